@@ -30,7 +30,7 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import rotation_vectors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import mean_rotation_l1
 
 # A frame that sees fewer points in a half says nothing.
@@ -72,6 +72,12 @@ class RotationWeight(NamedTuple):
             sigmas = np.full(problem.num_frames, self.sigma_rad)
         prior = RotationPrior(rotations=given, information=isotropic_information(sigmas))
         return replace(problem, rotation_prior=prior)
+
+    def singled_out(self, num_frames: int) -> BoolArray:
+        """Return the frames (n,) that pull less than the others: their given rotations are clearly wrong."""
+        if self.hold or self.frame_sigmas_rad is None:
+            return np.zeros(num_frames, dtype=np.bool_)
+        return np.asarray(self.frame_sigmas_rad > self.frame_sigmas_rad.min())
 
     def open_rad(self) -> float | FloatArray:
         """Return the standard deviation per axis of the errors of held rotations, or one per frame."""

@@ -313,18 +313,17 @@ def adjust_placement(
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
     problem = run.frames.problem(joined, found)
-    scale = run.choose_scale(problem)
     if weight is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
-        loss_scale_px = scale * structure_options.max_reprojection_error_px
+        loss_scale_px = run.choose_scale(problem) * structure_options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.solve(problem, scale, _GIVEN_FALL)
-    if run.lenses.doubts:
-        run.judge_lenses(adjusted)
-    else:
-        adjusted = run.return_frames(problem, adjusted)
+    adjusted = run.adjust_placed(problem)
+    if weight.singled_out(problem.num_frames).any():
+        # A frame whose rotation was far off has had few of its tracks; where it stands now it has all.
+        joined, found = run.triangulate(1.0)
+        adjusted = run.adjust_placed(run.frames.problem(joined, found))
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
         reconstruction=poses,
@@ -458,6 +457,14 @@ class _Run:
         self.iterations += adjusted.iterations
         self.converged = adjusted.converged
         return adjusted.problem
+
+    def adjust_placed(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+        """Move the frames to the optimum of a problem, but those that would gain nothing by it."""
+        adjusted = self.solve(problem, self.choose_scale(problem), _GIVEN_FALL)
+        if not self.lenses.doubts:
+            return self.return_frames(problem, adjusted)
+        self.judge_lenses(adjusted)
+        return adjusted
 
     def return_frames(self, before: AdjustmentProblem, after: AdjustmentProblem) -> AdjustmentProblem:
         """Put the frames back that gained nothing by moving, and return the problem with them."""

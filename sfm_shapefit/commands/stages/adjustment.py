@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import (
     AdjustedPlacement,
     Uncertainty,
@@ -31,6 +31,14 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.viewgraph import ViewGraph
+
+_SAID_OF_MATCHES = (
+    "num_inliers",
+    "num_rivals",
+    "cheirality_fraction",
+    "median_residual_px",
+    "parallax_deg",
+)
 
 
 def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
@@ -91,7 +99,8 @@ def adjust_placed(
     locations = (centers - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
-        directions = _measure_again(source, directions, options, clock)
+        corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
+        directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         placement = replace(placement, measured=_turn(placement.measured, directions, turns))
     moved = with_uncertainty(
@@ -114,16 +123,26 @@ def with_uncertainty(
 
 
 def _measure_again(
-    source: MatchSource, before: PairDirections, options: LocateOptions, clock: Clock
+    source: MatchSource,
+    before: PairDirections,
+    corrected: BoolArray,
+    options: LocateOptions,
+    clock: Clock,
 ) -> PairDirections:
-    """Return the usable directions as they are at other rotations; the others, and what is said, stay."""
+    """Return the usable directions as they are at other rotations; the others, and what is said, stay.
+
+    Of images whose rotations were clearly wrong, and are `corrected`, it is what their matches say now.
+    """
     if source.kind == "relative-poses":
         return before
     again = measure_directions(source, options, clock)
     both = np.intersect1d(before.usable(), again.usable())
-    directions = before.directions.copy()
-    directions[both] = again.directions[both]
-    return replace(before, directions=directions)
+    anew = both[corrected[before.pairs[both]].any(axis=1)]
+    rows = {"directions": both, **dict.fromkeys(_SAID_OF_MATCHES, anew)}
+    merged = {name: getattr(before, name).copy() for name in rows}
+    for name, taken in rows.items():
+        merged[name][taken] = getattr(again, name)[taken]
+    return replace(before, **merged)
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:
