@@ -202,10 +202,10 @@ def measure_scene(name: str, args: argparse.Namespace) -> Measured:
         database = folder / "database.db"
         variables = thread_environment(args.threads)
         peers = []
-        if not args.no_peers:
-            settings = {"threads": args.threads, "versions": versions(["pycolmap"]), "scene": name}
-            kept = Kept(kept_in / f"{folder.name}.peers" if args.folder else None, settings)
-            for mapper, limit in PEERS:
+        settings = {"threads": args.threads, "versions": versions(["pycolmap"]), "scene": name}
+        kept = Kept(kept_in / f"{folder.name}.peers" if args.folder else None, settings)
+        for mapper, limit in PEERS:
+            if not args.no_peers or f"{mapper} {limit}" in kept:
                 ask = partial(
                     *(call, measure_peer, mapper, limit, database, truth, args.threads),
                     environment=variables,

@@ -188,14 +188,17 @@ def _gather_values(args: Sequence[str]) -> list[str]:
     """Return arguments in which the values of a repeated flag are one."""
     counts = {_flag_of(name): len(kinds) for name, kinds in _REPEATED.items()}
     gathered, waiting = [], list(args)
-    while waiting:
-        flag = waiting.pop(0)
-        gathered.append(flag)
+    while waiting and waiting[0] != "--":
+        word = waiting.pop(0)
+        flag, equals, value = word.partition("=")
         count = counts.get(flag, 0)
-        if count:
-            gathered.append(_JOINT.join(waiting[:count]))
-            waiting = waiting[count:]
-    return gathered
+        if not count:
+            gathered.append(word)
+            continue
+        values = [value, *waiting] if equals else waiting
+        gathered += [flag, _JOINT.join(values[:count])]
+        waiting = values[count:]
+    return gathered + waiting
 
 
 def _values_of(name: str, text: str) -> tuple[Any, ...]:

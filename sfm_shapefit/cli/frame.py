@@ -146,9 +146,8 @@ def command_run(
             from sfm_shapefit.report.thumbnails import refuse_no_folder
 
             refuse_no_folder(Path(flags.images))
-        fixed = getattr(options, "fix", "")
-        images = Path(flags.images) if flags.images else None
-        paths = [*inputs, config, Path(fixed) if fixed else None, images]
+        named = [flags.images, *(getattr(options, name, "") for name in ("fix", "without"))]
+        paths = [*inputs, config, *(Path(name) for name in named if name)]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)
         if inputs[0] is not None:

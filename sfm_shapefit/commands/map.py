@@ -92,6 +92,9 @@ def map_database(
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         without = read_left_out(inputs, unposed.names, options).left_out
+        for name in (name for one in options.known_distance for name in one[:2]):
+            if name not in unposed.names:
+                raise InputError(f"known_distance: the database has no image {name}")
         positions = read_priors(unposed, inputs, options, priors)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     run = _Run(
@@ -147,7 +150,7 @@ def map_database(
         joined=found.joined,
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
-        num_frames=videos.num_frames,
+        num_video_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
@@ -278,9 +281,12 @@ class _Run(NamedTuple):
         waiting = _group_frames(num_frames, relative.pairs)
         while waiting:
             members = waiting.pop(0)
-            if len(members) < self.options.min_model_size:
+            least = self.options.min_model_size
+            if len(members) < least:
                 if len(members) > 1:
-                    few = f"joined to {len(members) - 1} other image only; three make a model"
+                    few = (
+                        f"matched with {counted(len(members) - 1, 'other image')} only; a model needs {least}"
+                    )
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
             with self.clock("rotation averaging"):

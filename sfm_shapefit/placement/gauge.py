@@ -273,13 +273,14 @@ def tell_scale(gauge: Gauge, sigma: float | None) -> Gauge:
     if sigma is None or gauge.scale not in ("rig", "prior"):
         return gauge
     statement = f"{gauge.statement}; the scale is known to {100.0 * sigma:.2g} %"
-    warning = gauge.warning
+    warnings = [gauge.warning] if gauge.warning else []
     if sigma > METRIC_SIGMA:
-        warning = (
-            f"the scale is known to {100.0 * sigma:.2g} % only, so it is not metric: the offsets that tell "
-            "it are too short for this scene"
+        cause = {"rig": "offsets that tell it are too short", "prior": "priors that tell it are too vague"}
+        warnings.append(
+            f"the scale is known to {100.0 * sigma:.2g} % only, so it is not metric: the "
+            f"{cause[gauge.scale]} for this scene"
         )
-    return replace(gauge, statement=statement, warning=warning, scale_sigma=sigma)
+    return replace(gauge, statement=statement, warning="; ".join(warnings), scale_sigma=sigma)
 
 
 def coincide(centers: FloatArray) -> bool:

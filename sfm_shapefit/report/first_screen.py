@@ -177,7 +177,8 @@ def _figure_tiles(facts: dict[str, Any]) -> Iterator[dict[str, str]]:
     if sigma is not None and share is not None:
         scope = f", {NOISE_ONLY}" if facts["sigma_of"].startswith(NOISE_ONLY) else ""
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope}"
-        hint = f"Median standard deviation of a position, {figures['sigma_unit']}. {facts['sigma_of']}"
+        of = facts["sigma_of"]
+        hint = f"Median standard deviation of a position: {sigma:.2g} {figures['sigma_unit']} ({of})."
         yield _tile(f"± {sigma:.2g} units", label, hint)
 
 

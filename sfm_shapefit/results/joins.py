@@ -32,7 +32,7 @@ class Joined:
         return (
             f"model {self.model} is joined to model {self.to} by {join.evidence}: scale known to "
             f"{100.0 * join.scale_sigma:.2g} %, turn to {join.turn_sigma_deg:.2g} deg, its cameras to "
-            f"{join.center_sigma:.2g} of the units of model {self.to}"
+            f"{join.center_sigma:.2g} units of model {self.to}"
         )
 
     def summary(self, folder: str | None) -> Join:

@@ -316,7 +316,8 @@ class LocateSummary(PlacementSummary):
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     scale_sigma: Annotated[
-        float | None, "Relative standard deviation of a scale that rigs or priors tell; else null."
+        float | None,
+        "Relative standard deviation of a scale that rigs, priors or known distances tell; else null.",
     ]
     known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
@@ -393,7 +394,7 @@ class MapSummary(TypedDict):
     options: Options
     num_images: Annotated[int, "Images of the database."]
     num_placed: Annotated[int, "Cameras in all models."]
-    num_frames: Annotated[int, "Images that are frames of a video."]
+    num_video_frames: Annotated[int, "Images that are frames of a video."]
     num_pairs: Annotated[int, "Pairs with a relative rotation."]
     models: Annotated[list[Model], "One per connected component, most cameras first."]
     joins: Annotated[list[Join], "What came of joining the models; one for each but the largest."]

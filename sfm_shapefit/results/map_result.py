@@ -41,7 +41,7 @@ class MapResult(Displayed):
     num_images: int
     num_pairs: int
     """Pairs with a relative rotation."""
-    num_frames: int
+    num_video_frames: int
     """Images that are frames of a video."""
     left_out: dict[str, str]
     """Name and reason of each image in no model."""
@@ -66,7 +66,7 @@ class MapResult(Displayed):
             "options": asdict(self.options),
             "num_images": self.num_images,
             "num_placed": self.num_placed,
-            "num_frames": self.num_frames,
+            "num_video_frames": self.num_video_frames,
             "num_pairs": self.num_pairs,
             "models": [
                 {

@@ -45,7 +45,7 @@ def loop_cells(loop: LoopOfVideo) -> list[str]:
     """Return the cells of a loop's row: its two stretches, pairs, matches, angle, what became of it."""
     refused, total = loop["num_refused"], loop["num_pairs"]
     fate = "taken" if refused == 0 else "refused" if refused == total else f"taken but for {refused}"
-    angle = f"{loop['angle_deg']:.2g} of {loop['tolerance_deg']:.2g} deg"
+    angle = f"{loop['angle_deg']:.2g} deg (up to {loop['tolerance_deg']:.2g} agree)"
     return [
         _stretch(loop["first"]),
         _stretch(loop["second"]),

@@ -65,7 +65,7 @@ def matched_shares(
 ) -> FloatArray:
     """Return the share of a pair's overlap that is matched, for the pairs of a batch, (b,), in [0, 1].
 
-    NaN where no keypoint of the overlap is matched with a third image.
+    NaN where no keypoint of the overlap, in either image, is matched with a third image.
 
     Args:
         pixels: (k, 2) the keypoints of each image.
@@ -76,7 +76,7 @@ def matched_shares(
     for k, ends in enumerate(batch.pairs.tolist()):
         matched = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]]
         sides = [_share(pixels[image], partners[image], matched[:, side]) for side, image in enumerate(ends)]
-        shares[k] = min(sides)
+        shares[k] = np.fmin(sides[0], sides[1])  # a side that says nothing leaves it to the other
     return shares
 
 

@@ -275,7 +275,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
     assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
     assert describe_loops(found.models[0].located.summary()["loops"]).endswith(f"{names[0]} to {names[15]}")
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
-    assert (blind.num_frames, blind.models[0].located.loops) == (0, ())
+    assert (blind.num_video_frames, blind.models[0].located.loops) == (0, ())
     assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
 
 
@@ -332,7 +332,7 @@ def test_images_in_no_model_are_told_their_own_reason(tmp_path):
     assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
     assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
     assert {found.left_out[name] for name in ("0005.jpg", "0006.jpg")} == {
-        "joined to 1 other image only; three make a model"
+        "matched with 1 other image only; a model needs 3"
     }
     assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
 

@@ -10,9 +10,12 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit import InputError, locate
+from sfm_shapefit import InputError, LocateOptions, locate
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
+from sfm_shapefit.commands.stages.rigs import find_rigid_parts
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
@@ -86,6 +89,35 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
     assert "0003.jpg and 0007.jpg are 42.5 apart" in json.loads(result.stdout)["scale"]
     unknown = ("--known-distance", "0003.jpg", "x.jpg", "1")
     assert "no posed image x.jpg" in run_refused("locate", RING_MODEL, tmp_path / "none", *unknown)
+    database = RING_MODEL.parent.parent / "database.db"
+    assert "the database has no image x.jpg" in run_refused("map", database, tmp_path / "none", *unknown)
+    joined = ("--known-distance=0003.jpg", "0007.jpg", "42.5")
+    again = json.loads(run("locate", RING_MODEL, tmp_path / "two", "--json", *joined).stdout)
+    assert again["known_distances"] == json.loads(result.stdout)["known_distances"]
+    both = ("--priors", write_priors(tmp_path))
+    assert "leave out one of the two" in run_refused("locate", RING_MODEL, tmp_path / "none", *known, *both)
+
+
+def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
+    model = read_model(RING_MODEL)
+    t, names = model.centers[:6], model.names
+
+    def placed(*known):
+        options = LocateOptions(known_distance=known)
+        rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
+        return rule.choose(np.arange(6), t, None).similarity.apply(t)
+
+    found = placed((names[1], names[4], 3.0), (names[2], names[7], 9.0))
+    assert np.linalg.norm(found[1] - found[4]) == pytest.approx(3.0, rel=1e-12)
+    with pytest.raises(UnsolvableError, match=f"{names[7]} could not be placed"):
+        placed((names[2], names[7], 9.0))
+
+
+def write_priors(folder):
+    """A table of one position, which is refused before it is read."""
+    table = folder / "gps.csv"
+    table.write_text("0001.jpg,0,0,0\n")
+    return table
 
 
 def test_several_known_distances_are_fitted_robustly_and_say_how_well():

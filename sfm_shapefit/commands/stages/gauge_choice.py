@@ -37,6 +37,10 @@ def read_priors(
     """
     if options.scale not in ("auto", "prior") and table is not None:
         raise InputError(f"priors have no effect with the scale {options.scale}; leave out one of the two")
+    if options.known_distance and (table is not None or options.refine_with_priors):
+        raise InputError(
+            "known distances and position priors would both set the scale; leave out one of the two"
+        )
     if table is not None:
         return exif_priors(Path(table), model) if Path(table).is_dir() else table_priors(Path(table), model)
     if options.scale != "prior":
@@ -108,15 +112,20 @@ def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) ->
 def _gauge_of_distances(
     model: PosedModel, cameras: list[int], locations: FloatArray, known: Sequence[KnownDistance]
 ) -> Gauge:
-    """Return the gauge of known distances of cameras, by their names."""
-    places = []
+    """Return the gauge of known distances of cameras, by their names; those that are not there say nothing.
+
+    Raises:
+        InputError: if the model has no such image.
+        UnsolvableError: if of each distance an image is not among the cameras.
+    """
+    place_of = {model.names[camera]: place for place, camera in enumerate(cameras)}
     for name in (name for one in known for name in one[:2]):
         if name not in model.names:
             raise InputError(f"known_distance: the model has no posed image {name}")
-        index = model.names.index(name)
-        if index not in cameras:
-            raise InputError(f"known_distance: the image {name} could not be placed; choose another")
-        places.append(cameras.index(index))
-    names = [f"{first} and {second}" for first, second, _ in known]
-    distances = np.array([float(distance) for *_, distance in known])
-    return distance_gauge(locations, np.array(places).reshape(-1, 2), distances, names)
+    there = [one for one in known if {*one[:2]} <= place_of.keys()]
+    if not there:
+        missing = next(name for name in known[0][:2] if name not in place_of)
+        raise UnsolvableError(f"known_distance: the image {missing} could not be placed; choose another")
+    places = np.array([[place_of[first], place_of[second]] for first, second, _ in there])
+    names = [f"{first} and {second}" for first, second, _ in there]
+    return distance_gauge(locations, places, np.array([float(distance) for *_, distance in there]), names)
