@@ -14,7 +14,7 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, Uncertainty
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
@@ -146,36 +146,18 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         measured = add_evidence(measured, source, directions, options)
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
-            centers = known.centers[placement.cameras]
-            placed = bring_to_scale(placement, centers)
-            placement = move_cameras(placement, placed, options)
-            there = np.isfinite(centers).all(axis=1)
-            scale = median_spread(centers[there]) / median_spread(placed[there])
-            placement = with_uncertainty(placement, model, known.uncertainty, scale)
+            placement = _at_known_centers(placement, known, model, options)
         given = GivenPoses(lenses=known.intrinsics.free)
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
-            placement = located.placement
-    adjustment, intrinsics = None, known.intrinsics
-    is_adjusted = known.centers is not None and located.given.centers is None
-    if not is_adjusted and options.adjusts_cameras(len(placement.cameras)):
-        weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
-        with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            after = adjust_placed(source, directions, located, options, clock, weight)
-            source, directions, placement, adjustment = after
-            intrinsics = intrinsics.after(adjustment.lenses)
-            given = located.given._replace(
-                weight=adjustment.weight,
-                weight_frames=adjustment.frame_ids,
-                model=model.reconstruction,
-                lenses=intrinsics.free,
-            )
-            located = located._replace(given=given)
+    source, directions, located, adjustment, intrinsics = _adjust(
+        source, directions, located, known, options, clock
+    )
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
         focal_doubts = question_focal_lengths(source, directions, options)
-        placement = doubt_cameras(placement, directions, relative, source.model, options)
+        placement = doubt_cameras(located.placement, directions, relative, source.model, options)
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
@@ -217,6 +199,56 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
     )
+
+
+def _at_known_centers(
+    placement: Placement, known: Locating, model: PosedModel, options: LocateOptions
+) -> Placement:
+    """Return the placement with its cameras where an adjustment had them, and how well it knew that."""
+    assert known.centers is not None
+    centers = known.centers[placement.cameras]
+    placed = bring_to_scale(placement, centers)
+    there = np.isfinite(centers).all(axis=1)
+    scale = median_spread(centers[there]) / median_spread(placed[there])
+    return with_uncertainty(move_cameras(placement, placed, options), model, known.uncertainty, scale)
+
+
+class _Adjusted(NamedTuple):
+    """What an adjustment leaves, or what was there where there is none."""
+
+    source: MatchSource
+    directions: PairDirections
+    located: Located
+    adjustment: AdjustedPlacement | None
+    intrinsics: Intrinsics
+
+
+def _adjust(
+    source: MatchSource,
+    directions: PairDirections,
+    located: Located,
+    known: Locating,
+    options: LocateOptions,
+    clock: Clock,
+) -> _Adjusted:
+    """Adjust the placed cameras, if that is wanted and was not done before."""
+    before = _Adjusted(source, directions, located, None, known.intrinsics)
+    is_adjusted = known.centers is not None and located.given.centers is None
+    if is_adjusted or not options.adjusts_cameras(len(located.placement.cameras)):
+        return before
+    weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
+    with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
+        after = adjust_placed(source, directions, located, options, clock, weight)
+        intrinsics = known.intrinsics.after(after.adjusted.lenses)
+        given = located.given._replace(
+            weight=after.adjusted.weight,
+            weight_frames=after.adjusted.frame_ids,
+            model=source.model.reconstruction,
+            lenses=intrinsics.free,
+        )
+        moved = located._replace(placement=after.placement, given=given)
+        return _Adjusted(after.source, after.directions, moved, after.adjusted, intrinsics)
+    return before
 
 
 def _ask_priors(

@@ -87,59 +87,27 @@ def map_database(
     """
     options = merge_options(options, MapOptions, overrides)
     path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
-    with clock("read"):
-        images = read_images(path)
-        unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
-        inputs = choose_inputs(images.reconstruction, path, options.directions)
-        without = read_left_out(inputs, unposed.names, options).left_out
-        for name in (name for one in options.known_distance for name in one[:2]):
-            if name not in unposed.names:
-                raise InputError(f"known_distance: the database has no image {name}")
-        positions = read_priors(unposed, inputs, options, priors)
-    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-    run = _Run(
-        options,
-        clock,
-        path,
-        images,
-        unposed,
-        frame_of_image,
-        sensor_rotations,
-        intrinsics,
-        positions,
-        without,
-    )
+    run = _start(path, options, clock, priors)
     relative = run.measure()
-    if options.adjust and intrinsics.free.doubts:
+    if options.adjust and run.intrinsics.free.doubts:
         known = run.refine_intrinsics(relative)
-        if differ_in_rays(known, unposed):
+        if differ_in_rays(known, run.unposed):
             run = run._replace(unposed=known)
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)
     run = run.score_pairs(relative)
-    models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
-    for frames, members, averaging in run.average_images(relative, reasons):
-        try:
-            located = run.locate_component(members, averaging)
-        except UnsolvableError as error:
-            reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
-            continue
-        names = tuple(unposed.names[k] for k in members.tolist())
-        located = replace(located, loops=tuple(_loops_of(visits, unposed.names, set(names))))
-        models.append(MappedModel(located=located, averaging=averaging, names=names))
-        for k in frames.tolist():
-            del reasons[k]
+    reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
+    models = run.locate_components(relative, visits, reasons)
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
-    models.sort(key=lambda model: -int(model.located.kept.sum()))
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            found = join_models(models, unposed, path, positions, run.without)
+            found = join_models(models, run.unposed, path, run.priors, run.without)
     left_out = {
         name: reasons[frame]
-        for name, frame in zip(unposed.names, frame_of_image.tolist(), strict=True)
+        for name, frame in zip(run.unposed.names, run.frame_of_image.tolist(), strict=True)
         if frame in reasons
     }
     result = MapResult(
@@ -148,12 +116,12 @@ def map_database(
         models=tuple(models),
         joins=found.joins,
         joined=found.joined,
-        num_images=unposed.num_images,
+        num_images=run.unposed.num_images,
         num_pairs=len(relative.pairs),
         num_video_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
-        warnings=tuple(_warnings(images, models, left_out)),
+        warnings=tuple(_warnings(run.images, models, left_out)),
     )
     return tell_joins(result)
 
@@ -169,6 +137,32 @@ def database_in(path: Path) -> Path:
     if not (path / "database.db").is_file():
         raise InputError(f"{path} is a folder without a database.db; give the database file itself")
     return path / "database.db"
+
+
+def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | None) -> "_Run":
+    """Read what a run works from, but for the matches."""
+    with clock("read"):
+        images = read_images(path)
+        unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
+        inputs = choose_inputs(images.reconstruction, path, options.directions)
+        inputs = read_left_out(inputs, unposed.names, options)
+        for name in (name for one in options.known_distance for name in one[:2]):
+            if name not in unposed.names:
+                raise InputError(f"known_distance: the database has no image {name}")
+        positions = read_priors(unposed, inputs, options, priors)
+    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
+    return _Run(
+        options=options,
+        clock=clock,
+        database=path,
+        images=images,
+        unposed=unposed,
+        frame_of_image=frame_of_image,
+        sensor_rotations=sensor_rotations,
+        intrinsics=intrinsics,
+        priors=positions,
+        without=inputs.left_out,
+    )
 
 
 class _Run(NamedTuple):
@@ -312,6 +306,27 @@ class _Run(NamedTuple):
             kept = answer.registered
             if kept.sum() >= self.options.min_model_size:
                 yield members[kept], answer.subset(kept)
+
+    def locate_components(
+        self, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
+    ) -> list[MappedModel]:
+        """Return a model of each component that can be placed, most cameras first.
+
+        Why a frame belongs to none is written to `reasons`, which starts with one for each.
+        """
+        models = []
+        for frames, members, averaging in self.average_images(relative, reasons):
+            try:
+                located = self.locate_component(members, averaging)
+            except UnsolvableError as error:
+                reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
+                continue
+            names = tuple(self.unposed.names[k] for k in members.tolist())
+            located = replace(located, loops=tuple(_loops_of(visits, self.unposed.names, set(names))))
+            models.append(MappedModel(located=located, averaging=averaging, names=names))
+            for k in frames.tolist():
+                del reasons[k]
+        return sorted(models, key=lambda model: -int(model.located.kept.sum()))
 
     def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
