@@ -55,6 +55,9 @@ _DOUBTFUL_SHARE = 0.25
 # The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
 # again.
 _MOST_SCORED_PAIRS = 20_000
+# Of the images: where so many have intrinsics in doubt, the relative rotations are measured twice. Fewer are
+# found with the poses, which the others hold; their pairs do not decide the averaging.
+_MANY_DOUBTED = 0.25
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 
@@ -89,7 +92,7 @@ def map_database(
     path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     run = _start(path, options, clock, priors)
     relative = run.measure()
-    if options.adjust and run.intrinsics.free.doubts:
+    if options.adjust and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
         if differ_in_rays(known, run.unposed):
             run = run._replace(unposed=known)
@@ -233,6 +236,11 @@ class _Run(NamedTuple):
                     shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
         both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
         return self._replace(scores=dict(zip(pairs, both, strict=True)))
+
+    def share_of_doubted_lenses(self) -> float:
+        """Return the share of images whose intrinsics are in doubt."""
+        images = [self.unposed.reconstruction.image(i) for i in self.unposed.image_ids.tolist()]
+        return float(np.mean([image.camera_id in self.intrinsics.free.doubts for image in images]))
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
