@@ -86,6 +86,21 @@ class Similarity:
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
 
+def invert(similarity: Similarity) -> Similarity:
+    """Return the inverse map."""
+    turn, scale = similarity.rotation.T, 1.0 / similarity.scale
+    return Similarity(scale=scale, rotation=turn, translation=-scale * turn @ similarity.translation)
+
+
+def compose(outer: Similarity, inner: Similarity) -> Similarity:
+    """Return x -> outer(inner(x))."""
+    return Similarity(
+        scale=outer.scale * inner.scale,
+        rotation=outer.rotation @ inner.rotation,
+        translation=outer.apply(inner.translation[None])[0],
+    )
+
+
 def fit_similarity(
     source: FloatArray, target: FloatArray, weights: FloatArray | None = None, *, rotate: bool = True
 ) -> Similarity:

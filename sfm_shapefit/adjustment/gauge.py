@@ -76,12 +76,14 @@ def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) 
         values: an adjustment's answer.
         free: from `free_similarities`.
     """
-    find = _best_similarity if free.shape[1] == _DIMENSION else _best_free_similarity
-    motion = find(problem, values, free) if free.size else np.eye(4)
+    if free.shape[1] == _DIMENSION:
+        motion = _best_similarity(problem, values)
+    else:
+        motion = _best_free_similarity(problem, values, free) if free.size else np.eye(4)
     return _apply(problem, values, motion, turned=bool(free[3:6].any()))
 
 
-def _best_similarity(problem: AdjustmentProblem, values: Values, _free: FloatArray) -> FloatArray:
+def _best_similarity(problem: AdjustmentProblem, values: Values) -> FloatArray:
     """Return the similarity, 4 x 4, that maps the centers best to the start's; the identity if mirrored."""
     fit, motion = fit_similarity(values.centers, problem.centers), np.eye(4)
     if fit.scale > 0.0:

@@ -8,7 +8,6 @@ undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP
 from then on its sensor and datum, and an image is the datum of a camera.
 """
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import is_number, text_of
+from sfm_shapefit.formats.lines import is_number, lines_of_cells
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import Datum, PositionPriors
 
@@ -115,11 +114,7 @@ def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatAr
     """
     found: dict[str, tuple[FloatArray, FloatArray]] = {}
     geodetic, first = False, True
-    for number, line in enumerate(text_of(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        cells = next(csv.reader([line])) if "," in line else line.split()
-        cells = [cell.strip() for cell in cells]
+    for number, cells in lines_of_cells(path):
         if first and len(cells) > 1 and not is_number(cells[1]):
             geodetic = cells[1].lower() in _GEODETIC_NAMES
         else:

@@ -1,8 +1,9 @@
 """What the readers of text formats share: lines of words and numbers, refused by their number."""
 
+import csv
 import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,18 @@ def text_of(file: Path) -> str:
         raise InputError(f"{file} does not exist") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a readable text file ({error})") from error
+
+
+def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells, between commas or white space, of each line that is no comment.
+
+    Raises:
+        InputError: as `text_of`.
+    """
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            cells = next(csv.reader([line])) if "," in line else line.split()
+            yield number, [cell.strip() for cell in cells]
 
 
 def first_words(file: Path) -> list[str]:

@@ -4,12 +4,11 @@ A table whose first two columns are the names serves too, as the first lines of 
 are passed over, and so is a header "name1,name2,...". Lines that begin with # are comments.
 """
 
-import csv
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import text_of
+from sfm_shapefit.formats.lines import lines_of_cells
 
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
@@ -28,7 +27,9 @@ def read_pair_list(path: Path, known: Collection[str]) -> PairNames:
             is named by its number.
     """
     there, found = frozenset(known), set()
-    for number, cells in _lines(path):
+    for number, cells in lines_of_cells(path):
+        if cells[:2] == _HEADER:
+            continue
         if len(cells) < 2:
             raise InputError(f"{path}, line {number}: expected the names of two images")
         unknown = [name for name in cells[:2] if name not in there]
@@ -41,14 +42,3 @@ def read_pair_list(path: Path, known: Collection[str]) -> PairNames:
     if not found:
         raise InputError(f"{path} lists no pair; give the names of two images per line")
     return frozenset(found)
-
-
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of each line that is no comment and no header."""
-    for number, line in enumerate(text_of(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        row = next(csv.reader([line])) if "," in line else line.split()
-        cells = [cell.strip() for cell in row]
-        if cells[:2] != _HEADER:
-            yield number, cells

@@ -25,8 +25,10 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import (
     Similarity,
+    compose,
     fit_similarity,
     fits_of_few_points,
+    invert,
     mean_rotation_l1,
     median_spread,
     normalized,
@@ -181,21 +183,6 @@ def refuse_uncertain(join: ModelJoin, centers: FloatArray) -> None:
         raise UnsolvableError(
             f"where one stands beside the other is known to {join.center_sigma / size:.0%} of its size only"
         )
-
-
-def invert(similarity: Similarity) -> Similarity:
-    """Return the inverse map."""
-    turn, scale = similarity.rotation.T, 1.0 / similarity.scale
-    return Similarity(scale=scale, rotation=turn, translation=-scale * turn @ similarity.translation)
-
-
-def compose(outer: Similarity, inner: Similarity) -> Similarity:
-    """Return x -> outer(inner(x))."""
-    return Similarity(
-        scale=outer.scale * inner.scale,
-        rotation=outer.rotation @ inner.rotation,
-        translation=outer.apply(inner.translation[None])[0],
-    )
 
 
 def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Similarity:

@@ -18,12 +18,11 @@ from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
-from sfm_shapefit.geometry import Similarity
+from sfm_shapefit.geometry import Similarity, compose
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import (
     ModelJoin,
     Ties,
-    compose,
     join_by_matches,
     join_by_priors,
 )
