@@ -35,7 +35,8 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, same_intrinsics, world_rays
-from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
+from sfm_shapefit.colmap.sorted_matches import MOST_MATCHES, SortedMatches, UInt32Array
+from sfm_shapefit.directions.matches import KeypointMatches, MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.formats.pair_list import PairNames
@@ -48,7 +49,11 @@ NO_ID = 2**32 - 1
 """COLMAP's ids are 32-bit, and this one is none."""
 
 KEPT_MATCHES = 1_000_000
-"""So many are kept, in 80 MB; of more, a million takes a tenth of a second to read again."""
+"""So many are kept with their rays, in 80 MB."""
+
+BATCH = 250_000
+"""Matches that are put together at a time, in 60 MB. The arrays of larger batches come from the system and go
+back to it each time, and its zeros cost as much as what is written over them."""
 
 _KEYPOINT_BITS = np.uint64(32)
 _KEYPOINT_MASK = np.uint64(2**32 - 1)
@@ -164,10 +169,15 @@ class MatchDatabase:
         self._cache_bytes = _CACHE_BYTES
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._cached_bytes = 0
-        self._kept: dict[int, list[MatchBatch]] = {}
+        self._kept: dict[tuple[int, int], list[MatchBatch]] = {}
         index_of_id = _match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
         self._pairs = _read_pairs(path, connection, index_of_id).without(_indices_of_names(model, left_out))
+        self._looked_at: dict[int, _Keypoints] = {}
+        self._sorted: SortedMatches | None = None
+        if float(self._pairs.num_inliers.sum(dtype=np.float64)) <= MOST_MATCHES:
+            _, rowids, swapped, _, counts = self._pairs
+            self._share(SortedMatches(rowids, swapped, counts))
 
     @property
     def unmatched_names(self) -> tuple[str, ...]:
@@ -188,6 +198,26 @@ class MatchDatabase:
         self._rays.clear()
         self._cached_bytes = 0
 
+    def among(self, model: PosedModel, left_out: PairNames = frozenset()) -> "MatchDatabase":
+        """Return the matches between the images of another model, those that were read already included.
+
+        Raises:
+            InputError: as `open_database`.
+        """
+        with _sqlite_errors(self.path):
+            other = MatchDatabase(self.path, self._connection, model, left_out)
+        if self._sorted is not None:
+            other._share(self._sorted)
+        return other
+
+    def _share(self, matches: SortedMatches) -> None:
+        """Look matches up among, and add them to, those that were read already."""
+        self._sorted, self._places = matches, matches.places(self._pairs.rowids, self._pairs.swapped)
+
+    def forget_matches(self) -> None:
+        """Give back the memory of all matches; from now on they are read each time they are needed."""
+        self._sorted, self._kept = None, {}
+
     def turned(self, model: PosedModel) -> "MatchDatabase":
         """Return the same matches for a model of the same images, in the same order, with other rotations.
 
@@ -196,9 +226,10 @@ class MatchDatabase:
         other = copy.copy(self)
         other._model, other._rays, other._cached_bytes, other._kept = model, OrderedDict(), 0, {}
         if not same_intrinsics(model, self._model):
+            other._looked_at = {}
             return other
         turns = model.rotations.transpose(0, 2, 1) @ self._model.rotations
-        other._kept = {least: [_turn(batch, turns) for batch in kept] for least, kept in self._kept.items()}
+        other._kept = {kind: [_turn(batch, turns) for batch in kept] for kind, kept in self._kept.items()}
         return other
 
     @property
@@ -250,7 +281,7 @@ class MatchDatabase:
     def iter_matches(
         self,
         min_matches: int,
-        max_matches_per_batch: int = 2_000_000,
+        max_matches_per_batch: int = BATCH,
         among: IntArray | None = None,
         part: tuple[int, int] | None = None,
     ) -> Iterator[MatchBatch]:
@@ -267,12 +298,52 @@ class MatchDatabase:
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
         """
-        if among is None and part is None and self.num_matches <= min(max_matches_per_batch, KEPT_MATCHES):
-            if min_matches not in self._kept:
-                self._kept[min_matches] = list(self._batches(min_matches, max_matches_per_batch))
-            yield from self._kept[min_matches]
+        if among is None and part is None and self._keeps_rays(max_matches_per_batch):
+            kind = min_matches, max_matches_per_batch
+            if kind not in self._kept:
+                self._kept[kind] = list(self._batches(*kind))
+            yield from self._kept[kind]
         else:
             yield from self._batches(min_matches, max_matches_per_batch, among, part)
+
+    def _keeps_rays(self, max_matches_per_batch: int) -> bool:
+        """Return whether all matches are kept with their rays; who wants small batches wants no memory."""
+        return self.num_matches <= KEPT_MATCHES and max_matches_per_batch >= min(BATCH, self.num_matches)
+
+    def iter_keypoints(
+        self, min_matches: int, among: IntArray | None = None, without: IntArray | None = None
+    ) -> Iterator[KeypointMatches]:
+        """Yield the same matches without their rays, which takes a fraction of the time.
+
+        Args:
+            min_matches: as in `iter_matches`.
+            among: only pairs of these images, by their index.
+            without: (k, 2) pairs that are left out.
+
+        Raises:
+            InputError: as `iter_matches`.
+        """
+        chosen = self._choose(min_matches, among)
+        if without is not None and len(without):
+            first, second = np.sort(without, axis=1).T
+            codes = self._pairs.pairs[chosen] @ [self._model.num_images, 1]
+            chosen = chosen[~np.isin(codes, first * self._model.num_images + second)]
+        for first, last in batch_ranges(self._pairs.num_inliers[chosen], BATCH):
+            batch = self._keypoint_batch(chosen[first:last], max(min_matches, 1))
+            if len(batch.pairs):
+                yield batch
+
+    def _choose(
+        self, min_matches: int, among: IntArray | None = None, part: tuple[int, int] | None = None
+    ) -> IntArray:
+        """Return the pairs that `iter_matches` is asked for, by their position."""
+        enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
+        if part is not None:
+            rank = np.cumsum(self._pairs.has_matches) - 1
+            enough &= (rank >= part[0]) & (rank < part[1])
+        if among is not None:
+            enough &= np.isin(self._pairs.pairs, among).all(axis=1)
+        return np.flatnonzero(enough)
 
     def _batches(
         self,
@@ -282,16 +353,12 @@ class MatchDatabase:
         part: tuple[int, int] | None = None,
     ) -> Iterator[MatchBatch]:
         """Read what `iter_matches` yields."""
-        enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
-        if part is not None:
-            rank = np.cumsum(self._pairs.has_matches) - 1
-            enough &= (rank >= part[0]) & (rank < part[1])
-        if among is not None:
-            enough &= np.isin(self._pairs.pairs, among).all(axis=1)
-        yield from self._batches_of(np.flatnonzero(enough), min_matches, max_matches_per_batch)
+        yield from self._batches_of(
+            self._choose(min_matches, among, part), min_matches, max_matches_per_batch
+        )
 
     def iter_matches_between(
-        self, groups: IntArray, max_matches_per_batch: int = 2_000_000
+        self, groups: IntArray, max_matches_per_batch: int = BATCH
     ) -> Iterator[MatchBatch]:
         """Yield the matches of all pairs whose images are in different groups (n,), as `iter_matches` does.
 
@@ -358,36 +425,58 @@ class MatchDatabase:
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
         """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
-        in_order = [self._read_matches(pair) for pair in chosen.tolist()]
-        counts = np.array([len(matches) for matches in in_order], dtype=np.int64)
-        keypoints = np.concatenate([np.empty((0, 2), dtype=np.int64), *in_order])
-        bounds = np.append(0, np.cumsum(counts))
-        rays = np.empty((2, len(keypoints), 3))
-        for k, pair in enumerate(chosen.tolist()):
-            rows = slice(bounds[k], bounds[k + 1])
-            for side in (0, 1):
-                table = self._world_rays(int(self._pairs.pairs[pair, side]))
-                if rows.stop > rows.start and keypoints[rows, side].max() >= len(table):
-                    raise self._damaged_pair(pair, "matches of keypoints that do not exist")
-                table.take(keypoints[rows, side], axis=0, out=rays[side, rows])
-
-        keep = np.isfinite(rays[:, :, 0]).all(axis=0)  # the ray of a pixel that has none is all NaN
-        if not keep.all():
-            counts = np.bincount(np.repeat(np.arange(len(chosen)), counts)[keep], minlength=len(chosen))
-        kept = counts >= min_matches
-        keep &= np.repeat(kept, np.diff(bounds))
-        everything = bool(keep.all())
-        pairs = self._pairs.pairs[chosen[kept]]
+        found = self._keypoint_batch(chosen, min_matches)
+        rays = np.empty((2, len(found.keypoints), 3))
+        bounds = found.offsets.tolist()
+        for pair, (first, last) in zip(found.pairs.tolist(), itertools.pairwise(bounds), strict=True):
+            for side, image in enumerate(pair):
+                own = found.keypoints[first:last, side]
+                self.world_rays(image).take(own, axis=0, out=rays[side, first:last])
         return MatchBatch(
-            pairs=pairs,
-            offsets=np.append(0, np.cumsum(counts[kept])),
-            keypoints=keypoints if everything else keypoints[keep],
-            rays_i=rays[0] if everything else rays[0, keep],
-            rays_j=rays[1] if everything else rays[1, keep],
-            pixel_angles=1.0 / self._model.focal_lengths_px[pairs].min(axis=1),
+            pairs=found.pairs,
+            offsets=found.offsets,
+            keypoints=found.keypoints,
+            rays_i=rays[0],
+            rays_j=rays[1],
+            pixel_angles=1.0 / self._model.focal_lengths_px[found.pairs].min(axis=1),
         )
 
-    def _read_matches(self, pair: int) -> IntArray:
+    def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
+        """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
+        pairs = self._pairs.pairs[chosen]
+        counts, keypoints = self._matches_of(chosen)
+        images = np.unique(pairs).tolist()
+        if any(self._look_at(image).blind is not None for image in images):
+            has_ray = np.ones(len(keypoints), dtype=np.bool_)
+            ends = itertools.pairwise(np.append(0, np.cumsum(counts)).tolist())
+            for images_of_pair, (first, last) in zip(pairs.tolist(), ends, strict=True):
+                for side, image in enumerate(images_of_pair):
+                    blind = self._look_at(image).blind
+                    if blind is not None:
+                        has_ray[first:last] &= ~blind[keypoints[first:last, side]]
+            keypoints = keypoints[has_ray]
+            counts = np.bincount(np.repeat(np.arange(len(pairs)), counts)[has_ray], minlength=len(pairs))
+        kept = counts >= min_matches
+        if not kept.all():
+            keypoints = keypoints[np.repeat(kept, counts)]
+        return KeypointMatches(
+            pairs=pairs[kept],
+            offsets=np.append(0, np.cumsum(counts[kept])),
+            keypoints=keypoints.astype(np.int64),
+        )
+
+    def _matches_of(self, chosen: IntArray) -> tuple[IntArray, UInt32Array]:
+        """Return the sorted matches of the chosen pairs, of each how many and then all of them.
+
+        They are read from the file only if they were not before, or there is no room to keep them.
+        """
+        if self._sorted is not None and (self._places[chosen] >= 0).all():
+            return self._sorted.read(self._places[chosen], lambda k: self._read_matches(int(chosen[k])))
+        parts = [self._read_matches(pair) for pair in chosen.tolist()]
+        counts = np.array([len(matches) for matches in parts], dtype=np.int64)
+        return counts, np.concatenate([np.empty((0, 2), dtype=np.uint32), *parts])
+
+    def _read_matches(self, pair: int) -> UInt32Array:
         """Return the matches (M, 2) of a pair, image i first, ascending and each once.
 
         Sums over matches then do not depend on the order in which the database lists them.
@@ -400,10 +489,20 @@ class MatchDatabase:
         # Of two keypoints one number is made, for numbers are sorted several times faster than rows.
         both = np.sort(first << _KEYPOINT_BITS | second)
         both = both[np.append(True, both[1:] != both[:-1])[: len(both)]]
-        return np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.int64)
+        matches = np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.uint32)
+        for image, keypoints in zip(self._pairs.pairs[pair].tolist(), matches.T, strict=True):
+            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).count:
+                raise self._damaged_pair(pair, "matches of keypoints that do not exist")
+        return matches
 
-    def _world_rays(self, image: int) -> FloatArray:
-        """Return the rays of all keypoints of an image, from the cache if it was used recently."""
+    def world_rays(self, image: int) -> FloatArray:
+        """Return the rays (k, 3) of all keypoints of an image in world axes, from memory if there lately.
+
+        NaN where a pixel has none.
+
+        Raises:
+            InputError: as `keypoints`.
+        """
         if image in self._rays:
             self._rays.move_to_end(image)
             return self._rays[image]
@@ -413,6 +512,13 @@ class MatchDatabase:
         while self._cached_bytes > self._cache_bytes:
             self._cached_bytes -= self._rays.popitem(last=False)[1].nbytes
         return rays
+
+    def _look_at(self, image: int) -> "_Keypoints":
+        """Return how many keypoints an image has, and which of them have no ray."""
+        if image not in self._looked_at:
+            blind = np.isnan(self.world_rays(image)[:, 0])
+            self._looked_at[image] = _Keypoints(len(blind), blind if blind.any() else None)
+        return self._looked_at[image]
 
     def _damaged_pair(self, pair: int, what: str) -> InputError:
         """Return the error that names a pair of images."""
@@ -529,6 +635,14 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
 
 
 # --- tables ----------------------------------------------------------------------------------------
+
+
+class _Keypoints(NamedTuple):
+    """Those of an image."""
+
+    count: int
+    blind: BoolArray | None
+    """(count,) which have no ray; None if all have one."""
 
 
 class _Pairs(NamedTuple):

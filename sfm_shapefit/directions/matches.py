@@ -41,6 +41,18 @@ def join_rays(parts: Sequence[RayMatches]) -> RayMatches:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeypointMatches:
+    """The matches of k image pairs, M in all, one pair after the other, as keypoints; no rays."""
+
+    pairs: IntArray
+    """(k, 2) images (i, j), i < j, as indices into `PosedModel.image_ids`."""
+    offsets: IntArray
+    """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
+    keypoints: IntArray
+    """(M, 2) index of the keypoint in image i and in image j."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchBatch(RayMatches):
     """Matches that know their keypoints; images i < j are indices into `PosedModel.image_ids`."""
 

@@ -42,11 +42,11 @@ _OBSERVATION_BYTES = 620.0
 # Unknowns of an adjusted camera, and up to how many of them their system is dense.
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
 
-BATCH = 2_000_000
+BATCH = 250_000
 """Matches that are read at a time where memory is no concern."""
 RAYS_BYTES = 1_000_000_000
 """Of the rays of keypoints that are kept for the next pair, where memory is no concern."""
-_SMALL_BATCH, _FEW_RAYS_BYTES = 200_000, 50_000_000
+_SMALL_BATCH, _FEW_RAYS_BYTES = 50_000, 50_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,7 +239,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     has_factor = economy.factor or work.needs_factor
     factor = 2.2 * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
     moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
-    is_kept = work.num_matches <= min(economy.batch, KEPT_MATCHES)
+    is_kept = work.num_matches <= KEPT_MATCHES and economy.batch >= min(BATCH, work.num_matches)
     kept = 80.0 * work.num_matches if is_kept else 0.0
     peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor
     seeds = 66.0 * work.num_keypoints
