@@ -19,7 +19,7 @@ from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, Observ
 from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import camera_rays, observed_points, points2d_xy
-from sfm_shapefit.colmap.structure import TrackSource
+from sfm_shapefit.colmap.structure import ImageMatches, TrackSource
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 
@@ -153,15 +153,15 @@ def read_frames(
 def collect_tracks(
     frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource
 ) -> ObservedTracks | MatchedKeypoints:
-    """Return the tracks of a model's points, or the matches of a graph, that posed images observe.
+    """Return the tracks of a model's points, or the matches, that posed images observe.
 
     Args:
         frames: of `reconstruction`, which has the keypoints of its images.
         reconstruction: the same.
         tracks: as in `colmap.structure.triangulate`.
     """
-    if isinstance(tracks, pycolmap.CorrespondenceGraph):
-        return _read_matches(frames, reconstruction, tracks)
+    if isinstance(tracks, ImageMatches):
+        return _matched_keypoints(frames, reconstruction, tracks)
     seen = [observed_points(tracks.image(i)) for i in frames.image_ids]
     images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
     keypoints = np.concatenate([keypoints for keypoints, _ in seen])
@@ -345,19 +345,18 @@ def _sensor_from_rig(
     return _matrix(pose.rotation), pose.translation
 
 
-def _read_matches(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph
+def _matched_keypoints(
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, matches: ImageMatches
 ) -> MatchedKeypoints:
-    """Return the matches between the images."""
-    place = {image_id: k for k, image_id in enumerate(frames.image_ids)}
+    """Return the matches between posed images as pairs of keypoints."""
     counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
     begins = np.concatenate([[0], np.cumsum(counts)])
-    parts = [np.empty((0, 2), dtype=np.int64)]
-    for first, second in sorted(map(pycolmap.pair_id_to_image_pair, graph.image_pairs())):
-        if first in place and second in place:
-            matches = graph.extract_matches_between_images(first, second)
-            parts.append(matches.astype(np.int64) + begins[[place[first], place[second]]])
-    ends = np.concatenate(parts)
+    known = np.isin(matches.image_pairs, frames.image_ids).all(axis=1)
+    lengths, keypoints = np.diff(matches.offsets), matches.keypoints
+    if not known.all():
+        keypoints = keypoints[np.repeat(known, lengths)]
+    firsts = begins[np.searchsorted(frames.image_ids, matches.image_pairs[known])]
+    ends = keypoints + np.repeat(firsts, lengths[known], axis=0)
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     is_matched[ends] = True
     matched = np.flatnonzero(is_matched)

@@ -53,7 +53,7 @@ from sfm_shapefit.colmap.adjustment import (
 )
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
-from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
+from sfm_shapefit.colmap.structure import ImageMatches, TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.known_positions import KnownPositions
@@ -522,7 +522,7 @@ class _Run:
         joined, found, adjusted = self.adjust_by_all_points()
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points)
-        colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks
+        colors = None if isinstance(tracks, ImageMatches) else tracks
         add_points(answer, self.frames, joined, found, colors)
         return answer, initial_error_px, adjusted
 

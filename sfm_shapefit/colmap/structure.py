@@ -2,8 +2,8 @@
 
 Tracks come from one of two sources:
 
-    a correspondence graph   matches of a database; COLMAP's incremental triangulator grows, completes and
-                             merges tracks at the given poses. All in memory: no database is opened.
+    matches                  of a database; COLMAP's incremental triangulator grows, completes and merges
+                             tracks at the given poses. All in memory: no database is opened.
     another reconstruction   the input's own points: each track is triangulated afresh (LO-RANSAC over its
                              observations) and keeps its point id.
 
@@ -26,17 +26,31 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
-from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import answers
 
-TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ImageMatches:
+    """The matches between images by their ids, M in all, eight bytes each."""
+
+    image_pairs: IntArray
+    """(k, 2) ids of the images of each pair."""
+    offsets: IntArray
+    """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
+    keypoints: npt.NDArray[np.uint32]
+    """(M, 2) index of the keypoint in the first image and in the second."""
+
+
+TrackSource = ImageMatches | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
 
 Advance = Callable[[int, int], None]
@@ -51,10 +65,10 @@ _IMAGES_OF_A_CHECKED_TRACK = 3
 _CALIBRATED = 2
 
 
-def correspondence_graph(
-    seed: pycolmap.Reconstruction, image_ids: IntArray, batches: Iterable[MatchBatch]
-) -> pycolmap.CorrespondenceGraph:
-    """Return the graph of all matches between registered images; batches are consumed one at a time.
+def collect_matches(
+    seed: pycolmap.Reconstruction, image_ids: IntArray, batches: Iterable[KeypointMatches]
+) -> ImageMatches:
+    """Return all matches between registered images; batches are consumed one at a time.
 
     Args:
         seed: the placed images, with the points2D that the matches refer to.
@@ -64,24 +78,46 @@ def correspondence_graph(
     Raises:
         InputError: if a match refers to a keypoint that its image does not have.
     """
-    num_keypoints = {i: seed.image(i).num_points2D() for i in sorted(seed.reg_image_ids())}
-    graph = pycolmap.CorrespondenceGraph()
-    for image_id, count in num_keypoints.items():
-        graph.add_image(image_id, count)
+    registered = np.isin(image_ids, sorted(seed.reg_image_ids()))
+    images = [seed.image(i) if is_in else None for i, is_in in zip(image_ids.tolist(), registered, strict=True)]
+    num_keypoints = np.array([0 if image is None else image.num_points2D() for image in images])
+    pairs, counts, keypoints = [], [], []
     for batch in batches:
-        for pair, (i, j) in enumerate(image_ids[batch.pairs].tolist()):
-            if i not in num_keypoints or j not in num_keypoints:
-                continue
-            matches = batch.keypoints[batch.offsets[pair] : batch.offsets[pair + 1]]
-            if len(matches) and (matches >= (num_keypoints[i], num_keypoints[j])).any():
-                names = f"{seed.image(i).name} and {seed.image(j).name}"
-                raise InputError(
-                    f"the pair {names} has matches of keypoints that do not exist; match the images again"
-                )
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = _CALIBRATED
-            geometry.inlier_matches = matches.astype(np.uint32)
-            graph.add_two_view_geometry(i, j, geometry)
+        kept = registered[batch.pairs].all(axis=1)
+        lengths = np.diff(batch.offsets)
+        ends, own = batch.pairs[kept], batch.keypoints
+        if not kept.all():
+            own = own[np.repeat(kept, lengths)]
+        counts.append(lengths[kept])
+        missing = (own >= np.repeat(num_keypoints[ends], counts[-1], axis=0)).any(axis=1)
+        if missing.any():
+            pair = np.repeat(np.arange(len(ends)), counts[-1])[np.argmax(missing)]
+            names = " and ".join(seed.image(i).name for i in image_ids[ends[pair]].tolist())
+            raise InputError(
+                f"the pair {names} has matches of keypoints that do not exist; match the images again"
+            )
+        pairs.append(image_ids[ends])
+        keypoints.append(own.astype(np.uint32))
+    return ImageMatches(
+        image_pairs=np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs]),
+        offsets=np.append(0, np.cumsum(np.concatenate([np.zeros(0, dtype=np.int64), *counts]))),
+        keypoints=np.concatenate([np.zeros((0, 2), dtype=np.uint32), *keypoints]),
+    )
+
+
+def correspondence_graph(
+    seed: pycolmap.Reconstruction, matches: ImageMatches
+) -> pycolmap.CorrespondenceGraph:
+    """Return the matches between the registered images as pycolmap wants them, about 40 bytes each."""
+    graph, registered = pycolmap.CorrespondenceGraph(), sorted(seed.reg_image_ids())
+    for image_id in registered:
+        graph.add_image(image_id, seed.image(image_id).num_points2D())
+    known = np.isin(matches.image_pairs, registered).all(axis=1)
+    for pair in np.flatnonzero(known).tolist():
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = _CALIBRATED
+        geometry.inlier_matches = matches.keypoints[matches.offsets[pair] : matches.offsets[pair + 1]]
+        graph.add_two_view_geometry(*matches.image_pairs[pair].tolist(), geometry)
     graph.finalize()
     return graph
 
@@ -99,7 +135,7 @@ def triangulate(
 
     Args:
         seed: the placed images. For tracks of another model, its points2D must be that model's.
-        tracks: a graph from `correspondence_graph`, or the reconstruction whose own tracks serve.
+        tracks: matches from `collect_matches`, or the reconstruction whose own tracks serve.
         options: filters; the defaults if None.
         advance: called with the images, or tracks, that are done and their number.
         executor: shares out the tracks of another model among its workers; no use for matches.
@@ -115,8 +151,8 @@ def triangulate(
     """
     options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
     structure = seed if in_place else copy_without_points(seed)
-    if isinstance(tracks, pycolmap.CorrespondenceGraph):
-        _triangulate_matches(structure, tracks, options, advance)
+    if isinstance(tracks, ImageMatches):
+        _triangulate_matches(structure, correspondence_graph(structure, tracks), options, advance)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
     _filter(structure, options)

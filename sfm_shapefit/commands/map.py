@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
-from sfm_shapefit.colmap.database import open_database
+from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
@@ -91,6 +91,13 @@ def map_database(
     options = merge_options(options, MapOptions, overrides)
     path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     run = _start(path, options, clock, priors)
+    with open_database(path, run.unposed, run.without) as opened:
+        return _map_opened(run._replace(opened=opened))
+
+
+def _map_opened(run: "_Run") -> MapResult:
+    """Do what `map_database` does, once the matches are open."""
+    options, path, clock = run.options, run.database, run.clock
     relative = run.measure()
     if options.adjust and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
@@ -186,6 +193,8 @@ class _Run(NamedTuple):
     priors: PositionPriors | None
     without: PairNames
     """Pairs that are taken for unmatched."""
+    opened: MatchDatabase | None = None
+    """The open database, which keeps the matches that were read."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
     """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
 
@@ -194,9 +203,12 @@ class _Run(NamedTuple):
         with self.clock("relative rotations"):
             sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
             source = self.options.relative_rotations
-            return measure_rotations(
-                self.database, self.unposed, LEAST_MATCHES, source, sharing, self.without
-            )
+            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, source, sharing)
+
+    def matches(self) -> MatchDatabase:
+        """Return the matches of all images, but for the pairs that are left out."""
+        assert self.opened is not None
+        return self.opened.among(self.unposed, self.without)
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
@@ -225,13 +237,11 @@ class _Run(NamedTuple):
         triplets = score_triplets(self.unposed.num_images, relative).tolist()
         shares: dict[tuple[int, int], float] = {}
         if len(pairs) <= _MOST_SCORED_PAIRS:
-            with (
-                self.clock("scores of pairs"),
-                open_database(self.database, self.unposed, self.without) as opened,
-            ):
-                pixels = [opened.keypoints(k) for k in range(self.unposed.num_images)]
-                partners = count_partners([len(own) for own in pixels], opened.iter_matches(LEAST_MATCHES))
-                for batch in opened.iter_matches(LEAST_MATCHES):
+            with self.clock("scores of pairs"):
+                matches = self.matches()
+                pixels = [matches.keypoints(k) for k in range(self.unposed.num_images)]
+                partners = count_partners([len(own) for own in pixels], matches.iter_keypoints(LEAST_MATCHES))
+                for batch in matches.iter_keypoints(LEAST_MATCHES):
                     found = matched_shares(pixels, partners, batch).tolist()
                     shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
         both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
@@ -255,7 +265,7 @@ class _Run(NamedTuple):
             model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
             inputs = self.inputs_of(model)
             rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
-            with open_source(model, inputs, options) as source, suppress(UnsolvableError):
+            with open_source(model, inputs, options, self.opened) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
                     first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
@@ -346,7 +356,7 @@ class _Run(NamedTuple):
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
-        with open_source(model, inputs, options) as averaged:
+        with open_source(model, inputs, options, self.opened) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
             intrinsics = self.intrinsics
             if self.options.adjust:

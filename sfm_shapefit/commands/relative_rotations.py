@@ -16,7 +16,6 @@ from sfm_shapefit.colmap.relative_rotations import (
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.execution import PairWork, measure_with_workers
-from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, MapOptions, Relative
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
@@ -81,46 +80,44 @@ def relative_rotations(
     with clock("relative rotations"):
         model = read_model(read_images(path).reconstruction)
         sharing = Sharing(options.num_threads(), executor, clock.advance)
-        found = measure_rotations(path, model, min_matches, source, sharing)
+        with open_database(path, model) as matches:
+            found = measure_rotations(matches, model, min_matches, source, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 
 
 def measure_rotations(
-    path: Path,
+    database: MatchDatabase,
     model: PosedModel,
     min_matches: int = LEAST_MATCHES,
     source: Relative = "matches",
     sharing: Sharing | None = None,
-    left_out: PairNames = frozenset(),
 ) -> RelativeRotations:
     """Return the relative rotations of a database; pairs are indices into the model's images.
 
     Args:
-        path: the database; it is not changed.
+        database: open, of the model.
         model: all its images, with the identity as their rotation (see `database_images`).
         min_matches: pairs with fewer inlier matches are left out.
         source: estimated from the matches, or as stored.
         sharing: one thread if None.
-        left_out: pairs that are taken for unmatched.
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.
         WorkerError: if a worker died and the executor does not replace it.
     """
     sharing = sharing or Sharing()
-    with open_database(path, model, left_out) as database:
-        if source == "stored":
-            return stored_relative_rotations(database, model, min_matches)
-        if sharing.executor is None:
-            parts = _estimate_here(database, min_matches, sharing)
-        else:
-            work = PairWork(
-                estimate=estimate_relative_rotations,
-                min_matches=min_matches,
-                matches_per_task=_MATCHES_PER_TASK,
-            )
-            parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
+    if source == "stored":
+        return stored_relative_rotations(database, model, min_matches)
+    if sharing.executor is None:
+        parts = _estimate_here(database, min_matches, sharing)
+    else:
+        work = PairWork(
+            estimate=estimate_relative_rotations,
+            min_matches=min_matches,
+            matches_per_task=_MATCHES_PER_TASK,
+        )
+        parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
     return concatenate(parts)
 
 

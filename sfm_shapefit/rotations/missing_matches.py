@@ -34,7 +34,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.matches import KeypointMatches
 
 # Of the matched keypoints along an axis, the quantiles that bound the overlap.
 _BOX = (0.02, 0.98)
@@ -44,7 +44,7 @@ _NO_TRIANGLE = 0.5
 _DOUBTFUL_SHARE = 0.05
 
 
-def count_partners(num_keypoints: Sequence[int], batches: Iterable[MatchBatch]) -> list[IntArray]:
+def count_partners(num_keypoints: Sequence[int], batches: Iterable[KeypointMatches]) -> list[IntArray]:
     """Return in how many pairs each keypoint of each image is matched.
 
     Args:
@@ -56,12 +56,12 @@ def count_partners(num_keypoints: Sequence[int], batches: Iterable[MatchBatch]) 
         for k, ends in enumerate(batch.pairs.tolist()):
             matched = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]]
             for side, image in enumerate(ends):
-                counts[image] += _marked(counts[image], matched[:, side])
+                counts[image][matched[:, side]] += 1  # once, even where it is matched twice
     return counts
 
 
 def matched_shares(
-    pixels: Sequence[FloatArray], partners: Sequence[IntArray], batch: MatchBatch
+    pixels: Sequence[FloatArray], partners: Sequence[IntArray], batch: KeypointMatches
 ) -> FloatArray:
     """Return the share of a pair's overlap that is matched, for the pairs of a batch, (b,), in [0, 1].
 
@@ -82,8 +82,8 @@ def matched_shares(
 
 def _share(pixels: FloatArray, partners: IntArray, matched: IntArray) -> float:
     """Return the share of one image's overlap with another that is matched."""
-    ordered = np.sort(pixels[matched], axis=0)
-    (left, top), (right, bottom) = (ordered[round(share * (len(ordered) - 1))] for share in _BOX)
+    ranks = [round(share * (len(matched) - 1)) for share in _BOX]
+    (left, top), (right, bottom) = np.partition(pixels[matched], ranks, axis=0)[ranks]
     x, y = pixels.T
     own = _marked(partners, matched)
     findable = (x >= left) & (x <= right) & (y >= top) & (y <= bottom) & (partners > own)

@@ -1,16 +1,16 @@
 """Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
 
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
 from sfm_shapefit.colmap.model import PosedModel, track_matches
 from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
-from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.matches import KeypointMatches, MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.locate_options import LocateOptions, Source
@@ -18,6 +18,8 @@ from sfm_shapefit.results.result import Inputs
 
 if TYPE_CHECKING:
     import pycolmap
+
+Batch = TypeVar("Batch", MatchBatch, KeypointMatches)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,8 +41,8 @@ class MatchSource:
         return self.database.iter_matches(1, self.economy.batch, among)
 
     def counted(
-        self, batches: Iterator[MatchBatch], advance: Callable[[int, int], None]
-    ) -> Iterator[MatchBatch]:
+        self, batches: Iterator[Batch], advance: Callable[[int, int], None]
+    ) -> Iterator[Batch]:
         """Report progress while batches are consumed: pairs of a database, or images of a model."""
         total = self.model.num_images if self.database is None else self.database.num_pairs
         done = 0
@@ -75,14 +77,21 @@ class MatchSource:
         """Return the same source, which gives up so much for memory."""
         if self.database is not None:
             self.database.limit_rays(economy.rays_bytes)
+            if economy.statement:
+                self.database.forget_matches()
         return replace(self, economy=economy)
 
 
 @contextmanager
 def open_source(
-    model: PosedModel, inputs: Inputs, options: LocateOptions | None = None
+    model: PosedModel,
+    inputs: Inputs,
+    options: LocateOptions | None = None,
+    opened: MatchDatabase | None = None,
 ) -> Iterator[MatchSource]:
     """Open the matches that were chosen, and close them in the end; without options memory has no limit.
+
+    A database that is `opened` already stays open, and what was read of it is not read again.
 
     Raises:
         InputError: if the matches cannot be read, or there is no way to stay below the limit.
@@ -90,7 +99,11 @@ def open_source(
     if inputs.database is None:
         yield MatchSource(model=model, kind=inputs.source, database=None)
         return
-    with open_database(inputs.database, model, inputs.left_out) as database:
+    with ExitStack() as stack:
+        if opened is None:
+            database = stack.enter_context(open_database(inputs.database, model, inputs.left_out))
+        else:
+            database = opened.among(model, inputs.left_out)
         source = MatchSource(model=model, kind=inputs.source, database=database)
         if options is not None and options.max_memory_mb:
             bare = replace(

@@ -1,7 +1,7 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,11 +17,10 @@ from sfm_shapefit.colmap.point_support import (
     judge_observations,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
-from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, collect_matches, color_points, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
-from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import Similarity
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
@@ -204,24 +203,5 @@ def seed_and_tracks(
     seed = build_seed(model, is_placed, centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
-    return seed, correspondence_graph(seed, model.image_ids, batches)
-
-
-def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
-    """Empty the match lists of the rejected pairs (k, 2): their directions contradict the solution."""
-    unwanted = {(min(i, j), max(i, j)) for i, j in rejected.tolist()}
-    for batch in batches:
-        dropped: BoolArray = np.array(
-            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
-        )
-        counts = np.diff(batch.offsets)
-        kept = np.repeat(~dropped, counts)
-        yield MatchBatch(
-            pairs=batch.pairs[~dropped],
-            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
-            keypoints=batch.keypoints[kept],
-            rays_i=batch.rays_i[kept],
-            rays_j=batch.rays_j[kept],
-            pixel_angles=batch.pixel_angles[~dropped],
-        )
+    matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
+    return seed, collect_matches(seed, model.image_ids, source.counted(matches, advance))
