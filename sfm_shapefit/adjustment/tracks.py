@@ -1,13 +1,17 @@
 """Tracks: which keypoints of which cameras are taken for the same point, before any point is known."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.directions.tracks import sampson_px
+from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.viewgraph import connected_components
+from sfm_shapefit.jit import kernel
+
+# Between two slices Python can be interrupted: about 50 ms.
+_MATCHES_A_SLICE = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,18 +118,13 @@ class MatchedKeypoints:
             limit_px: largest Sampson error of a match that joins.
         """
         rays = normalized(self._rays(poses))
-        first, second = self.cameras[self.matches].T
-        directions = normalized(poses.centers[second] - poses.centers[first])
-        angles = 2.0 / (poses.focal_lengths_px[first] + poses.focal_lengths_px[second])
-        a, b = rays[self.matches[:, 0]], rays[self.matches[:, 1]]
-        joining = self.matches[sampson_px(a, b, directions, angles) <= limit_px]
-        is_joined = np.zeros(len(self.cameras), dtype=np.bool_)
-        is_joined[joining] = True
-        rows = np.flatnonzero(is_joined)
-        place = np.cumsum(is_joined) - 1
-        track = connected_components(len(rows), place[joining])
-        rows = rows[np.argsort(track, kind="stable")]
-        lengths = np.bincount(track)
+        parents = np.arange(len(self.cameras))
+        given = rays, self.cameras, poses.centers, poses.focal_lengths_px, limit_px
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            _join(self.matches[first : first + _MATCHES_A_SLICE], *given, parents)
+        track = number_trees(parents, np.arange(len(parents)))
+        rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
+        rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
         return ObservedTracks(
             offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
             cameras=self.cameras[rows],
@@ -139,3 +138,23 @@ class MatchedKeypoints:
         """Return the rays (K, 3) in axes of the world, of no particular length."""
         ahead = np.concatenate([self.on_plane, np.ones((len(self.on_plane), 1))], axis=1)
         return np.asarray(np.einsum("kba,kb->ka", poses.rotations[self.cameras], ahead))
+
+
+@kernel
+def _join(
+    matches: Any, rays: Any, cameras: Any, centers: Any, focal_lengths_px: Any, limit_px: float, parents: Any
+) -> None:
+    """Join the keypoints of the matches that agree with the poses."""
+    d = np.empty(3)
+    for m in range(len(matches)):
+        k, other = matches[m, 0], matches[m, 1]
+        i, j = cameras[k], cameras[other]
+        square = 0.0
+        for c in range(3):
+            d[c] = centers[j, c] - centers[i, c]
+            square += d[c] * d[c]
+        for c in range(3):
+            d[c] /= np.sqrt(square)
+        angle = 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])
+        if sampson_px(rays[k], rays[other], d, angle) <= limit_px:
+            unite(parents, k, other)

@@ -270,6 +270,10 @@ class MatchDatabase:
             return xy
         raise InputError(f"{self.path}: image {name} has a keypoint that is not finite; extract them again")
 
+    def count_keypoints(self, image: int) -> int:
+        """Return the number of keypoints of an image by its index; errors as of `keypoints`."""
+        return self._look_at(image).count
+
     def parts(self, max_matches: int) -> list[tuple[int, int]]:
         """Return the ranges (first, stop) of pairs, in their order, of about so many matches each."""
         totals = np.append(0, np.cumsum(self._pairs.num_inliers[self._pairs.has_matches]))

@@ -2,14 +2,15 @@
 
 import math
 from collections.abc import Collection, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.model import PosedModel, observed_points
+from sfm_shapefit.directions.joining import sampson_px
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.jit import kernel
 
 # So many frames stay whatever they see.
 _FEWEST_FRAMES = 3
@@ -77,8 +78,8 @@ def judge_observations(
     images = [
         structure.image(i) if is_in else None for i, is_in in zip(model.image_ids, registered, strict=True)
     ]
-    num_matches = [np.zeros(0 if image is None else image.num_points2D(), dtype=np.int64) for image in images]
-    num_missing = [np.zeros_like(counts) for counts in num_matches]
+    begins = np.append(0, np.cumsum([0 if image is None else image.num_points2D() for image in images]))
+    counts = np.zeros((int(begins[-1]), 3), dtype=np.int32)
     centers, turns = np.zeros((len(images), 3)), np.tile(np.eye(3), (len(images), 1, 1))
     for k, image in enumerate(images):
         if image is not None:
@@ -86,42 +87,54 @@ def judge_observations(
             centers[k] = image.projection_center()
             turns[k] = pose.rotation.matrix().T @ model.rotations[k]
     for batch in batches:
-        misses = _miss_epipolar_lines(batch, turns, centers, max_error_px)
-        for pair in np.flatnonzero(registered[batch.pairs].all(axis=1)).tolist():
-            rows = slice(batch.offsets[pair], batch.offsets[pair + 1])
-            for side, image in enumerate(batch.pairs[pair].tolist()):
-                num_matches[image][batch.keypoints[rows, side]] += 1
-                num_missing[image][batch.keypoints[rows, side]] += misses[rows]
+        baselines = centers[batch.pairs[:, 1]] - centers[batch.pairs[:, 0]]
+        lengths = np.maximum(np.linalg.norm(baselines, axis=1), np.finfo(np.float64).tiny)
+        _count_misses(
+            batch.pairs, batch.offsets, batch.keypoints, np.ascontiguousarray(batch.rays_i),
+            np.ascontiguousarray(batch.rays_j), turns, baselines / lengths[:, None], batch.pixel_angles,
+            max_error_px, registered, begins, counts,
+        )  # fmt: skip
     matched, agreeing, contradicting = 0, 0, 0
-    for image, counts, missing in zip(images, num_matches, num_missing, strict=True):
+    for image, own in zip(images, np.split(counts, begins[1:-1]), strict=True):
         if image is not None:
-            checked = counts >= _CHECKED_BY
+            checked = own[:, 0] >= _CHECKED_BY
             sees = np.zeros_like(checked)
             sees[observed_points(image)[0]] = True
             matched += int(checked.sum())
             agreeing += int(np.sum(checked & sees))
-            contradicting += int(np.sum(checked & ~sees & (2 * missing > counts)))
+            contradicting += int(np.sum(checked & ~sees & (2 * own[:, 1] > own[:, 0])))
     return ObservationShares(agreeing / matched, contradicting / matched) if matched else _NO_OBSERVATIONS
 
 
 _NO_OBSERVATIONS = ObservationShares(math.nan, math.nan)
 
 
-def _miss_epipolar_lines(
-    batch: MatchBatch, turns: FloatArray, centers: FloatArray, max_error_px: float
-) -> BoolArray:
-    """Return which matches miss the epipolar lines; `turns` (n, 3, 3) take the rays to the cameras' axes.
+@kernel
+def _count_misses(
+    pairs: Any, offsets: Any, keypoints: Any, rays_i: Any, rays_j: Any, turns: Any, baselines: Any,
+    pixel_angles: Any, max_error_px: float, registered: Any, begins: Any, counts: Any,
+) -> None:  # fmt: skip
+    """Count the partners of each keypoint of all images, and those of them that miss their epipolar lines.
 
-    Rays u, v and the baseline t span a volume (u x v) . t of 0. Over how it changes as u and v turn, that is
-    the angle by which both together miss. Two images in one place contradict nothing.
+    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take the rays to the cameras' axes. Two images in one place, whose baseline is 0,
+    contradict nothing.
     """
-    counts = np.diff(batch.offsets)
-    i, j = batch.pairs.T
-    baselines = centers[j] - centers[i]
-    lengths = np.linalg.norm(baselines, axis=1)
-    t = np.repeat(baselines / np.maximum(lengths, np.finfo(np.float64).tiny)[:, None], counts, axis=0)
-    u = np.einsum("kab,kb->ka", np.repeat(turns[i], counts, axis=0), batch.rays_i)
-    v = np.einsum("kab,kb->ka", np.repeat(turns[j], counts, axis=0), batch.rays_j)
-    volumes = np.abs(np.einsum("ka,ka->k", np.cross(u, v), t))
-    slopes = np.hypot(np.linalg.norm(np.cross(v, t), axis=1), np.linalg.norm(np.cross(u, t), axis=1))
-    return np.asarray(volumes > np.repeat(max_error_px * batch.pixel_angles, counts) * slopes)
+    u, v = np.empty(3), np.empty(3)
+    for p in range(len(pairs)):
+        i, j = pairs[p, 0], pairs[p, 1]
+        if not (registered[i] and registered[j]):
+            continue
+        for m in range(offsets[p], offsets[p + 1]):
+            for c in range(3):
+                u[c] = v[c] = 0.0
+                for a in range(3):
+                    u[c] += turns[i, c, a] * rays_i[m, a]
+                    v[c] += turns[j, c, a] * rays_j[m, a]
+            misses = sampson_px(u, v, baselines[p], pixel_angles[p]) > max_error_px
+            for side in range(2):
+                own = counts[begins[pairs[p, side]] + keypoints[m, side]]
+                other = 1 + pairs[p, 1 - side]
+                if own[2] != other:  # a keypoint may be matched twice with one image
+                    own[0] += 1
+                    own[1] += misses
+                    own[2] = other

@@ -12,27 +12,27 @@ covering set is chosen: so many that every camera, if it can, sees a given numbe
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.measured import MeasuredGraph
-from sfm_shapefit.viewgraph import ViewGraph, connected_components
+from sfm_shapefit.viewgraph import ViewGraph
 
 # These are about 3 tracks started per camera, of 6 views each: what determines a straight road.
 _PER_CAMERA = 20
 # A small scene can afford so many observations, in all and per camera.
 _IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
 _MIN_VIEWS = 3
-# So many matches are held at a time, in 0.6 GB.
+# The keypoints of so many matches are held at a time, in 0.4 GB.
 _MAX_MATCHES = 10_000_000
 # Rays farther apart gain nothing more, and are often wrong.
 _WIDEST_RAD = 0.5
-# No image has so many keypoints.
-_KEYPOINTS = 1 << 32
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -68,6 +68,7 @@ def build_tracks(
     batches: Iterable[MatchBatch],
     directions: PairDirections,
     threshold_px: float,
+    num_keypoints: IntArray,
     max_matches: int = _MAX_MATCHES,
 ) -> Tracks:
     """Return the tracks of at least three views that the matches of usable pairs form.
@@ -75,31 +76,64 @@ def build_tracks(
     The tracks and their order do not depend on the order of pairs.
 
     Args:
-        batches: the matches of all pairs.
+        batches: the matches of all pairs; they pass by once, none is held.
         directions: what was measured of the same pairs.
         threshold_px: largest Sampson error of a match that is kept.
-        max_matches: held in memory; beyond, a share of the keypoints is drawn.
+        num_keypoints: (n,) of each image.
+        max_matches: whose keypoints are held in memory; beyond, a share of the keypoints is drawn.
     """
     usable = directions.usable()
     share = min(1.0, max_matches / max(float(directions.num_inliers[usable].sum()), 1.0))
     pairs = map(tuple, directions.pairs[usable].tolist())
     rows = dict(zip(pairs, usable.tolist(), strict=True))
-    keys, rays = [], []
+    begins = np.append(0, np.cumsum(num_keypoints))
+    places = np.full(int(begins[-1]), -1, dtype=np.int32)
+    parents, rays, count = np.empty(0, dtype=np.int64), [], 0
     for batch in batches:
         row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
         counts = np.diff(batch.offsets)
-        kept = np.repeat(row >= 0, counts) & _draw_matches(batch, counts, share)
-        pair = np.repeat(np.arange(len(row)), counts)[kept]
-        d = directions.directions[row[pair]]
-        angle = batch.pixel_angles[pair]
-        agrees = sampson_px(batch.rays_i[kept], batch.rays_j[kept], d, angle) <= threshold_px
-        chosen = np.flatnonzero(kept)[agrees]
-        keys.append(batch.pairs[pair[agrees]] * _KEYPOINTS + batch.keypoints[chosen])
-        rays.append(np.stack([batch.rays_i[chosen], batch.rays_j[chosen]], axis=1).reshape(-1, 3))
-    if not keys:
-        zero = np.zeros(1, dtype=np.int64)
-        return Tracks(offsets=zero, cameras=zero[:0], rays=np.zeros((0, 3)))
-    return _components(np.concatenate(keys), rays)
+        drawn = _draw_matches(batch, counts, share)
+        keypoints = begins[np.repeat(batch.pairs, counts, axis=0)] + batch.keypoints
+        new_rays = np.empty((min(2 * len(keypoints), len(places) - count), 3))
+        if count + len(new_rays) > len(parents):
+            parents = np.concatenate([parents, np.arange(len(parents), 2 * (count + len(new_rays)))])
+        number = _join_batch(
+            row, batch.offsets, keypoints, drawn, np.ascontiguousarray(batch.rays_i),
+            np.ascontiguousarray(batch.rays_j), directions.directions, batch.pixel_angles, threshold_px,
+            places, parents, count, new_rays,
+        )  # fmt: skip
+        rays.append(new_rays[: number - count].copy())
+        count = number
+    return _collect(places, begins, parents[:count], np.concatenate([np.zeros((0, 3)), *rays]))
+
+
+@kernel
+def _join_batch(
+    row: Any, offsets: Any, keypoints: Any, drawn: Any, rays_i: Any, rays_j: Any, directions: Any,
+    pixel_angles: Any, threshold_px: float, places: Any, parents: Any, count: int, rays: Any,
+) -> int:  # fmt: skip
+    """Join the observations of matches that agree with their pair's direction; return how many there are.
+
+    `places` has the number of the observation of each keypoint of all images, -1 for none; new ones are
+    numbered from `count` on, and their rays written to `rays`.
+    """
+    first = count
+    for p in range(len(row)):
+        if row[p] < 0:
+            continue
+        for m in range(offsets[p], offsets[p + 1]):
+            if not drawn[m]:
+                continue
+            if not sampson_px(rays_i[m], rays_j[m], directions[row[p]], pixel_angles[p]) <= threshold_px:
+                continue
+            for side in range(2):
+                if places[keypoints[m, side]] < 0:
+                    places[keypoints[m, side]] = count
+                    for c in range(3):
+                        rays[count - first, c] = rays_i[m, c] if side == 0 else rays_j[m, c]
+                    count += 1
+            unite(parents, places[keypoints[m, 0]], places[keypoints[m, 1]])
+    return count
 
 
 def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
@@ -114,45 +148,25 @@ def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArra
     return np.asarray(drawn.any(axis=1))
 
 
-def sampson_px(a: FloatArray, b: FloatArray, d: FloatArray, pixel_angle: FloatArray) -> FloatArray:
-    """Return the Sampson error of matches (k, 3) against directions (k, 3) in pixels, see `directions`."""
-    along_a, along_b = np.sum(a * d, axis=1), np.sum(b * d, axis=1)
-    gradient = np.sqrt(np.maximum(2.0 - along_a**2 - along_b**2, 1e-12))
-    return np.asarray(np.abs(np.sum(np.cross(a, b) * d, axis=1)) / (gradient * pixel_angle))
-
-
-def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
-    """Return the tracks of matches from keys image * 2^32 + keypoint of both observations, (k, 2).
-
-    `rays` are those of the observations, (2 k, 3) in all, in parts.
-    """
-    keys, first, index = np.unique(ends.ravel(), return_index=True, return_inverse=True)
-    track = connected_components(len(keys), index.reshape(-1, 2))  # by first observation: keys are sorted
-    camera = keys // _KEYPOINTS
-    order = np.lexsort((camera, track))
-    track, camera, seen = track[order], camera[order], first[order]
-    repeated = np.zeros(int(track.max()) + 1, dtype=np.bool_)
+def _collect(places: IntArray, begins: IntArray, parents: IntArray, rays: FloatArray) -> Tracks:
+    """Return the tracks of joined observations, see `_join_batch`; (k,) `parents`, (k, 3) `rays`."""
+    keypoints = np.flatnonzero(places >= 0)
+    seen = places[keypoints].astype(np.int64)
+    camera = np.searchsorted(begins, keypoints, side="right") - 1
+    track = number_trees(parents, seen)[seen]
+    order = np.argsort(track, kind="stable")  # of a track by ascending camera, as keypoints are
+    track, camera, seen = track[order], camera[order], seen[order]
+    lengths = np.bincount(track)
+    repeated = np.zeros(len(lengths), dtype=np.bool_)
     again = (track[1:] == track[:-1]) & (camera[1:] == camera[:-1])
     repeated[track[1:][again]] = True
-    good = ~repeated & (np.bincount(track) >= _MIN_VIEWS)
+    good = ~repeated & (lengths >= _MIN_VIEWS)
     kept = good[track]
-    lengths = np.bincount(track)[good]
     return Tracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        offsets=np.append(0, np.cumsum(lengths[good])).astype(np.int64),
         cameras=camera[kept].astype(np.int64),
-        rays=_gather_rows(rays, seen[kept]),
+        rays=rays[seen[kept]],
     )
-
-
-def _gather_rows(parts: list[FloatArray], rows: IntArray) -> FloatArray:
-    """Return the given rows of arrays (., 3) that follow one another, without joining these."""
-    found = np.empty((len(rows), 3))
-    start = 0
-    for part in parts:
-        inside = np.flatnonzero((rows >= start) & (rows < start + len(part)))
-        found[inside] = part[rows[inside] - start]
-        start += len(part)
-    return found
 
 
 def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None) -> IntArray:

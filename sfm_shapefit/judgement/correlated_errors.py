@@ -78,6 +78,7 @@ def _add_scores(
     """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
     a, b, normal = np.empty(3), np.empty(3), np.empty(3)
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
+    terms = np.empty((16, 3))
     for p in range(len(pairs)):
         if not known[p]:
             continue
@@ -98,7 +99,7 @@ def _add_scores(
                 normal[c] /= square
             _tangential(a, across_b, factors[:2])
             _tangential(b, across_a, factors[2:])
-            _add_samples(pairs[p], keypoints[k], factors, normal, scores[p])
+            _add_samples(pairs[p], keypoints[k], factors, normal, terms, scores[p])
 
 
 @inner_kernel
@@ -126,22 +127,29 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
 
 
 @inner_kernel
-def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -> None:
-    """Add the score of one match times its residual in each sample."""
-    one, two = np.uint64(1), np.uint64(2)
-    f0, f1, f2, f3 = factors[0], factors[1], factors[2], factors[3]
+def _add_samples(pair: Any, match: Any, factors: Any, score: Any, terms: Any, scores: Any) -> None:
+    """Add the score of one match times its residual in each sample.
+
+    Two signs of either keypoint make sixteen residuals, and `terms` (16, 3) holds what each of them adds.
+    """
+    one, two, four = np.uint64(1), np.uint64(2), np.uint64(4)
+    for signs in range(16):
+        residual = factors[0] if signs & 1 else -factors[0]
+        residual += factors[1] if signs & 2 else -factors[1]
+        residual += factors[2] if signs & 4 else -factors[2]
+        residual += factors[3] if signs & 8 else -factors[3]
+        for c in range(3):
+            terms[signs, c] = residual * score[c]
+    both = one + two
     for first in range(0, len(scores), _SIGNS_PER_HASH):
         bits_i = _hash(pair[0], match[0], first)
         bits_j = _hash(pair[1], match[1], first)
         for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
-            residual = f0 if bits_i & one else -f0
-            residual += f1 if bits_i & two else -f1
-            residual += f2 if bits_j & one else -f2
-            residual += f3 if bits_j & two else -f3
+            signs = np.int64((bits_i & both) + four * (bits_j & both))
             bits_i >>= two
             bits_j >>= two
             for c in range(3):
-                scores[k, c] += residual * score[c]
+                scores[k, c] += terms[signs, c]
 
 
 @inner_kernel

@@ -1,5 +1,6 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from sfm_shapefit.colmap.adjustment import (
     with_poses,
 )
 from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
+from sfm_shapefit.colmap.structure import collect_matches
+from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.geometry import fit_similarity
 from tests.scenes import BUNDLED
 
@@ -203,33 +206,28 @@ def test_a_model_without_points_is_refused():
         sfm_shapefit.bundle_adjust(empty)
 
 
-def graph_of(model):
-    """The correspondence graph of a model's own tracks."""
-    graph = pycolmap.CorrespondenceGraph()
+def matches_of(model):
+    """The matches that a model's own tracks make."""
     images = sorted(model.reg_image_ids())
-    seen = {}
-    for i in images:
-        points = model.image(i).points2D
-        graph.add_image(i, len(points))
-        seen[i] = {p.point3D_id: k for k, p in enumerate(points) if p.has_point3D()}
-    for a in images:
-        for b in images:
-            common = sorted(seen[a].keys() & seen[b].keys())
-            if a < b and common:
-                geometry = pycolmap.TwoViewGeometry()
-                geometry.config = 2
-                matches = [[seen[a][p], seen[b][p]] for p in common]
-                geometry.inlier_matches = np.array(matches, dtype=np.uint32)
-                graph.add_two_view_geometry(a, b, geometry)
-    graph.finalize()
-    return graph
+    seen = [
+        {p.point3D_id: k for k, p in enumerate(model.image(i).points2D) if p.has_point3D()} for i in images
+    ]
+    pairs, parts = [], []
+    for a, b in itertools.combinations(range(len(images)), 2):
+        common = sorted(seen[a].keys() & seen[b].keys())
+        if common:
+            pairs.append([a, b])
+            parts.append(np.array([[seen[a][p], seen[b][p]] for p in common]))
+    offsets = np.append(0, np.cumsum([len(part) for part in parts]))
+    batch = KeypointMatches(pairs=np.array(pairs), offsets=offsets, keypoints=np.concatenate(parts))
+    return collect_matches(model, np.array(images), [batch])
 
 
 def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
     model = scene()
     frames = read_frames(model)
     own = collect_tracks(frames, model, model)
-    matched = collect_tracks(frames, model, graph_of(model))
+    matched = collect_tracks(frames, model, matches_of(model))
     assert isinstance(own, ObservedTracks)
     assert isinstance(matched, MatchedKeypoints)
     joined = matched.join(frames.poses(), 4.0)
@@ -251,7 +249,7 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
     for frame_id in sorted(truth.reg_frame_ids()):
         if frame_id not in fixed:
             start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
-    tracks = truth if source == "tracks" else graph_of(truth)
+    tracks = truth if source == "tracks" else matches_of(truth)
     found = adjust_thinly(start, tracks, fixed_frames=fixed).reconstruction
     assert found.num_points3D() == 0
     true, before, after = centers_of(truth), centers_of(start), centers_of(found)
@@ -266,7 +264,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     truth = scene("RADIAL")
     start = disturbed(truth)
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
-    tracks = start if source == "tracks" else graph_of(truth)
+    tracks = start if source == "tracks" else matches_of(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
     found = adjust_thinly(start, tracks, lenses=free)
     # 0.3 px on 7 views of 80 points

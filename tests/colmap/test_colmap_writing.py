@@ -20,9 +20,9 @@ from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import color_points, correspondence_graph, filter_points, triangulate
+from sfm_shapefit.colmap.structure import collect_matches, color_points, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
-from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
 from tests.problems import all_pairs
@@ -83,25 +83,17 @@ def all_matches(num_points=120, n=NUM_IMAGES):
 
 def batch_of(pairs, num_points):
     keypoints = np.tile(np.stack([np.arange(num_points)] * 2, axis=1), (len(pairs), 1))
-    no_rays = np.zeros((len(keypoints), 3))
     offsets = num_points * np.arange(len(pairs) + 1)
-    return MatchBatch(
-        pairs=pairs,
-        offsets=offsets,
-        keypoints=keypoints,
-        rays_i=no_rays,
-        rays_j=no_rays,
-        pixel_angles=np.zeros(len(pairs)),
-    )
+    return KeypointMatches(pairs=pairs, offsets=offsets, keypoints=keypoints)
 
 
 def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=None):
-    """The seed of a reconstruction at the given centers, or its own, and the graph of its matches."""
+    """The seed of a reconstruction at the given centers, or its own, and its matches."""
     model = read_model(reconstruction)
     placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
     centers = model.centers if centers is None else centers
     seed = build_seed(model, placed, centers, None if keypoints is None else keypoints.get)
-    return seed, correspondence_graph(seed, model.image_ids, all_matches() if batches is None else batches)
+    return seed, collect_matches(seed, model.image_ids, all_matches() if batches is None else batches)
 
 
 SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])
@@ -109,8 +101,8 @@ SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])
 
 def seeded_with(source, original, centers=None):
     """The seed, and what its points are triangulated from: all matches, or the model's own tracks."""
-    seed, graph = seeded(original, centers)
-    return seed, graph if source == "matches" else original
+    seed, matches = seeded(original, centers)
+    return seed, matches if source == "matches" else original
 
 
 def dump(reconstruction):
@@ -154,9 +146,9 @@ def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tm
 def test_the_input_of_every_stage_stays_as_it_was():
     original, _ = ring_model(noise_px=0.3)
     before = dump(original)
-    seed, graph = seeded(original, ring_centers() + 0.01)
+    seed, matches = seeded(original, ring_centers() + 0.01)
     seed_before = dump(seed)
-    for tracks in (graph, original):
+    for tracks in (matches, original):
         structure = triangulate(seed, tracks)
         structure_before = dump(structure)
         color_points(structure, original)
@@ -171,8 +163,8 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
     original, _ = ring_model()
     placed = np.arange(NUM_IMAGES) != 2
     centers = np.where(placed[:, None], ring_centers(), np.nan)
-    seed, graph = seeded(original, centers, placed)
-    structure = triangulate(seed, graph)
+    seed, matches = seeded(original, centers, placed)
+    structure = triangulate(seed, matches)
     write_model(structure, tmp_path)
     written = read_model(tmp_path)
     assert written.names == tuple(f"view{k}.jpg" for k in range(NUM_IMAGES) if k != 2)
@@ -227,13 +219,13 @@ def test_points_follow_the_new_positions_and_those_of_the_models_own_tracks_keep
     original, points = ring_model()
     for point_id in (3, 50):
         original.delete_point3D(point_id)
-    seed, graph = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
-    for tracks in (graph, original):
+    seed, matches = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
+    for tracks in (matches, original):
         structure = triangulate(seed, tracks)
-        assert structure.num_points3D() == 120 if tracks is graph else 118
+        assert structure.num_points3D() == 120 if tracks is matches else 118
         for point_id, point in structure.points3D.items():
             (keypoint,) = {element.point2D_idx for element in point.track.elements}
-            assert tracks is graph or keypoint == point_id - 1
+            assert tracks is matches or keypoint == point_id - 1
             expected = 2.0 * points[keypoint] + [1.0, 2.0, 3.0]
             np.testing.assert_allclose(point.xyz, expected, rtol=0.0, atol=2e-9)
     assert set(structure.point3D_ids()) == set(original.point3D_ids())
@@ -277,8 +269,8 @@ def test_the_same_gives_the_same_bits_again_and_in_place(source):
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
     # baselines of at most 0.12 units at 60 units: 0.11 degrees
     original, _ = ring_model(centers=0.01 * ring_centers() + [60.0, 0.0, 0.0])
-    seed, graph = seeded(original)
-    for tracks in (graph, original):
+    seed, matches = seeded(original)
+    for tracks in (matches, original):
         assert triangulate(seed, tracks).num_points3D() == 0
         options = StructureOptions(min_triangulation_angle_deg=0.05)
         assert triangulate(seed, tracks, options).num_points3D() == 120
@@ -305,13 +297,13 @@ def test_wrong_matches_make_no_point_that_misses_its_observations():
 
 
 def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_more_are_placed():
-    seed, graph = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
-    assert triangulate(seed, graph).num_points3D() == 0
-    both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
+    seed, matches = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
+    assert triangulate(seed, matches).num_points3D() == 0
+    both = triangulate(seed, matches, StructureOptions(ignore_two_view_tracks=False))
     assert both.num_points3D() == 120
-    seed, graph = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
-    assert triangulate(seed, graph).num_points3D() == 120
-    assert bundle_adjust(seed, graph).reconstruction.num_points3D() == 120
+    seed, matches = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
+    assert triangulate(seed, matches).num_points3D() == 120
+    assert bundle_adjust(seed, matches).reconstruction.num_points3D() == 120
 
 
 def test_matches_and_tracks_of_other_keypoints_are_refused():
@@ -332,8 +324,8 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
             original.delete_observation(element.image_id, element.point2D_idx)
         original.point3D(point_id).color = np.array([10, 20, 30], dtype=np.uint8)
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
-    seed, graph = seeded(original)
-    black = triangulate(seed, graph)
+    seed, matches = seeded(original)
+    black = triangulate(seed, matches)
     structure = color_points(black, original)
     assert not any(point.color.any() for point in black.points3D.values())
     assert color_points(black, original, in_place=True) is black
@@ -348,8 +340,8 @@ def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_the
     original, _ = ring_model()
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
-        seed_and_graph = seeded(original, keypoints={k: moved[k] for k in changed})
-        structure = color_points(triangulate(*seed_and_graph), original)
+        seed_and_matches = seeded(original, keypoints={k: moved[k] for k in changed})
+        structure = color_points(triangulate(*seed_and_matches), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
     for point in original.points3D.values():
@@ -454,13 +446,13 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     original, _ = ring_model()
     camera = original.camera(3)
     camera.params = np.array(camera.params) * [1.01, 1.0, 1.0, 1.0]
-    seed, graph = seeded(original)
-    fixed = bundle_adjust(seed, graph)
+    seed, matches = seeded(original)
+    fixed = bundle_adjust(seed, matches)
     assert fixed.reconstruction.camera(3).params[0] == 808.0
     doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
     for adjuster in ("own", "ceres"):
         given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
-        found = bundle_adjust(seed, graph, adjuster=adjuster, given=given)
+        found = bundle_adjust(seed, matches, adjuster=adjuster, given=given)
         for camera_id, camera in found.reconstruction.cameras.items():
             if camera_id == 3:
                 assert camera.params[0] == pytest.approx(800.0, rel=5e-4)
@@ -472,22 +464,22 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
 
 def test_adjusted_points_satisfy_the_same_filters():
     original, _ = ring_model(noise_px=1.0)
-    seed, graph = seeded(original)
-    adjusted = bundle_adjust(seed, graph, StructureOptions(max_reprojection_error_px=1.5))
+    seed, matches = seeded(original)
+    adjusted = bundle_adjust(seed, matches, StructureOptions(max_reprojection_error_px=1.5))
     assert 1.0 < max(reprojection_errors_px(adjusted.reconstruction)) <= 1.5
 
 
 def test_too_few_iterations_and_no_points_are_told(monkeypatch):
     monkeypatch.setattr("sfm_shapefit.colmap.ceres_adjustment._MAX_STEPS", 1)
     original, _ = ring_model(noise_px=0.5)
-    seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
-    adjusted = bundle_adjust(seed, graph, adjuster="ceres")
+    seed, matches = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
+    adjusted = bundle_adjust(seed, matches, adjuster="ceres")
     assert not adjusted.converged
     assert adjusted.iterations == 3
-    seed, graph = seeded(original, np.zeros((NUM_IMAGES, 3)))
+    seed, matches = seeded(original, np.zeros((NUM_IMAGES, 3)))
     for adjuster in ("own", "ceres"):
         with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
-            bundle_adjust(seed, graph, adjuster=adjuster)
+            bundle_adjust(seed, matches, adjuster=adjuster)
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -499,9 +491,9 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
         return make_adjuster(*arguments)
 
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
-    seed, graph = seeded(ring_model(noise_px=0.5)[0])
+    seed, matches = seeded(ring_model(noise_px=0.5)[0])
     with hear_pycolmap(not quiet):
-        bundle_adjust(seed, graph, adjuster="ceres")
+        bundle_adjust(seed, matches, adjuster="ceres")
     said = capfd.readouterr()
     assert said.out == ""
     assert ("not positive definite" in said.err) != quiet
@@ -545,9 +537,9 @@ def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):
 def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
     original, _ = ring_model(noise_px=0.3)
     placed = np.arange(NUM_IMAGES) != unplaced
-    seed, graph = seeded(original, ring_centers() + 0.01, placed)
+    seed, matches = seeded(original, ring_centers() + 0.01, placed)
     with atomic_folder(tmp_path / "out") as partial:
-        write_model(color_points(triangulate(seed, graph), original), partial)
+        write_model(color_points(triangulate(seed, matches), original), partial)
     (tmp_path / "adjusted").mkdir()
 
     analysis = colmap("model_analyzer", "--path", tmp_path / "out")

@@ -16,6 +16,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 PIXEL = 1e-3  # rad
 NUM_POINTS = 60
+KEYPOINTS = np.full(6, NUM_POINTS)
 
 
 def scene(cameras=6, seed=0, noise=0.0, wrong=0.0):
@@ -42,7 +43,7 @@ def scene(cameras=6, seed=0, noise=0.0, wrong=0.0):
 
 
 def tracks_of(batch, **options):
-    return build_tracks([batch], estimate_directions(batch), 2.0, **options)
+    return build_tracks([batch], estimate_directions(batch), 2.0, KEYPOINTS, **options)
 
 
 def reordered(batch, order):
@@ -75,7 +76,7 @@ def test_tracks_do_not_depend_on_the_order_of_pairs_or_on_batches():
     shuffled = reordered(batch, order)
     one, other = tracks_of(batch), tracks_of(shuffled)
     halves = [reordered(shuffled, half) for half in np.array_split(np.arange(len(order)), 2)]
-    split = build_tracks(halves, estimate_directions(batch), 2.0)
+    split = build_tracks(halves, estimate_directions(batch), 2.0, KEYPOINTS)
     for again in (other, split):
         np.testing.assert_array_equal(again.offsets, one.offsets)
         np.testing.assert_array_equal(again.cameras, one.cameras)
@@ -115,8 +116,8 @@ def test_matches_that_contradict_their_direction_join_no_track():
 def test_two_views_and_no_matches_are_no_track():
     _, _, batch = scene(cameras=2)
     directions = estimate_directions(batch)
-    none = build_tracks([], directions, 2.0)
-    assert build_tracks([batch], directions, 2.0).num_tracks == none.num_tracks == 0
+    none = build_tracks([], directions, 2.0, KEYPOINTS)
+    assert build_tracks([batch], directions, 2.0, KEYPOINTS).num_tracks == none.num_tracks == 0
     assert len(covering_set(none, 6)) == 0
 
 

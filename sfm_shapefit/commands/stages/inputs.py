@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
+
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
 from sfm_shapefit.colmap.model import PosedModel, track_matches
@@ -52,6 +54,14 @@ class MatchSource:
                 done = int(batch.pairs[-1, 0]) + 1 if self.database is None else done + len(batch.pairs)
             advance(min(done, total), total)
         advance(total, total)
+
+    def num_keypoints(self) -> IntArray:
+        """Return the number of keypoints of each image, (n,), to which matches refer."""
+        model, database = self.model, self.database
+        if database is not None:
+            return np.array([database.count_keypoints(k) for k in range(model.num_images)])
+        images = map(model.reconstruction.image, model.image_ids.tolist())
+        return np.array([image.num_points2D() for image in images])
 
     def workload(self) -> Workload:
         """Return what is known of the work before any direction is measured."""
