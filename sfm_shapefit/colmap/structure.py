@@ -49,6 +49,16 @@ class ImageMatches:
     keypoints: npt.NDArray[np.uint32]
     """(M, 2) index of the keypoint in the first image and in the second."""
 
+    def subset(self, kept: BoolArray) -> "ImageMatches":
+        """Return the matches that are kept, (M,), and the pairs that have any of them."""
+        sums = np.append(0, np.cumsum(kept))[self.offsets]
+        has_some = np.diff(sums) > 0
+        return ImageMatches(
+            image_pairs=self.image_pairs[has_some],
+            offsets=np.append(0, sums[1:][has_some]),
+            keypoints=self.keypoints[kept],
+        )
+
 
 TrackSource = ImageMatches | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
