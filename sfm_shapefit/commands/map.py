@@ -38,6 +38,8 @@ from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
+from sfm_shapefit.results.scene_words import describe_repeated_pairs, describe_rival_pairs
+from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
@@ -240,9 +242,10 @@ class _Run(NamedTuple):
             with self.clock("scores of pairs"):
                 matches = self.matches()
                 pixels = [matches.keypoints(k) for k in range(self.unposed.num_images)]
+                sizes = self.unposed.image_sizes()
                 partners = count_partners([len(own) for own in pixels], matches.iter_keypoints(LEAST_MATCHES))
                 for batch in matches.iter_keypoints(LEAST_MATCHES):
-                    found = matched_shares(pixels, partners, batch).tolist()
+                    found = matched_shares(pixels, sizes, partners, batch).tolist()
                     shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
         both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
         return self._replace(scores=dict(zip(pairs, both, strict=True)))
@@ -305,13 +308,7 @@ class _Run(NamedTuple):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 local = replace(inside, pairs=np.searchsorted(members, inside.pairs))
                 try:
-                    answer = average_consistently(
-                        len(members),
-                        local,
-                        self.options.min_matches,
-                        averaging=self.options.averaging,
-                        threads=self.options.num_threads(),
-                    )
+                    answer = self.average(len(members), local, self.evidence_of(inside))
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
@@ -324,6 +321,38 @@ class _Run(NamedTuple):
             kept = answer.registered
             if kept.sum() >= self.options.min_model_size:
                 yield members[kept], answer.subset(kept)
+
+    def average(
+        self, num_frames: int, relative: RelativeRotations, evidence: FloatArray
+    ) -> AveragedRotations:
+        """Average rotations, by the arrangement of the images that the matches speak for."""
+
+        def average(some: RelativeRotations) -> AveragedRotations:
+            return average_consistently(
+                num_frames,
+                some,
+                self.options.min_matches,
+                averaging=self.options.averaging,
+                threads=self.options.num_threads(),
+            )
+
+        averaged = average(relative)
+        if not evidence.any():
+            return averaged
+        chosen = choose_arrangement(relative, evidence, averaged, average)
+        return replace(
+            chosen.averaged,
+            num_repeated=int(chosen.refused.sum()),
+            num_rivals=int(chosen.rival.sum()),
+        )
+
+    def evidence_of(self, relative: RelativeRotations) -> FloatArray:
+        """Return how much speaks for each pair of frames; nothing for frames of rigs, or without scores."""
+        if len(self.frame_of_image) > int(self.frame_of_image.max()) + 1:
+            return np.zeros(len(relative.pairs))
+        pairs = map(tuple, relative.pairs.tolist())
+        shares = [self.scores.get(pair, (np.nan, np.nan))[1] for pair in pairs]
+        return evidence_of(relative, np.array(shares))
 
     def locate_components(
         self, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
@@ -458,6 +487,12 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
                 f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
                 "trust it without a look"
             )
+        if model.averaging.num_repeated:
+            yield (
+                f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
+            )
+        if model.averaging.num_rivals:
+            yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
         if len(doubtful):
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]

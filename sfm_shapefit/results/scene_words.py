@@ -41,6 +41,22 @@ def describe_doubtful_pairs(count: int) -> str:
     return f"{count} pairs in use look like repeated structure; --without doubtful_pairs.csv leaves them out"
 
 
+def describe_repeated_pairs(count: int) -> str:
+    """Say that pairs of a folded arrangement were not followed."""
+    return (
+        f"the scene repeats itself: {counted(count, 'pair')} would fold the images together, and lack most of "
+        "the matches that such pairs should share; they were not followed"
+    )
+
+
+def describe_rival_pairs(count: int) -> str:
+    """Say that another arrangement of the images is as likely."""
+    return (
+        f"the images can be arranged in another way that {counted(count, 'other pair')} speak for, with as "
+        "much evidence: the scene repeats itself; look whether parts of it are folded together"
+    )
+
+
 def loop_cells(loop: LoopOfVideo) -> list[str]:
     """Return the cells of a loop's row: its two stretches, pairs, matches, angle, what became of it."""
     refused, total = loop["num_refused"], loop["num_pairs"]

@@ -38,6 +38,10 @@ class AveragedRotations(Displayed):
     averaging: Averaging = "own"
     num_tried: int = 1
     """How many answers it was chosen from."""
+    num_repeated: int = 0
+    """Pairs that most matches speak for, and that are set aside as repeated structure, see `arrangements`."""
+    num_rivals: int = 0
+    """Pairs of another arrangement that the matches speak for as much as for this one."""
     certified: bool | None = None
     """Whether no rotations fit the kept pairs, with their final weights, better than those next to these, see
     `rotations.dual_certificate`. It does not say that these are the right pairs. None if not checked."""
