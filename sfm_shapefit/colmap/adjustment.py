@@ -180,32 +180,6 @@ def collect_tracks(
     )
 
 
-def agreeing_matches(
-    reconstruction: pycolmap.Reconstruction, matches: ImageMatches, max_error_px: float
-) -> ImageMatches:
-    """Return the matches that can be of one point at the poses of a reconstruction.
-
-    Where both observations miss a point by at most e, the match misses the epipolar line by sqrt(2) e, to
-    first order. So nothing is lost that could become a point, but of the wrong matches nearly all: pycolmap's
-    triangulator would try to merge two tracks for each of them.
-
-    Args:
-        reconstruction: with the keypoints of the images.
-        matches: of these.
-        max_error_px: e, the largest error of an observation.
-    """
-    frames = read_frames(reconstruction)
-    known = _among(matches, frames)
-    agrees = _matched_keypoints(frames, reconstruction, known).agree(frames.poses(), 2.0 * max_error_px)
-    return known.subset(agrees)
-
-
-def _among(matches: ImageMatches, frames: PosedFrames) -> ImageMatches:
-    """Return the matches between the posed images."""
-    kept = np.isin(matches.image_pairs, frames.image_ids).all(axis=1)
-    return matches if kept.all() else matches.subset(np.repeat(kept, np.diff(matches.offsets)))
-
-
 def with_rays_of(
     frames: PosedFrames, tracks: ObservedTracks | MatchedKeypoints
 ) -> ObservedTracks | MatchedKeypoints:
@@ -377,9 +351,12 @@ def _matched_keypoints(
     """Return the matches between posed images as pairs of keypoints."""
     counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
     begins = np.concatenate([[0], np.cumsum(counts)])
-    known = _among(matches, frames)
-    firsts = begins[np.searchsorted(frames.image_ids, known.image_pairs)]
-    ends = known.keypoints + np.repeat(firsts, np.diff(known.offsets), axis=0)
+    known = np.isin(matches.image_pairs, frames.image_ids).all(axis=1)
+    lengths, matched = np.diff(matches.offsets), matches.keypoints
+    if not known.all():
+        matched = matched[np.repeat(known, lengths)]
+    firsts = begins[np.searchsorted(frames.image_ids, matches.image_pairs[known])]
+    ends = matched + np.repeat(firsts, lengths[known], axis=0)
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     is_matched[ends] = True
     matched = np.flatnonzero(is_matched)

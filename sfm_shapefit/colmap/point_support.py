@@ -116,8 +116,8 @@ def _count_misses(
 ) -> None:  # fmt: skip
     """Count the partners of each keypoint of all images, and those of them that miss their epipolar lines.
 
-    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take the rays to the cameras' axes. Two images in one place, whose baseline is 0,
-    contradict nothing.
+    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take
+    the rays to the cameras' axes. Two images in one place, whose baseline is 0, contradict nothing.
     """
     u, v = np.empty(3), np.empty(3)
     for p in range(len(pairs)):

@@ -55,6 +55,7 @@ from sfm_shapefit.results.warnings import (
     quality_warnings,
     trust_warnings,
 )
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -131,6 +132,8 @@ class Locating(NamedTuple):
     """Of these centers, in their units."""
     intrinsics: Intrinsics = NO_DOUBTS
     """Which of the images' are in doubt, and what became of them so far."""
+    relative: RelativeRotations | None = None
+    """Relative rotations of pairs as far as they were measured with these intrinsics; None: not at all."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -155,7 +158,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         source, directions, located, known, options, clock
     )
     with clock("trust"):
-        relative = ask_pairs(source, directions, options)
+        relative = ask_pairs(source, directions, options, known.relative)
         focal_doubts = question_focal_lengths(source, directions, options)
         placement = doubt_cameras(located.placement, directions, relative, source.model, options)
         located = _judge_again(located, placement, options.min_trust)

@@ -20,7 +20,7 @@ from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
-from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.model import PosedModel, read_model, same_intrinsics
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
@@ -335,7 +335,7 @@ class _Run(NamedTuple):
         models = []
         for frames, members, averaging in self.average_images(relative, reasons):
             try:
-                located = self.locate_component(members, averaging)
+                located = self.locate_component(members, averaging, relative)
             except UnsolvableError as error:
                 reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
                 continue
@@ -346,7 +346,9 @@ class _Run(NamedTuple):
                 del reasons[k]
         return sorted(models, key=lambda model: -int(model.located.kept.sum()))
 
-    def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
+    def locate_component(
+        self, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
+    ) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
         priors = None if self.priors is None else self.priors.of(members)
@@ -367,9 +369,14 @@ class _Run(NamedTuple):
                 intrinsics = intrinsics.after(first.adjusted.lenses)
                 source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+            measured = None
+            if self.options.relative_rotations == "matches" and same_intrinsics(source.model, model):
+                measured = relative.subset(np.isin(relative.pairs, members).all(axis=1))
+                measured = replace(measured, pairs=np.searchsorted(members, measured.pairs))
             locating = Locating(
-                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics
-            )
+                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics,
+                relative=measured,
+            )  # fmt: skip
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()

@@ -40,9 +40,15 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource,
+    directions: PairDirections,
+    options: LocateOptions,
+    measured: RelativeRotations | None = None,
 ) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
+    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
+
+    Those that were `measured` already, with the intrinsics that the images have, are not measured again.
+    """
     if options.rotations == "measured" or source.kind == "relative-poses":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
@@ -50,7 +56,11 @@ def ask_pairs(
         return concatenate([])
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
-    for batch in source.batches():
+    if measured is not None:
+        known = [tuple(pair) in wanted for pair in measured.pairs.tolist()]
+        parts = [measured.subset(np.flatnonzero(known))]
+        wanted -= {tuple(pair) for pair in parts[0].pairs.tolist()}
+    for batch in source.batches() if wanted else ():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         parts.append(estimate_relative_rotations(rays, options.num_threads()))

@@ -87,9 +87,7 @@ def build_graph(source: MatchSource, directions: PairDirections, options: Locate
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
     if not (options.uses_points(model.num_images) and source.economy.points):
         return MeasuredGraph(graph, covariance=covariance)
-    tracks = build_tracks(
-        source.batches(), directions, options.inlier_threshold_px, source.num_keypoints()
-    )
+    tracks = build_tracks(source.batches(), directions, options.inlier_threshold_px, source.num_keypoints())
     chosen = tracks.subset(covering_set(tracks, model.num_images))
     return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
-from sfm_shapefit.colmap.adjustment import agreeing_matches
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
@@ -18,7 +17,7 @@ from sfm_shapefit.colmap.point_support import (
     judge_observations,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
-from sfm_shapefit.colmap.structure import ImageMatches, TrackSource, collect_matches, color_points, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, collect_matches, color_points, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -97,8 +96,6 @@ def build_seeded_model(
             source.database.forget_rays()  # triangulation is where most memory is needed
     if not options.bundle_adjust:
         with clock("triangulation"):
-            if isinstance(tracks, ImageMatches):
-                tracks = agreeing_matches(seed, tracks, options.max_reprojection_error_px)
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
