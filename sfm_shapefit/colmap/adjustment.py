@@ -352,11 +352,11 @@ def _matched_keypoints(
     counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
     begins = np.concatenate([[0], np.cumsum(counts)])
     known = np.isin(matches.image_pairs, frames.image_ids).all(axis=1)
-    lengths, matched = np.diff(matches.offsets), matches.keypoints
+    lengths, own = np.diff(matches.offsets), matches.keypoints
     if not known.all():
-        matched = matched[np.repeat(known, lengths)]
+        own = own[np.repeat(known, lengths)]
     firsts = begins[np.searchsorted(frames.image_ids, matches.image_pairs[known])]
-    ends = matched + np.repeat(firsts, lengths[known], axis=0)
+    ends = own + np.repeat(firsts, lengths[known], axis=0)
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     is_matched[ends] = True
     matched = np.flatnonzero(is_matched)

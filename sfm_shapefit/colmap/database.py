@@ -272,7 +272,7 @@ class MatchDatabase:
 
     def count_keypoints(self, image: int) -> int:
         """Return the number of keypoints of an image by its index; errors as of `keypoints`."""
-        return self._look_at(image).count
+        return self._look_at(image).number
 
     def parts(self, max_matches: int) -> list[tuple[int, int]]:
         """Return the ranges (first, stop) of pairs, in their order, of about so many matches each."""
@@ -495,7 +495,7 @@ class MatchDatabase:
         both = both[np.append(True, both[1:] != both[:-1])[: len(both)]]
         matches = np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.uint32)
         for image, keypoints in zip(self._pairs.pairs[pair].tolist(), matches.T, strict=True):
-            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).count:
+            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).number:
                 raise self._damaged_pair(pair, "matches of keypoints that do not exist")
         return matches
 
@@ -644,9 +644,9 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
 class _Keypoints(NamedTuple):
     """Those of an image."""
 
-    count: int
+    number: int
     blind: BoolArray | None
-    """(count,) which have no ray; None if all have one."""
+    """(number,) which have no ray; None if all have one."""
 
 
 class _Pairs(NamedTuple):

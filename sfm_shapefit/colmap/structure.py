@@ -123,7 +123,8 @@ def correspondence_graph(
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = _CALIBRATED
         geometry.inlier_matches = matches.keypoints[matches.offsets[pair] : matches.offsets[pair + 1]]
-        graph.add_two_view_geometry(*matches.image_pairs[pair].tolist(), geometry)
+        first, second = matches.image_pairs[pair].tolist()
+        graph.add_two_view_geometry(first, second, geometry)
     graph.finalize()
     return graph
 
@@ -285,7 +286,7 @@ def _joined_points(
         keypoints, ids = observed_points(image)
         point_of[begin + keypoints] = ids.astype(np.int64)
     joined, seen = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
-    known = np.isin(matches.image_pairs, image_ids).all(axis=1)
+    known: BoolArray = np.asarray(np.isin(matches.image_pairs, image_ids).all(axis=1))
     firsts = begins[np.searchsorted(image_ids, np.where(known[:, None], matches.image_pairs, image_ids[0]))]
     for first in range(0, len(known), _PAIRS_A_SLICE):
         pairs = slice(first, first + _PAIRS_A_SLICE)

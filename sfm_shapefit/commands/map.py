@@ -371,7 +371,7 @@ class _Run(NamedTuple):
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             measured = None
             if self.options.relative_rotations == "matches" and same_intrinsics(source.model, model):
-                measured = relative.subset(np.isin(relative.pairs, members).all(axis=1))
+                measured = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 measured = replace(measured, pairs=np.searchsorted(members, measured.pairs))
             locating = Locating(
                 inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics,

@@ -565,3 +565,14 @@ def colmap(*arguments):
     )
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
+
+
+def test_a_long_track_is_one_point_though_its_ends_are_not_matched():
+    original, _ = ring_model(noise_px=0.3)
+    neighbors = np.array(
+        [[k, k + 1] for k in range(NUM_IMAGES - 1)] + [[k, k + 2] for k in range(NUM_IMAGES - 2)]
+    )
+    seed, matches = seeded(original, batches=[batch_of(neighbors, 120)])
+    structure = triangulate(seed, matches)
+    assert structure.num_points3D() == 120
+    assert structure.compute_mean_track_length() > NUM_IMAGES - 0.5
