@@ -29,8 +29,8 @@ _TRACKS_A_BLOCK = 20_000
 _FEWEST_IMAGES_OF_A_CHECKED_TRACK = 3
 # Of a track: the share of the pixel threshold that a match may miss by, and the points it may be of. Where a
 # fifth of the matches is wrong, those within the whole threshold join a third of all observations to long
-# chains: on a made facade (a fifth wrong), fountain-P11, castle-P30 and lego100 the share 1 finds 3.6, 0.1, 0.3
-# and -1.2 % fewer observations than COLMAP's triangulator, 0.5 finds 0.2, 0.6, 1.5 and 1.6 % fewer.
+# chains: on a made facade (a fifth wrong), fountain-P11, castle-P30 and lego100 the share 1 finds 3.6, 0.1,
+# 0.3 and -1.2 % fewer observations than COLMAP's triangulator, 0.5 finds 0.2, 0.6, 1.5 and 1.6 % fewer.
 _JOINING_SHARE, _MOST_POINTS = 0.5, 50
 # Pairs of images, and matches, that are looked at together.
 _PAIRS_A_SLICE, _MATCHES_A_SLICE = 5_000, 1_000_000
