@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
@@ -105,8 +106,8 @@ class MatchedKeypoints:
     """(K, 2) as the adjustment's lens takes them."""
     on_plane: FloatArray
     """(K, 2) see `ObservedTracks`."""
-    matches: IntArray
-    """(m, 2) rows of the above."""
+    matches: npt.NDArray[np.integer]
+    """(m, 2) rows of the above, of any type of integer."""
 
     def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
         """Return the connected components under the matches that agree with the poses.
@@ -120,7 +121,8 @@ class MatchedKeypoints:
         parents = np.arange(len(self.cameras))
         given = normalized(self._rays(poses)), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
-            _join(self.matches[first : first + _MATCHES_A_SLICE], *given, parents)
+            block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
+            _join(block, *given, parents)
         track = number_trees(parents, np.arange(len(parents)))
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
         rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]

@@ -107,11 +107,15 @@ def find_database(model_folder: Path) -> Path | None:
 
 @contextmanager
 def open_database(
-    path: Path | str, model: PosedModel, left_out: PairNames = frozenset()
+    path: Path | str,
+    model: PosedModel,
+    left_out: PairNames = frozenset(),
+    rows: "PairRows | None" = None,
 ) -> Iterator["MatchDatabase"]:
     """Open a COLMAP database, for the matches of a model's images; neither it nor its folder is changed.
 
-    Pairs `left_out` are taken for unmatched.
+    Pairs `left_out` are taken for unmatched. With `rows`, as `MatchDatabase.rows` gave them for a model of
+    the same images, it has these pairs only, and the table of all pairs is not read again.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
@@ -122,7 +126,7 @@ def open_database(
         with _sqlite_errors(file):
             connection = stack.enter_context(_readonly_connection(file))
             _check_schema(file, connection)
-            database = MatchDatabase(file, connection, model, left_out)
+            database = MatchDatabase(file, connection, model, left_out, rows)
         yield database
 
 
@@ -162,8 +166,9 @@ class MatchDatabase:
         connection: sqlite3.Connection,
         model: PosedModel,
         left_out: PairNames = frozenset(),
+        rows: "PairRows | None" = None,
     ) -> None:
-        self.path, self.left_out = path, left_out
+        self.path = path
         self._connection = connection
         self._model = model
         self._cache_bytes = _CACHE_BYTES
@@ -172,7 +177,8 @@ class MatchDatabase:
         self._kept: dict[tuple[int, int], list[MatchBatch]] = {}
         index_of_id = _match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
-        self._pairs = _read_pairs(path, connection, index_of_id).without(_indices_of_names(model, left_out))
+        pairs = _read_pairs(path, connection, index_of_id) if rows is None else rows
+        self._pairs = pairs.without(_indices_of_names(model, left_out))
         self._looked_at: dict[int, _Keypoints] = {}
         self._sorted: SortedMatches | None = None
         if float(self._pairs.num_inliers.sum(dtype=np.float64)) <= MOST_MATCHES:
@@ -281,6 +287,10 @@ class MatchDatabase:
         bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
         return list(itertools.pairwise(bounds.tolist()))
+
+    def rows(self, part: tuple[int, int]) -> "PairRows":
+        """Return where the matches of a range of pairs are, one of `parts`, for another process to read them."""
+        return self._pairs.subset(np.flatnonzero(self._pairs.has_matches)[slice(*part)])
 
     def iter_matches(
         self,
@@ -649,7 +659,7 @@ class _Keypoints(NamedTuple):
     """(number,) which have no ray; None if all have one."""
 
 
-class _Pairs(NamedTuple):
+class PairRows(NamedTuple):
     """The pairs of posed images that have inlier matches, sorted by (i, j)."""
 
     pairs: IntArray
@@ -661,13 +671,17 @@ class _Pairs(NamedTuple):
     configs: IntArray
     num_inliers: IntArray
 
-    def without(self, left_out: set[tuple[int, int]]) -> "_Pairs":
+    def without(self, left_out: set[tuple[int, int]]) -> "PairRows":
         """Return all pairs but some (i, j), i < j."""
         if not left_out:
             return self
-        kept = np.array([(i, j) not in left_out for i, j in self.pairs.tolist()], dtype=np.bool_)
-        ends, rowids, swapped, configs, counts = self
-        return _Pairs(ends[kept], rowids[kept], swapped[kept], configs[kept], counts[kept])
+        return self.subset(
+            np.flatnonzero([(i, j) not in left_out for i, j in self.pairs.tolist()]).astype(np.int64)
+        )
+
+    def subset(self, chosen: IntArray) -> "PairRows":
+        """Return the chosen pairs."""
+        return PairRows(*(column[chosen] for column in self))
 
     @property
     def has_matches(self) -> BoolArray:
@@ -740,7 +754,7 @@ def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) 
     return index_of_id
 
 
-def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> _Pairs:
+def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> PairRows:
     """Read which pairs of posed images have inlier matches."""
     damaged = connection.execute(
         "SELECT pair_id FROM two_view_geometries WHERE typeof(pair_id) != 'integer' "
@@ -762,7 +776,7 @@ def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[in
     repeated = pair_ids[order[:-1]][(pairs[1:] == pairs[:-1]).all(axis=1)]
     if len(repeated):
         raise InputError(f"{path}: the two-view geometry of pair {repeated[0]} stands twice")
-    return _Pairs(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
+    return PairRows(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
 
 
 def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:

@@ -162,7 +162,7 @@ def triangulate(
         _triangulate_matches(structure, tracks, options, advance)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
-    _filter(structure, options)
+    filter_in_place(structure, options)
     return structure
 
 
@@ -176,7 +176,7 @@ def filter_points(
     is none); short tracks.
     """
     result = pycolmap.Reconstruction(reconstruction)
-    _filter(result, options or StructureOptions())
+    filter_in_place(result, options or StructureOptions())
     return result
 
 
@@ -207,7 +207,7 @@ def color_points(
 # --- triangulation ---------------------------------------------------------------------------------
 
 
-def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
+def filter_in_place(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
     """Do to our own `structure` what `filter_points` does to a copy; update the errors of points."""
     manager = pycolmap.ObservationManager(structure)
     manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
