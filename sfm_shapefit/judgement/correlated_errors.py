@@ -50,7 +50,7 @@ def sample_direction_errors(
     Returns:
         (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
-    scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
+    scores = np.zeros((len(matches.pairs), 3, NUM_SAMPLES))
     known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
     v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
     keypoints = np.ascontiguousarray(matches.keypoints)
@@ -59,7 +59,7 @@ def sample_direction_errors(
     _add_scores(*given, known, v, threshold_px, scores)
     bases = tangent_bases(v)
     gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
-    return np.asarray(scores @ gain.transpose(0, 2, 1))
+    return np.ascontiguousarray((gain @ scores).transpose(0, 2, 1))
 
 
 @kernel
@@ -78,6 +78,7 @@ def _add_scores(
     """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
     a, b, normal = np.empty(3), np.empty(3), np.empty(3)
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
+    residuals = np.empty(scores.shape[2])
     for p in range(len(pairs)):
         if not known[p]:
             continue
@@ -98,7 +99,11 @@ def _add_scores(
                 normal[c] /= square
             _tangential(a, across_b, factors[:2])
             _tangential(b, across_a, factors[2:])
-            _add_samples(pairs[p], keypoints[k], factors, normal, scores[p])
+            _sample_residuals(pairs[p], keypoints[k], factors, residuals)
+            # Sample after sample in memory, so that several are added at once.
+            for c in range(3):
+                for sample in range(len(residuals)):
+                    scores[p, c, sample] += residuals[sample] * normal[c]
 
 
 @inner_kernel
@@ -126,22 +131,22 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
 
 
 @inner_kernel
-def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -> None:
-    """Add the score of one match times its residual in each sample."""
-    one, two = np.uint64(1), np.uint64(2)
-    f0, f1, f2, f3 = factors[0], factors[1], factors[2], factors[3]
-    for first in range(0, len(scores), _SIGNS_PER_HASH):
+def _sample_residuals(pair: Any, match: Any, factors: Any, residuals: Any) -> None:
+    """Write the residual of one match in each sample: a factor per axis of its keypoints, by random signs."""
+    two, both = np.uint64(2), np.uint64(3)
+    sums = np.empty(16)
+    for signs in range(16):
+        total = 0.0
+        for axis in range(4):
+            total += factors[axis] if signs >> axis & 1 else -factors[axis]
+        sums[signs] = total
+    for first in range(0, len(residuals), _SIGNS_PER_HASH):
         bits_i = _hash(pair[0], match[0], first)
         bits_j = _hash(pair[1], match[1], first)
-        for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
-            residual = f0 if bits_i & one else -f0
-            residual += f1 if bits_i & two else -f1
-            residual += f2 if bits_j & one else -f2
-            residual += f3 if bits_j & two else -f3
+        for k in range(first, min(first + _SIGNS_PER_HASH, len(residuals))):
+            residuals[k] = sums[(bits_i & both) | (bits_j & both) << two]
             bits_i >>= two
             bits_j >>= two
-            for c in range(3):
-                scores[k, c] += residual * score[c]
 
 
 @inner_kernel
