@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.model import PosedModel, observed_points
+from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.matches import MatchBatch
 
 # So many frames stay whatever they see.
@@ -97,7 +97,7 @@ def judge_observations(
         if image is not None:
             checked = counts >= _CHECKED_BY
             sees = np.zeros_like(checked)
-            sees[observed_points(image)[0]] = True
+            sees[image.get_observation_point2D_idxs()] = True
             matched += int(checked.sum())
             agreeing += int(np.sum(checked & sees))
             contradicting += int(np.sum(checked & ~sees & (2 * missing > counts)))

@@ -204,11 +204,11 @@ def seed_and_tracks(
     seed = build_seed(model, is_placed, centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
+    batches = source.counted(without_pairs(source.batches(among), placement.rejected_pairs), advance)
     return seed, correspondence_graph(seed, model.image_ids, batches)
 
 
-def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
+def without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
     """Empty the match lists of the rejected pairs (k, 2): their directions contradict the solution."""
     unwanted = {(min(i, j), max(i, j)) for i, j in rejected.tolist()}
     for batch in batches:
