@@ -319,11 +319,12 @@ def adjust_placement(
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.adjust_placed(problem)
-    if weight.singled_out(problem.num_frames).any():
+    is_repeated = bool(weight.singled_out(problem.num_frames).any())
+    adjusted = run.adjust_placed(problem, _FIRST_FALL if is_repeated else _GIVEN_FALL)
+    if is_repeated:
         # A frame whose rotation was far off has had few of its tracks; where it stands now it has all.
         joined, found = run.triangulate(1.0)
-        adjusted = run.adjust_placed(run.frames.problem(joined, found))
+        adjusted = run.adjust_placed(run.frames.problem(joined, found), _GIVEN_FALL)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
         reconstruction=poses,
@@ -458,9 +459,9 @@ class _Run:
         self.converged = adjusted.converged
         return adjusted.problem
 
-    def adjust_placed(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+    def adjust_placed(self, problem: AdjustmentProblem, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, but those that would gain nothing by it."""
-        adjusted = self.solve(problem, self.choose_scale(problem), _GIVEN_FALL)
+        adjusted = self.solve(problem, self.choose_scale(problem), fall)
         if not self.lenses.doubts:
             return self.return_frames(problem, adjusted)
         self.judge_lenses(adjusted)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment.priors import cross_matrices
@@ -348,6 +347,9 @@ def _cost(fit: Similarity, ties: Ties) -> float:
 
 def _refine(start: Similarity, ties: Ties) -> Similarity:
     """Return the similarity of least robust (Cauchy) angular cost, from a start."""
+    # Here, since it takes long to import, and every command that writes results loads this module.
+    from scipy.optimize import least_squares
+
     middle = ties.eyes_second.mean(axis=0)
     size = start.scale * (median_spread(ties.eyes_second) or 1.0)
 

@@ -78,9 +78,7 @@ def measure_with_workers(
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
     parts = database.parts(work.matches_per_task)
-    tasks = [
-        PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts
-    ]
+    tasks = [PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts]
     found: list[Measured] = []
     for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
         found += measured
