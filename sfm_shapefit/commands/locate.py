@@ -157,10 +157,14 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
         focal_doubts = question_focal_lengths(source, directions, options)
-        placement = doubt_cameras(located.placement, directions, relative, source.model, options)
+
+        def judge(placement: Placement) -> Placement:
+            return doubt_cameras(placement, directions, relative, source.model, options)
+
+        placement = judge(located.placement)
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
-        further = place_further_pieces(source, placement, options)
+        further = place_further_pieces(source, placement, options, judge)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale

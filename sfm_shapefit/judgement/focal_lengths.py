@@ -22,9 +22,9 @@ Residuals are in pixels of each image, as it was taken,
 The pixels are what is observed, and a factor must not gain by making the noise of one image smaller.
 
 A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that gain
-0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if most of its
-images gain, if the pairs of its own images do not lose as clearly, and if the factor differs from 1 by 5 % or
-more. One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what
+0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs of its
+own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations held it
+must have three images or more, and most of them must gain: of one whose rotation is wrong the pairs do so, too. One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what
 these gain: the camera that gains most in all is named first, gets that focal length, and those that were
 doubted with it are asked again. If another one gains nearly as much, and is cleared by that correction,
 nothing tells which of the two is wrong, and neither is named.
@@ -52,7 +52,8 @@ _WIDTH_PX = 1.5
 _LEAST_GAINS = {True: 0.01, False: 0.03}
 _NOTICED, _LEAST_SIGMAS = 0.01, 3.0
 _LEAST_CHANGE = 0.05
-_LEAST_SHARE_OF_IMAGES = 0.75
+# With rotations held: images of a camera, and the share of them that gain.
+_FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 3, 0.75
 # A rival gains nearly as much from this share on.
 _RIVAL = 0.8
 _FEWEST_PAIRS = 5
@@ -179,10 +180,12 @@ def _is_doubtful(gains: FloatArray, images: IntArray, *, hold: bool) -> bool:
         hold: whether with rotations held.
     """
     least, inner = _LEAST_GAINS[hold], (images >= 0).all(axis=1)
+    if not _is_clear(gains, least) or _is_clear(-gains[inner], least):
+        return False
     _, labels = np.unique(images, return_inverse=True)
     of_images = np.bincount(labels.ravel(), np.repeat(gains, 2))[int(not inner.all()) :]
-    most_images = float(np.mean(of_images > 0.0)) >= _LEAST_SHARE_OF_IMAGES
-    return _is_clear(gains, least) and most_images and not _is_clear(-gains[inner], least)
+    gaining = float(np.mean(of_images > 0.0))
+    return not hold or (len(of_images) >= _FEWEST_IMAGES and gaining >= _LEAST_SHARE_OF_IMAGES)
 
 
 def _is_clear(gains: FloatArray, least: float) -> bool:

@@ -166,6 +166,14 @@ def test_two_groups_joined_at_one_camera_are_two_pieces(hinged):
     assert {row.piece for row in left_out} == {1}
 
 
+def test_cameras_of_a_further_piece_are_judged_by_their_pairs_as_those_of_the_largest(hinged):
+    for placement in (hinged.placement, hinged.further[0].placement):
+        doubts = placement.assessment.doubts
+        assert doubts is not None
+        assert len(doubts.kinds) == len(placement.cameras)
+        assert {kind.value for kind in doubts.kinds} == {"right"}
+
+
 def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
     first, second = {1, 2, 3, 4}, {4, 5, 6, 7, 8}
     write_result(hinged, tmp_path / "out")
