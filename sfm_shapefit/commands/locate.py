@@ -151,12 +151,15 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
+    before = source, directions
     source, directions, located, adjustment, intrinsics = _adjust(
         source, directions, located, known, options, clock
     )
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
-        focal_doubts = question_focal_lengths(source, directions, options)
+        # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
+        asked = (source, directions) if known.intrinsics.free.doubts else before
+        focal_doubts = question_focal_lengths(*asked, options)
 
         def judge(placement: Placement) -> Placement:
             return doubt_cameras(placement, directions, relative, source.model, options)

@@ -23,11 +23,14 @@ The pixels are what is observed, and a factor must not gain by making the noise 
 
 A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that gain
 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs of its
-own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations held it
-must have three images or more, and most of them must gain: of one whose rotation is wrong the pairs do so, too. One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what
-these gain: the camera that gains most in all is named first, gets that focal length, and those that were
-doubted with it are asked again. If another one gains nearly as much, and is cleared by that correction,
-nothing tells which of the two is wrong, and neither is named.
+own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations held, it
+must have two images, and three quarters of its images must gain: the pairs of a single one gain by a factor if
+its rotation is wrong, too.
+
+One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what these
+gain: the camera that gains most in all is named first, gets that focal length, and those that were doubted
+with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
+which of the two is wrong, and neither is named.
 
 Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone and the bundled `photographed`,
 of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
@@ -53,7 +56,7 @@ _LEAST_GAINS = {True: 0.01, False: 0.03}
 _NOTICED, _LEAST_SIGMAS = 0.01, 3.0
 _LEAST_CHANGE = 0.05
 # With rotations held: images of a camera, and the share of them that gain.
-_FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 3, 0.75
+_FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 2, 0.75
 # A rival gains nearly as much from this share on.
 _RIVAL = 0.8
 _FEWEST_PAIRS = 5
@@ -119,7 +122,9 @@ def _name(asked: _Asked, *, hold: bool) -> tuple[FocalDoubt, ...]:
         worst = max(doubts, key=lambda doubt: doubt.gain * doubt.num_pairs)
         factors[worst.camera] = worst.factor
         others = [doubt for doubt in doubts if doubt is not worst]
-        doubts = _ask(asked, factors, np.array([doubt.camera for doubt in others]), hold=hold) if others else []
+        doubts = (
+            _ask(asked, factors, np.array([doubt.camera for doubt in others]), hold=hold) if others else []
+        )
         cleared = {doubt.camera for doubt in others} - {doubt.camera for doubt in doubts}
         enough = _RIVAL * worst.gain * worst.num_pairs
         if any(doubt.camera in cleared and doubt.gain * doubt.num_pairs > enough for doubt in others):
