@@ -14,18 +14,19 @@ Noise that neighboring keypoints share is in both, other than in a covariance fr
 Single frames first. A few that are far off must not say what is usual, so that is the median agreement over
 what it is of a normal error. With the noise s^2 of a half, |d_f^1 + d_f^2|^2 / 6 has the mean 2 sigma^2 + s^2,
 and |d_f^1 - d_f^2|^2 / 6 the mean s^2, both by three degrees of freedom. Frames differ in noise, and three
-numbers hardly tell it: it is drawn towards what is common, as far as the frames' own numbers say that it is
-(Smyth, "Linear models and empirical Bayes methods for assessing differential expression", 2004): if 1 / s^2 is
-spread by nu degrees of freedom, the numbers are s_0^2 F(3, nu), and their quartiles tell nu and s_0. With what
-is usual for sigma^2 the ratio r of the former to 2 sigma^2 + s^2 is F(3, m), where s^2 has nu + 3 degrees of
-freedom and the sum m = (nu + 3) (1 + 2 sigma^2 / s^2)^2 (Satterthwaite). A frame beyond what that gives to any
-one of all frames once in a hundred times has its agreement for its sigma^2, and no part in what follows.
+numbers hardly tell it: it is drawn towards what is common, as far as the frames' own numbers say that it
+is (Smyth, "Linear models and empirical Bayes methods for assessing differential expression", 2004): if
+1 / s^2 is spread by nu degrees of freedom, the numbers are s_0^2 F(3, nu), and their quartiles tell nu and
+s_0. With what is usual for sigma^2 the ratio of the former to 2 sigma^2 + s^2 is F(3, m), where s^2 has
+nu + 3 degrees of freedom and the sum m = (nu + 3) (1 + 2 sigma^2 / s^2)^2 (Satterthwaite). A frame beyond
+what that gives to any one of all frames once in a hundred times has its agreement for its sigma^2, and no
+part in what follows.
 
 Then all others. If their median agreement does not exceed their median chance, freeing the rotations brings
 more noise than it takes errors away: they are held, and what that leaves open is what is usual. Otherwise
 sigma^2 is their mean agreement, and the adjustment weighs rotations by it. Where single frames are off and
-the others would be held, all are weighted: those by their own sigma, the others by the little that is open,
-at least a tenth of the chance, which is a hundred times what the matches say of them.
+the others would be held, all are weighted: those by their own sigma, the others by what is usual, and by a
+tenth of the chance at least, which is a hundred times what the matches say of them.
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
@@ -58,7 +59,7 @@ _MEDIAN_SQUARE = 0.7887
 # How probable it may be that any frame at all is singled out by chance.
 _FALSE_ALARM = 0.01
 _FREEDOM = 3.0
-# Of the chance: rotations that pull by that are as good as held.
+# Of the chance: rotations that pull by that stay what they are, for all that the matches say.
 _AS_GOOD_AS_HELD = 0.1
 
 

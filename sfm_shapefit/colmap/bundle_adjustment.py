@@ -153,10 +153,11 @@ class AdjustedPlacement:
             return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
         if self.errors.is_chance:
             frames = counted(int(self.weight.singled_out(len(self.frame_ids)).sum()), "frame")
+            open_deg = math.degrees(self.errors.sigma_rad)
             return (
                 f"centers, points and rotations adjusted: the matches put the given rotations of {frames} "
                 f"clearly off, which were weighted by that; the others, which freed would turn by chance "
-                f"({chance}), were as good as held"
+                f"({chance}), were weighted by the {open_deg:.2g} deg that they leave open"
             )
         sigma_deg = math.degrees(self.errors.sigma_rad)
         return (

@@ -21,19 +21,19 @@ Residuals are in pixels of each image, as it was taken,
 
 The pixels are what is observed, and a factor must not gain by making the noise of one image smaller.
 
-A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that gain
-0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs of its
-own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations held, it
-must have two images, and three quarters of its images must gain: the pairs of a single one gain by a factor if
-its rotation is wrong, too.
+A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that
+gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs
+of its own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations
+held, it must have two images, and three quarters of its images must gain: the pairs of a single one gain by a
+factor if its rotation is wrong, too.
 
 One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what these
 gain: the camera that gains most in all is named first, gets that focal length, and those that were doubted
 with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
 which of the two is wrong, and neither is named.
 
-Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone and the bundled `photographed`,
-of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
+Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and the
+bundled `photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
 """
 
 from dataclasses import replace
@@ -113,7 +113,7 @@ class _Asked(NamedTuple):
 
 
 def _name(asked: _Asked, *, hold: bool) -> tuple[FocalDoubt, ...]:
-    """Return the cameras that stay in doubt as one after the other is corrected, with rotations held or not."""
+    """Return the cameras that stay in doubt as one after the other is corrected; rotations held or free."""
     factors = np.ones(int(asked.lenses.camera_of.max(initial=-1)) + 1)
     found: list[FocalDoubt] = []
     # Only what was doubted at first is asked again: a right focal length makes no other one look wrong.

@@ -54,7 +54,7 @@ def test_a_camera_with_a_wrong_focal_length_is_named_with_the_right_one(factor, 
 
 
 def ring_about_an_object(factors, seed, count=30):
-    """Matches of images whose optical axes meet: two views without their rotation hardly tell focal lengths."""
+    """Matches of images whose optical axes meet: without rotations, two views hardly tell focal lengths."""
     rng = np.random.default_rng(seed)
     camera_of = (np.arange(IMAGES) % 3 == 0).astype(np.int64)
     angles = np.linspace(0.0, 2.0 * np.pi, IMAGES, endpoint=False)
