@@ -32,8 +32,8 @@ gain: the camera that gains most in all is named first, gets that focal length, 
 with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
 which of the two is wrong, and neither is named.
 
-Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and the
-bundled `photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
+Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and
+`photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
 """
 
 from dataclasses import replace
