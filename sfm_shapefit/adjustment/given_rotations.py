@@ -12,8 +12,8 @@ each half turns the frames by itself (common turns of all frames taken off):
 Noise that neighboring keypoints share is in both, other than in a covariance from residuals.
 
 Single frames first. A few that are far off must not say what is usual, so that is the median agreement over
-what it is of a normal error. With the noise s^2 of a half, |d_f^1 + d_f^2|^2 / 6 has the mean 2 sigma^2 + s^2,
-and |d_f^1 - d_f^2|^2 / 6 the mean s^2, both by three degrees of freedom. Frames differ in noise, and three
+what it is of a normal error. With the noise s^2 of a half, |d_f^1 + d_f^2|^2 / 6 has the mean 2 sigma^2 + s^2
+and |d_f^1 - d_f^2|^2 / 6 has s^2, both by three degrees of freedom. Frames differ in noise, and three
 numbers hardly tell it: it is drawn towards what is common, as far as the frames' own numbers say that it
 is (Smyth, "Linear models and empirical Bayes methods for assessing differential expression", 2004): if
 1 / s^2 is spread by nu degrees of freedom, the numbers are s_0^2 F(3, nu), and their quartiles tell nu and
