@@ -289,7 +289,7 @@ class MatchDatabase:
         return list(itertools.pairwise(bounds.tolist()))
 
     def rows(self, part: tuple[int, int]) -> "PairRows":
-        """Return where the matches of a range of pairs are, one of `parts`: another process reads them there."""
+        """Return where the matches of a range of pairs, one of `parts`, are, for another process."""
         return self._pairs.subset(np.flatnonzero(self._pairs.has_matches)[slice(*part)])
 
     def iter_matches(

@@ -154,16 +154,23 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
+    before = source, directions
     source, directions, located, adjustment, intrinsics = _adjust(
         source, directions, located, known, options, clock
     )
     with clock("trust"):
         relative = ask_pairs(source, directions, options, known.relative)
-        focal_doubts = question_focal_lengths(source, directions, options)
-        placement = doubt_cameras(located.placement, directions, relative, source.model, options)
+        # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
+        asked = (source, directions) if known.intrinsics.free.doubts else before
+        focal_doubts = question_focal_lengths(*asked, options)
+
+        def judge(placement: Placement) -> Placement:
+            return doubt_cameras(placement, directions, relative, source.model, options)
+
+        placement = judge(located.placement)
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
-        further = place_further_pieces(source, placement, options)
+        further = place_further_pieces(source, placement, options, judge)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale

@@ -45,7 +45,7 @@ class KeyFigures(TypedDict):
         float | None, "Median angle between the direction of a pair and the line between its cameras."
     ]
     pair_error_px: Annotated[
-        float | None, "The same in pixels, at the cameras' median focal length; null for a bare graph."
+        float | None, "The same in pixels, at the images' median focal length; null for a bare graph."
     ]
     sigma: Annotated[
         float | None,

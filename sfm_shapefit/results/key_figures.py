@@ -41,7 +41,8 @@ def key_figures(
     Args:
         cameras: their rows; those that are not placed do not count.
         pair_error_deg: median angle between the direction of a pair and the line between its cameras.
-        focal_length_px: median of the cameras; NaN for a bare graph.
+        focal_length_px: median over the images, as pairs are of images, and one camera may take most of
+            them; NaN for a bare graph.
         unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
     """
     placed = [row for row in cameras if row.placed]

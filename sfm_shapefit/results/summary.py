@@ -44,8 +44,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
     solved = [(0, found.gauge.statement, int(np.sum(found.kept)))]
     solved += [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in found.further]
     num_unusable = len(found.directions.pairs) - placement.num_pairs
-    cameras = found.model.reconstruction.cameras.values()
-    focal_length_px = float(np.median([camera.mean_focal_length() for camera in cameras]))
+    focal_length_px = float(np.median(found.model.focal_lengths_px))
     return {
         **_summarize(found, solved, found.warnings, (focal_length_px, UNITS[found.gauge.scale])),
         "num_images": len(found.image_names),

@@ -192,11 +192,17 @@ def _state(before: Gauge, after: Gauge) -> str:
 
 
 def place_further_pieces(
-    source: MatchSource, placement: Placement, options: LocateOptions
+    source: MatchSource,
+    placement: Placement,
+    options: LocateOptions,
+    judge: Callable[[Placement], Placement],
 ) -> tuple[FurtherPiece, ...]:
-    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own."""
+    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own.
+
+    What is trusted of a piece is what `judge` makes of it, as of the largest one.
+    """
     pieces = []
-    for further in place_further(placement, options):
+    for further in map(judge, place_further(placement, options)):
         kept = select_trusted(further, options.min_trust)
         gauge = unit_gauge(further.locations[kept])
         seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
