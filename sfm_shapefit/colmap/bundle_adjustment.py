@@ -352,15 +352,21 @@ class _Run:
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
         few = len(self.frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
-        checked = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
-        self.min_length = max(options.min_track_length, 3 if checked else 2)
+        checks = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
+        fewest = _FEWEST_IMAGES_OF_A_CHECKED_POINT if checks else 2
+        self.checked_length = max(options.min_track_length, fewest)
 
-    def triangulate(self, widening: float) -> tuple[ObservedTracks, TriangulatedPoints]:
-        """Return the tracks and points at the frames' poses, at so many pixel thresholds."""
+    def triangulate(
+        self, widening: float, *, checked: bool = False
+    ) -> tuple[ObservedTracks, TriangulatedPoints]:
+        """Return the tracks and points at the frames' poses, at so many pixel thresholds.
+
+        Checked: only points that the model may have; without, points of two images too.
+        """
         limits = PointLimits(
             max_error_px=widening * self.options.max_reprojection_error_px,
             min_angle_deg=self.options.min_triangulation_angle_deg,
-            min_length=self.min_length,
+            min_length=self.checked_length if checked else self.options.min_track_length,
         )
         poses = self.frames.poses()
         tracks = self.source.join(poses, limits.max_error_px)
@@ -386,7 +392,7 @@ class _Run:
 
     def adjust_twice_thinly(self) -> AdjustmentProblem:
         """Move coarse frames: at the wide limit, then finely at the threshold; return the last problem."""
-        adjusted = self.adjust_thinly(*self.triangulate(_THIN_LIMIT))
+        adjusted = self.adjust_thinly(*self.triangulate(_THIN_LIMIT, checked=True))
         joined, found = self.triangulate(1.0)
         return self.adjust_thinly(joined, found, finely=True) if len(found.points) else adjusted
 
@@ -514,14 +520,16 @@ class _Run:
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
         """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
-        (joined, found), (loosely, loose) = self.triangulate(1.0), self.triangulate(_THIN_LIMIT)
+        (joined, found), (loosely, loose) = (
+            self.triangulate(widening, checked=True) for widening in (1.0, _THIN_LIMIT)
+        )
         refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self.adjust_thinly(loosely, loose)
         joined, found, adjusted = self.adjust_by_all_points()
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
-        found = replace(found, points=adjusted.points)
+        found = replace(found, points=adjusted.points).of_length(self.checked_length)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks
         add_points(answer, self.frames, joined, found, colors)
         return answer, initial_error_px, adjusted
