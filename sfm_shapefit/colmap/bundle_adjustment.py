@@ -16,10 +16,12 @@ stand, a first solve at 1 px leads away from what finer losses find: a street of
 to 0.0144, from where a relative fall of 1e-4 ends at 0.0114, and 1e-5 at 0.0113. Tracks are joined from the
 matches that agree with the poses, anew for each solve.
 
-Points of two images take part, but for the poses that may be coarse, though no model gets them: a wrong
-match of these goes unnoticed in a model, while here it is one of many that the loss weighs. A third to a
-half of all matches are of no other tracks, and each tells the cameras one thing. Chosen on castle-P19 (mean
-error 0.0254 without, 0.0238 with them), Herz-Jesus-P8 (0.0036, both) and a rendered street.
+Points of two images take part where the poses are fine, though no model gets them: a wrong match of these
+goes unnoticed in a model, while here it is one of many that the loss weighs. On photographs a fifth to two
+fifths of all observations are of no longer tracks, and each such match tells the cameras one thing. Chosen
+on castle-P19 (mean error 0.0254 without, 0.0238 with them), Herz-Jesus-P8 (0.0036, both) and a rendered
+street (0.0116, 0.0114). From rotations that were given (`adjust_placement`) a first solve may be far off,
+and takes checked points alone.
 
 One thread does all, as the answer must not depend on their number.
 """
@@ -312,20 +314,19 @@ def adjust_placement(
     if run.lenses.doubts:  # points are found, and rotations judged, with the lenses that come out
         run.repeat_with_known_lenses(run.adjust_twice_thinly)
         run.frames = replace(run.frames, rotations=run.start.rotations)
-    joined, found = run.triangulate(1.0)
+    joined, found = run.triangulate(1.0, checked=True)
     refuse_without_points(len(found.points))
     problem = run.frames.problem(joined, found)
     if weight is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
         loss_scale_px = run.choose_scale(problem) * structure_options.max_reprojection_error_px
-        options = AdjustmentOptions(loss_scale_px=loss_scale_px)
-        errors = estimate_rotation_errors(run.checked(problem), options)
+        errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
     adjusted = run.adjust_placed(problem)
     if weight.singled_out(problem.num_frames).any():
         # A frame whose rotation was far off has had few of its tracks; where it stands now it has all.
-        joined, found = run.triangulate(1.0)
+        joined, found = run.triangulate(1.0, checked=True)
         adjusted = run.adjust_placed(run.frames.problem(joined, found))
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
