@@ -41,6 +41,7 @@ _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, w
 _LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
 _STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual that is rounding
+_LEAST_LEFT = 0.25  # of two observations, what their point leaves
 _BEHIND_PX = 1e6  # what a point behind its camera counts as where frames are compared
 
 
@@ -179,20 +180,27 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
     the asymptotic variance of an M-estimator. Where most observations are far better than the worst, as
     those of features in photographs, small c are better; under normal errors 2.4 standard deviations are.
 
+    A point follows its own l observations: of their 2 l residuals 2 l - 3 are left. So |r|^2 is that share of
+    the error's square, and the observation tells that share about the cameras. Points of two observations
+    count where there are no others: with one residual left, they say little of what it is in the plane.
+
     Args:
         problem: at or near its minimum.
         scales_px: to choose from.
 
-    Source: Huber, "Robust Estimation of a Location Parameter", 1964; for adaptive scales, Huber, "Robust
-    Statistics", 1981, section 4.
+    Source: Huber, "Robust Estimation of a Location Parameter", 1964; for adaptive scales and the correction
+    for what is fitted, Huber, "Robust Statistics", 1981, sections 4 and 7.6.
     """
-    squares = reprojection_errors_px(problem) ** 2
-    squares = squares[np.isfinite(squares)]
+    lengths = np.bincount(problem.points_seen, minlength=problem.num_points)[problem.points_seen]
+    left = np.maximum(1.0 - 1.5 / lengths, _LEAST_LEFT)
+    squares = reprojection_errors_px(problem) ** 2 / left
+    counts = np.isfinite(squares) & (lengths >= min(3, int(lengths.max(initial=0))))
+    squares, left = squares[counts], left[counts]
 
     def variance(scale_px: float) -> float:
         weights = 1.0 / (1.0 + squares / scale_px**2)
-        slope = float(np.sum(weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
-        return float(np.sum(weights**2 * squares)) / max(slope, 1e-300) ** 2
+        slope = float(np.sum(left * weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
+        return float(np.sum(left * weights**2 * squares)) / max(slope, 1e-300) ** 2
 
     return min(scales_px, key=variance)
 

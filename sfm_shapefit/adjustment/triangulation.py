@@ -60,6 +60,13 @@ class TriangulatedPoints:
     points_seen: IntArray
     """(m,) the point of each observation of the tracks, -1 for those that are of none."""
 
+    def of_length(self, least: int) -> "TriangulatedPoints":
+        """Return the points with so many observations; those of the others are of none."""
+        seen = self.points_seen
+        kept = np.bincount(seen[seen >= 0], minlength=len(self.points)) >= least
+        place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        return TriangulatedPoints(points=self.points[kept], tracks=self.tracks[kept], points_seen=place[seen])
+
 
 def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> TriangulatedPoints:
     """Return the points of tracks; the same bits whatever else is triangulated with them.
