@@ -68,7 +68,7 @@ def measure(method: str, share: float, num_images: int, drives: int) -> list[Out
         with tempfile.TemporaryDirectory() as folder:
             workspace = Path(folder) / "drive"
             options = WorkspaceOptions(model="rotations", relative_poses=True)
-            write_workspace(scene.scene, workspace, options, scene)
+            write_workspace(scene.scene, workspace, options)
             outcomes.append(_run(method, scene, workspace))
     return outcomes
 

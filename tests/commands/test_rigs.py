@@ -30,7 +30,7 @@ def rigs():
 @pytest.fixture(scope="module")
 def workspace(rigs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs") / "drive"
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"), rigs)
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
     return folder
 
 
@@ -136,7 +136,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     parts |= {name: getattr(images, name)[rows] for name in ("matches", "match_is_wrong")}
     lonely = replace(images, **parts, match_offsets=np.append(0, np.cumsum(counts[kept])))
     out = workspace.parent / "lonely"
-    write_workspace(lonely, out, WorkspaceOptions(model="rotations"), rigs)
+    write_workspace(lonely, out, WorkspaceOptions(model="rotations"))
     located = sfm_shapefit.locate(out / "sparse" / "0", points="never")
     row = located.cameras[4]
     assert row.placed
@@ -170,7 +170,7 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False), rigs)
+    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():

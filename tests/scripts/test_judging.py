@@ -269,7 +269,7 @@ def test_errors_are_taken_after_shift_and_scale_and_those_of_rotations_after_the
 
 def test_scale_and_errors_are_those_of_the_model(tmp_path):
     drive = make_rig_drive(SceneOptions(num_images=12, num_points=300, min_matches=8))
-    write_workspace(drive.scene, tmp_path / "w", WorkspaceOptions(model="rotations"), drive)
+    write_workspace(drive.scene, tmp_path / "w", WorkspaceOptions(model="rotations"))
     model = pycolmap.Reconstruction(tmp_path / "w" / "truth")
     exact = rigs.compare(drive, model, 1.0)
     assert exact.num_images == 12
