@@ -6,6 +6,7 @@ Each stage is one function from values to a new value; the input is never change
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -45,6 +46,7 @@ from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.placement.tied_groups import measure_unit
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
@@ -204,13 +206,20 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
 def _at_known_centers(
     placement: Placement, known: Locating, model: PosedModel, options: LocateOptions
 ) -> Placement:
-    """Return the placement with its cameras where an adjustment had them, and how well it knew that."""
+    """Return the placement with its cameras where an adjustment had them, and how well it knew that.
+
+    In units of the solver, those of the rigs are then as long as the adjustment has them, not as the
+    directions had: all pixels say it better.
+    """
     assert known.centers is not None
     centers = known.centers[placement.cameras]
     placed = bring_to_scale(placement, centers)
     there = np.isfinite(centers).all(axis=1)
     scale = median_spread(centers[there]) / median_spread(placed[there])
-    return with_uncertainty(move_cameras(placement, placed, options), model, known.uncertainty, scale)
+    moved = move_cameras(placement, placed, options)
+    if moved.unit is not None:
+        moved = replace(moved, unit=measure_unit(moved.measured_part(), moved.refined.locations))
+    return with_uncertainty(moved, model, known.uncertainty, scale)
 
 
 class _Adjusted(NamedTuple):

@@ -15,8 +15,8 @@ import pycolmap
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
-from sfm_shapefit.synthetic.options import ModelContent
 from sfm_shapefit.synthetic.mounts import Rigs
+from sfm_shapefit.synthetic.options import ModelContent
 
 
 class Points(NamedTuple):

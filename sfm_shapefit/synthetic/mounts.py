@@ -1,7 +1,7 @@
 """Rigs of synthetic scenes: which images were taken at once, and where the sensors stand in their rig.
 
-A rig's axes are those of its first sensor: x to the right, y down, z ahead. Sensors stand apart by decimeters,
-as on a small vehicle:
+A rig's axes are those of its first sensor: x to the right, y down, z ahead. Sensors stand apart as on a
+car, so that a scene of some 20 m has a scale to a thousandth:
 
     pair            two look ahead, side by side
     back-to-back    one looks ahead, one backwards: they never see the same
@@ -88,10 +88,10 @@ def yawed(yaw_deg: FloatArray) -> FloatArray:
 # Yaw and offset of each sensor.
 _SENSORS: dict[RigKind, tuple[list[float], list[list[float]]]] = {
     "none": ([0.0], [[0.0, 0.0, 0.0]]),
-    "pair": ([0.0, 0.0], [[0.0, 0.0, 0.0], [0.8, 0.0, 0.0]]),
-    "back-to-back": ([0.0, 180.0], [[0.0, 0.0, 0.0], [0.3, 0.1, -0.8]]),
+    "pair": ([0.0, 0.0], [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]),
+    "back-to-back": ([0.0, 180.0], [[0.0, 0.0, 0.0], [0.3, 0.1, -2.4]]),
     "four": (
         [0.0, 0.0, 90.0, -90.0],
-        [[0.0, 0.0, 0.0], [0.8, 0.0, 0.0], [0.0, -0.2, -0.6], [0.8, -0.2, -0.6]],
+        [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0], [-0.2, -0.2, -1.0], [1.4, -0.2, -1.0]],
     ),
 }

@@ -92,9 +92,7 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
         centers=layout.centers,
         stated_rotations=state_rotations(layout.rotations, rigs, options, rngs[5]),
         rigs=rigs,
-        surfaces=make_surfaces(
-            options.shape, len(rigs.rig_of_frame), render.repeated_fraction, surface_rng
-        ),
+        surfaces=make_surfaces(options.shape, len(rigs.rig_of_frame), render.repeated_fraction, surface_rng),
     )
     _refuse_folding(scene)
     return scene

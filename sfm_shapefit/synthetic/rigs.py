@@ -45,7 +45,8 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     """Return the drive of two rigs of three cameras.
 
     Args:
-        options: `num_images` is rounded down to whole frames; `shape` and `rig` are not read, and rotations are exact.
+        options: `num_images` is rounded down to whole frames; `shape` and `rig` are not read. Rotations are
+            exact.
 
     Raises:
         ValueError: if there is not a frame for each rig, or rotations are to be wrong.

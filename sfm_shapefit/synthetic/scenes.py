@@ -31,6 +31,7 @@ from sfm_shapefit.synthetic.layouts import (
     SceneCameras,
     lay_out_scene,
     state_rotations,
+    turn_at_random,
 )
 from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import SceneOptions
