@@ -14,7 +14,14 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+from sfm_shapefit.synthetic import (
+    SceneOptions,
+    WorkspaceOptions,
+    make_rendered_scene,
+    make_rig_drive,
+    make_scene,
+)
+from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run
 from tests.scenes import RING, copied, edit_database
@@ -319,6 +326,39 @@ def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspac
             np.testing.assert_allclose(
                 ours.rig(rig_id).sensor_from_rig(sensor).matrix(), pose.matrix(), atol=1e-12
             )
+
+
+def assert_mapped_as_well_as_located(scene, workspace, largest_scale_error=1e-3, **options):
+    """`map` has no rotations: `locate` starts at the true ones and frees them."""
+    (model,) = sfm_shapefit.map_database(workspace / "database.db", **options).models
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", rotations="free", **options)
+    mean_errors = []
+    for found in (model.located, located):
+        ids, own = centers_of(found.reconstruction)
+        assert len(ids) == scene.num_images
+        fit = fit_similarity(own, scene.centers)
+        assert abs(fit.scale - 1.0) < largest_scale_error
+        metric = replace(fit, scale=1.0, translation=np.zeros(3)).apply(own - own.mean(axis=0))
+        mean_errors.append(
+            np.linalg.norm(metric - (scene.centers - scene.centers.mean(axis=0)), axis=1).mean()
+        )
+    assert mean_errors[0] < 1.2 * mean_errors[1]
+
+
+def test_a_rig_of_four_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1500, seed=3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard")
+
+
+@pytest.mark.slow
+def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 24}
+    scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
+    write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, bundle_adjust=True)
 
 
 def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_path):
