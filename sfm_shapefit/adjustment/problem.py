@@ -123,7 +123,8 @@ class Rig:
 
     def sensor_centers(self) -> FloatArray:
         """Return where each camera stands in its rig, (c, 3)."""
-        return -np.einsum("cba,cb->ca", self.rotations, self.translations)
+        centers: FloatArray = -np.einsum("cba,cb->ca", self.rotations, self.translations)
+        return centers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -42,7 +42,7 @@ class Rigs:
         rig = self.rig_of_frame[self.frame_of_image]
         offsets = self.sensor_centers[rig, self.sensor_of_image]
         turned = np.einsum("nji,nj->ni", frame_rotations[self.frame_of_image], offsets)
-        return frame_centers[self.frame_of_image] + turned
+        return np.asarray(frame_centers[self.frame_of_image] + turned)
 
 
 def single_cameras(num_images: int) -> Rigs:

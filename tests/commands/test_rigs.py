@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
@@ -13,7 +14,7 @@ from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
-from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.geometry import fit_similarity, rotation_angles_deg
 from sfm_shapefit.synthetic import (
     SceneOptions,
     WorkspaceOptions,
@@ -350,6 +351,80 @@ def test_a_rig_of_four_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
     scene = make_scene(replace(options, wrong_match_fraction=0.05))
     write_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
     assert_mapped_as_well_as_located(scene, tmp_path / "yard")
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory):
+    """A yard seen by a rig of four whose sensors are said to be 1 deg and 2 % of their distance off."""
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    workspace, rng = tmp_path_factory.mktemp("rigs") / "yard", np.random.default_rng(3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, workspace, WorkspaceOptions(model="rotations"))
+    statements, model = [], pycolmap.Reconstruction(workspace / "sparse" / "0")
+    for k, share in ((1, 0.02), (2, -0.02), (3, 0.02)):
+        axis = rng.standard_normal(3)
+        turn = Rotation.from_rotvec(np.radians(1.0) * axis / np.linalg.norm(axis)).as_matrix()
+        rotation = turn @ scene.rigs.sensor_rotations[0, k]
+        shift = -rotation @ scene.rigs.sensor_centers[0, k] * (1.0 + share)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift)
+        model.rig(1).set_sensor_from_rig(model.camera(k + 1).sensor_id, pose)
+        blob = pose.rotation.quat[[3, 0, 1, 2]].tobytes() + pose.translation.tobytes()
+        statements.append(
+            f"UPDATE rig_sensors SET sensor_from_rig = x'{blob.hex()}' WHERE sensor_id = {k + 1}"
+        )
+    edit_database(workspace / "database.db", *statements)
+    return scene, model, workspace / "database.db"
+
+
+@pytest.mark.parametrize("way", ["map", "locate", "ceres"])
+def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(disturbed, way):
+    scene, model, database = disturbed
+    if way == "locate":
+        found = sfm_shapefit.locate(model, database, refine_rigs=True)
+    else:
+        ceres = {"bundle_adjust": True, "adjuster": "ceres"} if way == "ceres" else {}
+        found = sfm_shapefit.map_database(database, refine_rigs=True, **ceres).models[0].located
+    said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
+    (rig,) = found.reconstruction.rigs.values()
+    poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
+    shifts = np.array([poses[camera].translation for camera in (2, 3, 4)])
+    mean = np.linalg.norm(shifts, axis=1).mean()
+    assert mean == pytest.approx(np.linalg.norm(said, axis=1).mean(), rel=1e-9)
+    true = scene.rigs.sensor_centers[0]
+    size = np.linalg.norm(true[1:], axis=1).mean() / mean
+    assert [row["camera"] for row in found.rigs] == [2, 3, 4]
+    for row in found.rigs:
+        camera, pose = row["camera"], poses[row["camera"]]
+        turn = scene.rigs.sensor_rotations[0, camera - 1].T @ pose.rotation.matrix()
+        center = -size * pose.rotation.matrix().T @ pose.translation
+        # Largest of three axes, of the noise and of what is left of the wrong matches: 2.5 times at most.
+        assert rotation_angles_deg(turn) < 5.0 * row["turn_sigma_deg"] < 0.1
+        assert np.linalg.norm(center - true[camera - 1]) < 5.0 * row["place_sigma"] < 0.02
+        assert row["turned_deg"] == pytest.approx(1.0, abs=0.05)
+    ids, own = centers_of(found.reconstruction)
+    assert len(ids) == 32
+    fit = fit_similarity(own, scene.centers)
+    assert np.linalg.norm(fit.apply(own) - scene.centers, axis=1).max() < 0.01  # as they are said: 0.2
+    assert abs(fit.scale / size - 1.0) < 2e-3
+
+
+def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
+    # The two that look to the sides see nothing of a facade.
+    scene = make_scene(SceneOptions(rig="four", shape="facade", num_images=24, num_points=1500, seed=2))
+    write_workspace(scene, tmp_path / "facade")
+    sentence = r"the matches do not tell where camera 3 is in its rig"
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", refine_rigs=True)
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", refine_rigs=True)
+    for call in (
+        lambda: sfm_shapefit.map_database(RING / "database.db", refine_rigs=True),
+        lambda: sfm_shapefit.locate(RING / "sparse" / "0", refine_rigs=True),
+    ):
+        with pytest.raises(InputError, match="no rig of several cameras to refine; leave out refine_rigs"):
+            call()
+    with pytest.raises(ValueError, match="refine_rigs needs an adjustment"):
+        LocateOptions(refine_rigs=True, adjust=False)
 
 
 @pytest.mark.slow
