@@ -167,9 +167,10 @@ def find_scale_sensor(problem: AdjustmentProblem) -> int:
     free, sizes = problem.rig.free_sensors(), np.linalg.norm(problem.rig.translations, axis=1)
     priors = 0 if problem.center_prior is None else len(problem.center_prior.indices)
     known = sizes[free < 0].any() or max(int(problem.is_fixed().sum()), priors) > 1
-    if known or not sizes[free >= 0].any():
-        return -1
-    return int(free[np.argmax(np.where(free >= 0, sizes, -1.0))])
+    seeing = np.zeros(len(free), np.bool_)
+    seeing[problem.cameras_seeing] = True  # a sensor that sees nothing says nothing of any scale
+    sizes = np.where(seeing & (free >= 0), sizes, 0.0)
+    return -1 if known or not sizes.any() else int(free[np.argmax(sizes)])
 
 
 def _sensor_bases(problem: AdjustmentProblem, scale_sensor: int) -> FloatArray:

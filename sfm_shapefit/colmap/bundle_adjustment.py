@@ -296,13 +296,12 @@ def judge_sensors(
     except UnsolvableError as error:
         raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
     longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max())
-    found = {}
-    for camera_id, sigma in zip(frames.free_sensors, sigmas, strict=True):
-        found[camera_id] = SensorSigma(float(sigma[:3].max()), float(sigma[3:].max()))
-        known = _SHARED_NOISE * sigma <= np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3)
-        if not known.all():  # NaN is not known either
-            raise InputError(_OPEN_SENSOR.format(camera=f"camera {camera_id}"))
-    return found
+    limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
+    off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
+    if off.max() > 1.0:
+        raise InputError(_OPEN_SENSOR.format(camera=f"camera {frames.free_sensors[int(np.argmax(off))]}"))
+    largest = zip(frames.free_sensors, sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1), strict=True)
+    return {camera_id: SensorSigma(float(place), float(turn)) for camera_id, place, turn in largest}
 
 
 def adjust_thinly(

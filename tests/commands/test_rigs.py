@@ -412,7 +412,7 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
     # The two that look to the sides see nothing of a facade.
     scene = make_scene(SceneOptions(rig="four", shape="facade", num_images=24, num_points=1500, seed=2))
     write_workspace(scene, tmp_path / "facade")
-    sentence = r"the matches do not tell where camera 3 is in its rig"
+    sentence = r"the matches do not tell where camera [34] is in its rig"
     with pytest.raises(InputError, match=sentence):
         sfm_shapefit.map_database(tmp_path / "facade" / "database.db", refine_rigs=True)
     with pytest.raises(InputError, match=sentence):
