@@ -427,6 +427,44 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
         LocateOptions(refine_rigs=True, adjust=False)
 
 
+def keep_few_matches(connection):
+    """Leave few matches of eight pairs between the first four frames and the others, and none of the rest."""
+    rng, first = np.random.default_rng(0), 16
+    rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+    ends = {row[0]: divmod(row[0], 2147483647) for row in rows}
+    between = [pair for pair, (i, j) in ends.items() if (i <= first) != (j <= first)]
+    query = "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?"
+    found = [(pair, *connection.execute(query, (pair,)).fetchone()) for pair in between]
+    for rank, (pair, count, data) in enumerate(sorted(found, key=lambda row: -row[1])):
+        kept = rng.permutation(count)[: 12 * (rank < 8)]
+        matches = np.frombuffer(data, np.uint32).reshape(-1, 2)[kept]
+        values = len(matches), matches.tobytes(), pair
+        connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+
+def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_together(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    scene = make_scene(options)
+    write_workspace(scene, tmp_path / "yard")
+    database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches)
+    found = sfm_shapefit.map_database(database)
+    assert [len(model.names) for model in found.models] == [16, 16]
+    (told,) = found.joins
+    assert told.join is not None, told.statement
+    assert told.join.first_from_second.scale == 1.0
+    sigmas = [model.located.gauge.scale_sigma for model in found.models]
+    assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
+    (joined,) = found.joined
+    whole = read_model(joined.reconstruction)
+    assert (whole.num_images, whole.groups.num_groups, whole.has_rigs) == (32, 8, True)
+    assert (joined.reconstruction.num_rigs(), joined.reconstruction.num_cameras()) == (1, 4)
+    own, truth = whole.centers, scene.centers[whole.image_ids - 1]
+    fit = fit_similarity(own, truth)
+    errors = np.linalg.norm(fit.apply(own) - truth, axis=1)
+    assert errors.max() < 4.0 * told.join.center_sigma + 0.005
+    assert abs(fit.scale - 1.0) < 2e-3
+
+
 @pytest.mark.slow
 def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
     size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 24}
