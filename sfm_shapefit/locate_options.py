@@ -111,6 +111,12 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         'their distortion too; "none", nothing. What was given pulls by its own weight, and stays where the '
         "matches do not tell it. Cameras that images share stay shared.",
     )
+    refine_rigs: bool = option(
+        False,
+        "Let the adjustments change where sensors stand in their rigs, each by one pose for all frames. "
+        "The reference sensors stay, and so does the mean distance of the others from them: the scale is "
+        "still that of the rigs. Refused where the matches do not tell a sensor's pose.",
+    )
     min_trust: float = option(
         0.6,
         "Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. "
@@ -131,6 +137,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self.check_range("max_memory_mb", 0)
         if self.refine_intrinsics in ("focal", "all") and not (self.adjust or self.bundle_adjust):
             raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
+        if self.refine_rigs and not (self.adjust or self.bundle_adjust):
+            raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
         if self.adjuster != "own" and not self.bundle_adjust:
             raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):

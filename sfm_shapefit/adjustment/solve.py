@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge
+from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
 from sfm_shapefit.adjustment.priors import (
@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.priors import (
     sum_priors,
     turn,
 )
-from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
@@ -132,14 +132,25 @@ def adjust(
     finally:
         run.workers.close()
     values = restore_gauge(problem, run.values, free_similarities(problem, options))
+    if run.layout.scale_sensor >= 0:
+        values = restore_baselines(problem, values)
     lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
     return Adjusted(
-        problem=problem.with_values(values.rotations, values.centers, values.points, lenses),
+        problem=problem.with_values(
+            values.rotations, values.centers, values.points, lenses, _rig(problem, values)
+        ),
         costs=np.array(run.costs),
         gradient_norm=run.gradient_norm,
         iterations=run.iterations,
         ending=ending,
     )
+
+
+def _rig(problem: AdjustmentProblem, values: Values) -> Rig | None:
+    """Return the rig of a problem with the poses of its sensors at other values."""
+    if problem.rig is None:
+        return None
+    return replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
 
 
 def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
@@ -207,11 +218,19 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
 
 def values_of(problem: AdjustmentProblem) -> Values:
     """Return the numbers of a problem that an adjustment changes."""
+    if problem.rig is None:
+        sensor_rotations = np.tile(np.eye(3), (problem.num_cameras, 1, 1))
+        sensor_translations = np.zeros((problem.num_cameras, 3))
+    else:
+        sensor_rotations = np.ascontiguousarray(problem.rig.rotations, dtype=np.float64)
+        sensor_translations = np.ascontiguousarray(problem.rig.translations, dtype=np.float64)
     return Values(
         rotations=problem.rotations,
         centers=problem.centers,
         points=problem.points,
         lenses=np.array([lens.values() for lens in problem.lenses]).reshape(-1, 8),
+        sensor_rotations=sensor_rotations,
+        sensor_translations=sensor_translations,
     )
 
 
@@ -352,7 +371,36 @@ def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatAr
     lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
     if (lenses[:, :2] <= 0.0).any():
         return None
-    return Values(rotations=rotations, centers=centers, points=values.points + point_steps, lenses=lenses)
+    sensor_rotations, sensor_translations = _move_sensors(layout, values, steps)
+    return Values(
+        rotations=rotations,
+        centers=centers,
+        points=values.points + point_steps,
+        lenses=lenses,
+        sensor_rotations=sensor_rotations,
+        sensor_translations=sensor_translations,
+    )
+
+
+def _move_sensors(layout: Layout, values: Values, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the poses of all cameras in their rigs after steps of nodes (N, 6)."""
+    rotations, translations = values.sensor_rotations, values.sensor_translations
+    cameras = np.flatnonzero(layout.sensor_of_camera >= 0)
+    if not len(cameras):
+        return rotations, translations
+    sensors = layout.sensor_of_camera[cameras]
+    own = steps[layout.node_of_sensor[sensors]]
+    before = -np.einsum("cba,cb->ca", rotations[cameras], translations[cameras])
+    after = before + np.einsum("cab,cb->ca", layout.sensor_bases[sensors], own[:, :3])
+    kept = sensors == layout.scale_sensor
+    after[kept] *= np.linalg.norm(before[kept], axis=1, keepdims=True) / np.linalg.norm(
+        after[kept], axis=1, keepdims=True
+    )
+    rotations, translations = rotations.copy(), translations.copy()
+    # R exp(w) = (exp(-w) R^T)^T
+    rotations[cameras] = turn(rotations[cameras].transpose(0, 2, 1), -own[:, 3:]).transpose(0, 2, 1)
+    translations[cameras] = -np.einsum("cab,cb->ca", rotations[cameras], after)
+    return rotations, translations
 
 
 def _gradient_norm(normal: NormalEquations, cost: float) -> float:

@@ -23,6 +23,7 @@ from sfm_shapefit.cli.lines import (
     intrinsics_rows,
     next_steps,
     picture_rows,
+    rig_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import MapOptions
@@ -79,6 +80,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *figure_rows(located.summary()),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
+            *rig_rows(located.summary()),
             *scene_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]

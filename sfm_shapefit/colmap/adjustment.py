@@ -59,6 +59,12 @@ class PosedFrames:
     """(c, 3, 3) camera_from_rig."""
     sensor_translations: FloatArray
     """(c, 3)"""
+    sensor_of_camera: IntArray
+    """(c,) place in `free_sensors` of the sensor that a camera is, or is a view of; -1 if that stays."""
+    view_rotations: FloatArray
+    """(c, 3, 3) view_from_camera: the identity where a camera is the whole image."""
+    free_sensors: tuple[int, ...]
+    """The ids of the cameras that may move in their rigs, ascending."""
     lenses: tuple[Lens, ...]
     lens_of_camera: IntArray
     """(c,)"""
@@ -108,6 +114,7 @@ class PosedFrames:
                 frame_of_camera=self.frame_of_camera,
                 rotations=self.sensor_rotations,
                 translations=self.sensor_translations,
+                free_sensor_of_camera=self.sensor_of_camera,
             ),
             fixed=self.fixed,
             center_prior=self.center_prior,
@@ -118,6 +125,8 @@ def read_frames(
     reconstruction: pycolmap.Reconstruction,
     fixed_frames: Collection[int] = (),
     known: KnownPositions | None = None,
+    *,
+    free_rigs: bool = False,
 ) -> PosedFrames:
     """Return the posed frames of a reconstruction as arrays.
 
@@ -125,6 +134,7 @@ def read_frames(
         reconstruction: whose frames with a pose are read.
         fixed_frames: ids of those that stay; others are ignored.
         known: centers measured otherwise, by the ids of frames; of other frames they are ignored.
+        free_rigs: whether sensors may move in their rigs, all but the references.
     """
     image_ids = sorted(reconstruction.reg_image_ids())
     images = [reconstruction.image(i) for i in image_ids]
@@ -141,6 +151,9 @@ def read_frames(
     turns = np.concatenate([views[image.camera_id] for image in images])
     sensor_rotations = np.array([rotation for rotation, _ in sensors])[of_image]
     sensor_translations = np.array([translation for _, translation in sensors])[of_image]
+    moving = [free_rigs and not _is_reference(reconstruction, image) for image in images]
+    free_sensors = sorted({image.camera_id for image, moves in zip(images, moving, strict=True) if moves})
+    place_of_sensor = {camera_id: k for k, camera_id in enumerate(free_sensors)}
     is_turned = (counts > 1)[of_image]
     sensor_rotations[is_turned] = turns[is_turned] @ sensor_rotations[is_turned]
     sensor_translations[is_turned] = np.einsum("cab,cb->ca", turns[is_turned], sensor_translations[is_turned])
@@ -154,6 +167,9 @@ def read_frames(
         frame_of_camera=np.array([place[image.frame_id] for image in images])[of_image],
         sensor_rotations=sensor_rotations,
         sensor_translations=sensor_translations,
+        sensor_of_camera=np.array([place_of_sensor.get(image.camera_id, -1) for image in images])[of_image],
+        view_rotations=turns,
+        free_sensors=tuple(free_sensors),
         lenses=lenses,
         lens_of_camera=np.array([camera_ids.index(image.camera_id) for image in images])[of_image],
         colmap_camera_of_lens=tuple(camera_ids),
@@ -281,7 +297,7 @@ def with_points(
 def with_poses(
     reconstruction: pycolmap.Reconstruction, old: PosedFrames, new: PosedFrames
 ) -> pycolmap.Reconstruction:
-    """Return a copy whose frames stand, and lenses are, as in `new`; points stay where they are.
+    """Return a copy whose frames and free sensors stand, and lenses are, as in `new`; points stay.
 
     Args:
         reconstruction: whose frames `old` were read from.
@@ -297,10 +313,24 @@ def with_poses(
         frame = copy.frame(frame_id)
         turn = pycolmap.Rotation3d(rotation) if turns else _pose(frame).rotation
         frame.rig_from_world = pycolmap.Rigid3d(turn, -(rotation @ center))
+    for camera_id, pose in sensors_from_rigs(new).items():
+        sensor = copy.camera(camera_id).sensor_id
+        next(rig for rig in copy.rigs.values() if rig.has_sensor(sensor)).set_sensor_from_rig(sensor, pose)
     for before, after, camera_id in zip(old.lenses, new.lenses, new.colmap_camera_of_lens, strict=True):
         if after.parameters != before.parameters:
             copy.camera(camera_id).params = list(after.parameters)
     return copy
+
+
+def sensors_from_rigs(frames: PosedFrames) -> dict[int, pycolmap.Rigid3d]:
+    """Return the poses of the free sensors in their rigs, by the ids of their cameras."""
+    found = {}
+    for k, camera_id in enumerate(frames.free_sensors):
+        camera = int(np.argmax(frames.sensor_of_camera == k))
+        rotation, translation = frames.sensor_rotations[camera], frames.sensor_translations[camera]
+        view = frames.view_rotations[camera]
+        found[camera_id] = pycolmap.Rigid3d(pycolmap.Rotation3d(view.T @ rotation), view.T @ translation)
+    return found
 
 
 def add_points(
@@ -381,13 +411,19 @@ def _views(camera: pycolmap.Camera) -> FloatArray:
     return _CUBE
 
 
+def _is_reference(reconstruction: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
+    """Return whether an image is of the reference sensor of its rig."""
+    rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
+    return bool(rig.is_ref_sensor(reconstruction.camera(image.camera_id).sensor_id))
+
+
 def _sensor_from_rig(
     reconstruction: pycolmap.Reconstruction, image: pycolmap.Image
 ) -> tuple[FloatArray, FloatArray]:
     """Return rotation and translation of the sensor of an image, exactly the identity for a reference."""
     sensor = reconstruction.camera(image.camera_id).sensor_id
     rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
-    if rig.is_ref_sensor(sensor):
+    if _is_reference(reconstruction, image):
         return np.eye(3), np.zeros(3)
     pose = rig.sensor_from_rig(sensor)
     assert pose is not None  # `read_model` refuses others

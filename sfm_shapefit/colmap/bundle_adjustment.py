@@ -28,7 +28,8 @@ One thread does all, as the answer must not depend on their number.
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ from sfm_shapefit.adjustment import (
     frames_not_gained,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
@@ -50,8 +52,10 @@ from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import (
+    PosedFrames,
     add_points,
     collect_tracks,
+    read_bundle,
     read_frames,
     rotations_of_frames,
     with_poses,
@@ -61,7 +65,8 @@ from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import ImageMatches, TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import METRIC_SIGMA
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.wording import counted
 
@@ -82,6 +87,16 @@ _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
 # With more frames, the standard deviations would take longer than all the rest.
 _MOST_FRAMES = 2_000
 _FREE = RotationWeight()
+# Of the last round of Ceres, by which its answer is judged.
+_CERES_LOSS_PX = 1.0
+# Errors that keypoints share make those of a sensor's pose larger than the noise alone does, as those of a
+# focal length (`adjustment.free_lenses`).
+_SHARED_NOISE = 7.0
+_LARGEST_TURN_RAD = math.radians(1.0)
+_OPEN_SENSOR = (
+    "the matches do not tell where {camera} is in its rig: its images see too little that others see too, or "
+    "the rig never turns; leave out refine_rigs, or give more frames"
+)
 
 
 class RefinedLenses(NamedTuple):
@@ -93,8 +108,19 @@ class RefinedLenses(NamedTuple):
     """Those whose focal length the points leave open: they have what was given."""
 
 
+class SensorSigma(NamedTuple):
+    """How well an adjustment knows the pose of a sensor in its rig, by the noise alone."""
+
+    place: float
+    """Largest standard deviation of its place along an axis of the rig, units of the seed."""
+    turn_rad: float
+    """Largest standard deviation of its rotation about an axis."""
+
+
 UNREFINED = RefinedLenses({}, ())
 """Where no lens was free."""
+NO_SENSORS: Mapping[int, SensorSigma] = MappingProxyType({})
+"""Where rigs stay."""
 
 
 class Uncertainty(NamedTuple):
@@ -125,6 +151,8 @@ class Adjusted:
     """Nothing is known with Ceres, and of large models."""
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
+    sensors: Mapping[int, SensorSigma] = field(default_factory=dict)
+    """Of the sensors that were free in their rigs, by the ids of their cameras."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,6 +170,8 @@ class AdjustedPlacement:
     uncertainty: Uncertainty
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
+    sensors: Mapping[int, SensorSigma] = field(default_factory=dict)
+    """Of the sensors that were free in their rigs, by the ids of their cameras."""
 
     @property
     def statement(self) -> str:
@@ -183,6 +213,8 @@ class GivenPoses(NamedTuple):
     """Measured otherwise, by the ids of frames, which they pull at."""
     lenses: FreeLenses = ALL_HELD
     """Those that may change; all others stay what they are, to the bit."""
+    free_rigs: bool = False
+    """Whether the sensors of rigs may move in them."""
 
     def weight_of(self, frame_ids: Sequence[int]) -> RotationWeight:
         """Return the weight with the standard deviations of the given frames; new ones have the usual one."""
@@ -227,9 +259,9 @@ def bundle_adjust(
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(
-            start, tracks, structure_options, fixed_frames, given.lenses
+            start, tracks, structure_options, fixed_frames, given.lenses, free_rigs=given.free_rigs
         )
-        uncertainty = Uncertainty()
+        uncertainty, sensors = Uncertainty(), _ask_sensors(unfiltered, fixed_frames, given)
         refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
     else:
         run = _Run(seed, tracks, structure_options, fixed_frames, given)
@@ -238,7 +270,7 @@ def bundle_adjust(
             run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
         iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
-        refined = run.refined
+        refined, sensors = run.refined, run.judge_sensors(last)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
@@ -248,7 +280,41 @@ def bundle_adjust(
         iterations=iterations,
         uncertainty=uncertainty,
         lenses=refined,
+        sensors=sensors,
     )
+
+
+def _ask_sensors(
+    adjusted: pycolmap.Reconstruction, fixed_frames: Collection[int], given: GivenPoses
+) -> Mapping[int, SensorSigma]:
+    """Return how well the free sensors of a model that Ceres has adjusted are known."""
+    frames = read_frames(adjusted, fixed_frames, free_rigs=given.free_rigs)
+    if not frames.free_sensors:
+        return NO_SENSORS
+    options = AdjustmentOptions(loss_scale_px=_CERES_LOSS_PX)
+    return judge_sensors(frames, read_bundle(adjusted, frames)[1], options)
+
+
+def judge_sensors(
+    frames: PosedFrames, adjusted: AdjustmentProblem, options: AdjustmentOptions
+) -> Mapping[int, SensorSigma]:
+    """Return how well the free sensors of a problem at its minimum are known, by the ids of their cameras.
+
+    Raises:
+        InputError: if the observations leave the pose of a sensor open.
+    """
+    assert adjusted.rig is not None
+    try:
+        sigmas = estimate_covariances(adjusted, options).sensor_sigmas
+    except UnsolvableError as error:
+        raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
+    longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max())
+    limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
+    off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
+    if off.max() > 1.0:
+        raise InputError(_OPEN_SENSOR.format(camera=f"camera {frames.free_sensors[int(np.argmax(off))]}"))
+    largest = zip(frames.free_sensors, sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1), strict=True)
+    return {camera_id: SensorSigma(float(place), float(turn)) for camera_id, place, turn in largest}
 
 
 def adjust_thinly(
@@ -257,7 +323,7 @@ def adjust_thinly(
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
-    lenses: FreeLenses = ALL_HELD,
+    given: GivenPoses | None = None,
     thorough: bool = False,
 ) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
@@ -270,10 +336,10 @@ def adjust_thinly(
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None. Observations may miss by four times their limit.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        lenses: those that change with the poses. One whose focal length the points leave open gets what was
-            given back, and the poses are adjusted again.
-        thorough: whether all points follow where a lens has changed: a shape bends with a focal length that
-            few points leave a thousandth off. Up to 2,000 frames.
+        given: lenses and rigs that change with the poses; nothing else of it counts. A lens whose focal
+            length the points leave open gets what was given back, and the poses are adjusted again.
+        thorough: whether all points follow where a lens or a rig has changed: a shape bends with a focal
+            length that few points leave a thousandth off. Up to 2,000 frames.
 
     Returns:
         The adjusted poses, all rotations free; their gauge is as from `bundle_adjust`.
@@ -281,10 +347,11 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    given = GivenPoses(lenses=lenses)
-    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, given)
+    given = given or GivenPoses()
+    freed = GivenPoses(lenses=given.lenses, free_rigs=given.free_rigs)
+    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, freed)
     adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
-    if thorough and run.lenses.doubts and adjusted.num_frames <= _MOST_FRAMES:
+    if thorough and run.frees_more_than_poses() and adjusted.num_frames <= _MOST_FRAMES:
         _, _, adjusted = run.adjust_by_all_points()
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
@@ -294,6 +361,7 @@ def adjust_thinly(
         errors=None,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
+        sensors=run.judge_sensors(adjusted) if thorough else NO_SENSORS,
     )
 
 
@@ -320,7 +388,7 @@ def adjust_placement(
         UnsolvableError: if no point can be triangulated.
     """
     run, errors = _Run(seed, tracks, structure_options, fixed_frames, given or GivenPoses()), None
-    if run.lenses.doubts:  # points are found, and rotations judged, with the lenses that come out
+    if run.frees_more_than_poses():  # points are found, and rotations judged, with what comes out
         run.repeat_with_known_lenses(run.adjust_twice_thinly)
         run.frames = replace(run.frames, rotations=run.start.rotations)
     joined, found = run.triangulate(1.0, checked=True)
@@ -346,6 +414,7 @@ def adjust_placement(
         errors=errors,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
+        sensors=run.judge_sensors(adjusted),
     )
 
 
@@ -361,7 +430,7 @@ class _Run:
         given: GivenPoses,
     ) -> None:
         self.lenses, self.refined = given.lenses, UNREFINED
-        self.start = self.frames = read_frames(seed, fixed_frames, given.centers)
+        self.start = self.frames = read_frames(seed, fixed_frames, given.centers, free_rigs=given.free_rigs)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
@@ -369,6 +438,19 @@ class _Run:
         checks = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
         fewest = _FEWEST_IMAGES_OF_A_CHECKED_POINT if checks else 2
         self.checked_length = max(options.min_track_length, fewest)
+
+    def frees_more_than_poses(self) -> bool:
+        """Return whether lenses or rigs change."""
+        return bool(self.lenses.doubts or self.frames.free_sensors)
+
+    def judge_sensors(self, adjusted: AdjustmentProblem) -> Mapping[int, SensorSigma]:
+        """Return how well free sensors are known at the optimum last solved for; see the function."""
+        if not self.frames.free_sensors:
+            return NO_SENSORS
+        options = AdjustmentOptions(
+            loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
+        )
+        return judge_sensors(self.frames, adjusted, options)
 
     def triangulate(
         self, widening: float, *, checked: bool = False
@@ -482,6 +564,12 @@ class _Run:
         found = adjusted.problem
         lenses = tuple(found.lenses)
         self.frames = replace(self.frames, rotations=found.rotations, centers=found.centers, lenses=lenses)
+        if found.rig is not None:
+            self.frames = replace(
+                self.frames,
+                sensor_rotations=found.rig.rotations,
+                sensor_translations=found.rig.translations,
+            )
         if self.lenses.doubts:
             self.source = with_rays_of(self.frames, self.source)
         self.iterations += adjusted.iterations
@@ -491,7 +579,7 @@ class _Run:
     def adjust_placed(self, problem: AdjustmentProblem, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, but those that would gain nothing by it."""
         adjusted = self.solve(problem, self.choose_scale(problem), fall)
-        if not self.lenses.doubts:
+        if not self.frees_more_than_poses():
             return self.return_frames(problem, adjusted)
         self.judge_lenses(adjusted)
         return adjusted

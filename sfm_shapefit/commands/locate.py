@@ -3,9 +3,10 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +15,13 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import (
+    NO_SENSORS,
+    AdjustedPlacement,
+    GivenPoses,
+    SensorSigma,
+    Uncertainty,
+)
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
@@ -38,15 +45,17 @@ from sfm_shapefit.commands.stages.seed import (
     select_trusted,
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.placement.tied_groups import measure_unit
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
+from sfm_shapefit.results.rigs import refined_rigs, sensors_of
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
     focal_warnings,
@@ -134,6 +143,10 @@ class Locating(NamedTuple):
     """Which of the images' are in doubt, and what became of them so far."""
     relative: RelativeRotations | None = None
     """Relative rotations of pairs as far as they were measured with these intrinsics; None: not at all."""
+    sensors: Mapping[int, SensorSigma] = NO_SENSORS
+    """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
+    rigs: "Mapping[int, pycolmap.Rigid3d] | None" = None
+    """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -150,7 +163,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
             placement = _at_known_centers(placement, known, model, options)
-        given = GivenPoses(lenses=known.intrinsics.free)
+        given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
@@ -176,6 +189,11 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
+    sensors = dict(known.sensors)
+    for done in (adjustment, seeded.adjusted):
+        sensors |= {} if done is None else done.sensors
+    if options.refine_rigs and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out refine_rigs")
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, placement.scale_sigma)
     located = located._replace(placement=placement, gauge=gauge)
@@ -208,19 +226,29 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
+        rigs=refined_rigs(
+            known.rigs or sensors_of(model.reconstruction), sensors_of(seeded.reconstruction), sensors
+        ),
     )
 
 
 def _at_known_centers(
     placement: Placement, known: Locating, model: PosedModel, options: LocateOptions
 ) -> Placement:
-    """Return the placement with its cameras where an adjustment had them, and how well it knew that."""
+    """Return the placement with its cameras where an adjustment had them, and how well it knew that.
+
+    In units of the solver, those of the rigs are then as long as the adjustment has them, not as the
+    directions had: all pixels say it better.
+    """
     assert known.centers is not None
     centers = known.centers[placement.cameras]
     placed = bring_to_scale(placement, centers)
     there = np.isfinite(centers).all(axis=1)
     scale = median_spread(centers[there]) / median_spread(placed[there])
-    return with_uncertainty(move_cameras(placement, placed, options), model, known.uncertainty, scale)
+    moved = move_cameras(placement, placed, options)
+    if moved.unit is not None:
+        moved = replace(moved, unit=measure_unit(moved.measured_part(), moved.refined.locations))
+    return with_uncertainty(moved, model, known.uncertainty, scale)
 
 
 class _Adjusted(NamedTuple):

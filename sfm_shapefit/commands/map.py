@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import NO_SENSORS, Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
@@ -25,7 +25,7 @@ from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
+from sfm_shapefit.commands.stages.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
@@ -38,6 +38,7 @@ from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
+from sfm_shapefit.results.rigs import sensors_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
@@ -153,6 +154,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
     """Read what a run works from, but for the matches."""
     with clock("read"):
         images = read_images(path)
+        if options.refine_rigs and not images.rigs.rigs:
+            raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         inputs = read_left_out(inputs, unposed.names, options)
@@ -360,23 +363,31 @@ class _Run(NamedTuple):
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
-            intrinsics = self.intrinsics
+            intrinsics, sensors = self.intrinsics, NO_SENSORS
             if self.options.adjust:
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
                     first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
                 centers, uncertainty = first.centers, first.adjusted.uncertainty
                 intrinsics = intrinsics.after(first.adjusted.lenses)
-                source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
+                sensors = first.adjusted.sensors
+                source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             measured = None
             if self.options.relative_rotations == "matches" and same_intrinsics(source.model, model):
                 measured = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 measured = replace(measured, pairs=np.searchsorted(members, measured.pairs))
             locating = Locating(
-                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics,
+                inputs,
+                rigid,
+                priors,
+                centers=centers,
+                uncertainty=uncertainty,
+                intrinsics=intrinsics,
+                sensors=sensors,
+                rigs=sensors_of(model.reconstruction),
+            )
                 relative=measured,
-            )  # fmt: skip
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
@@ -401,10 +412,17 @@ class _Run(NamedTuple):
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
+        settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
         if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)
+
+    def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
+        """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
+        return run._pose(image_ids, first.rotations, first.parameters())
 
     def _pose(
         self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None

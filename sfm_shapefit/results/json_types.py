@@ -181,6 +181,17 @@ class CameraIntrinsics(TypedDict):
     parameters: Annotated[list[float], "All parameters of the output."]
 
 
+class RefinedSensor(TypedDict):
+    """A sensor whose pose in its rig was refined."""
+
+    camera: Annotated[int, "The id of its camera in the model."]
+    turned_deg: Annotated[float, "By how much its rotation changed."]
+    moved: Annotated[float, "How far it moved in its rig, in units of the output."]
+    distance: Annotated[float, "From the reference sensor, in units of the output."]
+    turn_sigma_deg: Annotated[float, "Standard deviation of its rotation per axis, by the noise alone."]
+    place_sigma: Annotated[float, "Standard deviation of its place per axis, by the noise alone."]
+
+
 class ModelInputs(TypedDict):
     """What `locate` worked from."""
 
@@ -325,6 +336,7 @@ class LocateSummary(PlacementSummary):
     intrinsics: Annotated[
         list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
     ]
+    refined_rigs: Annotated[list[RefinedSensor], "Sensors whose poses in their rigs were refined."]
     line_sigma: Annotated[
         float | None,
         "Median standard deviation of a position along the line on which all cameras stand, as a share of "

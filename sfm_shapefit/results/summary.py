@@ -78,6 +78,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
+        "refined_rigs": list(found.rigs),
         "line_sigma": found.line_sigma,
         "num_doubtful_pairs": len(found.doubtful_pairs),
         "loops": [_summarize_loop(loop) for loop in found.loops],

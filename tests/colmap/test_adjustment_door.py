@@ -20,7 +20,7 @@ from sfm_shapefit.colmap.adjustment import (
     with_points,
     with_poses,
 )
-from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, adjust_thinly, bundle_adjust
 from sfm_shapefit.colmap.structure import collect_matches
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import KeypointMatches
@@ -271,13 +271,13 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    found = adjust_thinly(start, tracks, lenses=free)
+    found = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert found.lenses.undetermined == ()
     assert 0.0 < found.lenses.sigmas[1] < 0.01
     monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
-    held = adjust_thinly(start, tracks, lenses=free)
+    held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == start.camera(1).params.tolist()
 

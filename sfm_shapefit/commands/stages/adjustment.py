@@ -21,6 +21,7 @@ from sfm_shapefit.colmap.bundle_adjustment import (
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
+from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
 from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import MatchBatch
@@ -99,12 +100,15 @@ def adjust_placed(
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
     locations = (centers - similarity.translation) / similarity.scale
-    if not adjusted.weight.hold or adjusted.lenses.sigmas:
+    if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
         corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
         directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
-        placement = replace(placement, measured=_turn(placement.measured, directions, turns))
+        measured = _turn(placement.measured, directions, turns)
+        if adjusted.sensors:  # which stand elsewhere in their frames now
+            measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
+        placement = replace(placement, measured=measured)
     moved = with_uncertainty(
         move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
     )
