@@ -63,6 +63,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Two images by name, and how far apart they are in the output's units. May be repeated: of several "
         "the scale is a robust fit, and each is told with what the model has.",
     )
+    control_points: str = option(
+        "",
+        "Ground control points, which set scale, origin and axes: a gcp_list.txt as of OpenDroneMap, whose "
+        "first line names the projection, and whose others are x y z, pixels, image, name of the point.",
+    )
     fix: str = option(
         "",
         "Cameras that stay exactly where the input has them, while the others are placed around them: "
@@ -126,6 +131,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_distance()
+        self._check_control_points()
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
@@ -152,6 +158,18 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         said = self.rotation_sigma_deg or self.rotations == "free"
         if said and not (self.adjust or self.bundle_adjust):
             raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
+
+    def _check_control_points(self) -> None:
+        """Refuse what would set the scale beside control points."""
+        others = {
+            f"the scale {self.scale}": self.scale != "auto",
+            "known distances": bool(self.known_distance),
+            "position priors": self.refine_with_priors,
+            "fixed cameras": bool(self.fix),
+        }
+        for other, is_asked in others.items():
+            if self.control_points and is_asked:
+                raise ValueError(f"control points and {other} would both set the scale; leave out one")
 
     def _check_distance(self) -> None:
         """Refuse a known distance that is none, or that the scale asked for has no use for."""

@@ -60,6 +60,7 @@ _METAVARS: dict[Any, str] = {
     "known_distance": "NAME NAME DISTANCE",
     "fix": "FILE|solved",
     "without": "FILE",
+    "control_points": "FILE",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",

@@ -24,6 +24,7 @@ from sfm_shapefit.commands.stages.adjustment import (
     with_uncertainty,
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.control_points import bring_to_control_points, read_control
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
@@ -41,6 +42,7 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
@@ -111,9 +113,10 @@ def locate(
         inputs = read_left_out(inputs, model.names, options)
         model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
+        control = read_control(model, options)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     with open_source(model, inputs, options) as opened:
-        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics)
+        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control)
         return locate_source(opened, known, options, clock)
 
 
@@ -131,6 +134,8 @@ class Locating(NamedTuple):
     """Of these centers, in their units."""
     intrinsics: Intrinsics = NO_DOUBTS
     """Which of the images' are in doubt, and what became of them so far."""
+    control: ControlPoints | None = None
+    """Ground control points of the images."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -162,6 +167,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
+    seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
@@ -175,6 +181,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
+        *of_control,
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -198,6 +205,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
+        control_points=tuple(control_points),
     )
 
 

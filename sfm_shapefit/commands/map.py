@@ -25,6 +25,7 @@ from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.control_points import read_control
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
@@ -34,6 +35,7 @@ from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
@@ -153,6 +155,7 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
             if name not in unposed.names:
                 raise InputError(f"known_distance: the database has no image {name}")
         positions = read_priors(unposed, inputs, options, priors)
+        control = read_control(unposed, options)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     return _Run(
         options=options,
@@ -164,6 +167,7 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         sensor_rotations=sensor_rotations,
         intrinsics=intrinsics,
         priors=positions,
+        control=control,
         without=inputs.left_out,
     )
 
@@ -184,6 +188,7 @@ class _Run(NamedTuple):
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
+    control: ControlPoints | None
     without: PairNames
     """Pairs that are taken for unmatched."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
@@ -342,6 +347,7 @@ class _Run(NamedTuple):
         priors = None if self.priors is None else self.priors.of(members)
         if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
+        control = None if self.control is None else self.control.of(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
@@ -358,7 +364,13 @@ class _Run(NamedTuple):
                 source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             locating = Locating(
-                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics
+                inputs,
+                rigid,
+                priors,
+                centers=centers,
+                uncertainty=uncertainty,
+                intrinsics=intrinsics,
+                control=control,
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
@@ -384,7 +396,8 @@ class _Run(NamedTuple):
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
-        if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
+        is_told = bool(known or has_priors or has_rigs or self.options.control_points)
+        if not is_told and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)
