@@ -38,7 +38,7 @@ class BundledScene(NamedTuple):
     """How its images are drawn; None for made-up keypoints."""
 
 
-GRAPH, GPS, GCP, NAMES = "graph40.txt", "gps.csv", "gcp_list.txt", "names.txt"
+GRAPH, GPS, GCP, NAMES, GRAVITY = "graph40.txt", "gps.csv", "gcp_list.txt", "names.txt", "gravity.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -100,6 +100,7 @@ def main() -> None:
     (out / GPS).write_text(measured_positions_text(), encoding="utf-8")
     (out / GCP).write_text(control_points_text(), encoding="utf-8")
     (out / NAMES).write_text(names_text(), encoding="utf-8")
+    (out / GRAVITY).write_text(gravity_text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
@@ -152,6 +153,15 @@ def control_points_text() -> str:
             for image, u, v in marks[:: len(marks) // 5]
         ]
     return "".join(lines)
+
+
+def gravity_text() -> str:
+    """Return the gravity of the cameras of ring8, 1 degree off per axis, and one of them wrong."""
+    scene = make_scene(SCENES["ring8"].scene)
+    measured = -scene.rotations[:, :, 2] + np.radians(1.0) * np.random.default_rng(0).standard_normal((8, 3))
+    measured[5] = [1.0, 0.0, 0.0]
+    lines = [f"{image_name(k)} {x:.4f} {y:.4f} {z:.4f}\n" for k, (x, y, z) in enumerate(measured.tolist())]
+    return "# name, gravity in axes of the camera\n" + "".join(lines)
 
 
 def names_text() -> str:

@@ -27,6 +27,9 @@ LEAST_MATCHES = 15
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""
 
+GRAVITY_OF_DATABASE = "database"
+"""In place of a file: the gravity of the database's pose priors."""
+
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
 # With more cameras, the adjustment would take longer than all the rest.
@@ -253,6 +256,12 @@ class MapOptions(LocateOptions):
         "Images that are frames of a video, told by a running number in their names: pairs far apart in time "
         'must agree with the chain of those near in time, or they are left out. "auto" asks that the matches '
         'look like a video too; "names" believes the names; "none" takes all pairs alike.',
+    )
+    gravity: str = option(
+        "",
+        "Directions of gravity, which take part in the averaging and turn the model so that z points up: a "
+        "text file of name x y z [sigma] per line, in axes of the camera (x right, y down, z ahead; sigma in "
+        'degrees, 1 if not given), or "database": those of its pose priors.',
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
     join: Join = option(

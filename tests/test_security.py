@@ -175,6 +175,7 @@ READING = {
     "a model file": ("convert", "{pipe}", "{out}"),
     "priors": ("locate", MODEL, "{out}", "--priors", "{pipe}"),
     "control points": ("locate", MODEL, "{out}", "--control-points", "{pipe}"),
+    "gravity": ("map", str(RING / "database.db"), "{out}", "--gravity", "{pipe}"),
     "names": ("locate", MODEL, "{out}", "--fix", "{pipe}"),
     "options": ("locate", MODEL, "{out}", "--config", "{pipe}"),
 }

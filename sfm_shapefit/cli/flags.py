@@ -61,6 +61,7 @@ _METAVARS: dict[Any, str] = {
     "fix": "FILE|solved",
     "without": "FILE",
     "control_points": "FILE",
+    "gravity": "FILE|database",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",

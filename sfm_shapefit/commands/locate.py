@@ -27,6 +27,7 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.control_points import bring_to_control_points, read_control
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import turn_model_upright
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -57,6 +58,7 @@ from sfm_shapefit.results.warnings import (
     quality_warnings,
     trust_warnings,
 )
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -136,6 +138,8 @@ class Locating(NamedTuple):
     """Which of the images' are in doubt, and what became of them so far."""
     control: ControlPoints | None = None
     """Ground control points of the images."""
+    gravity: Gravity | None = None
+    """Of the images, which turns the model upright."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -168,6 +172,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
+    seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
@@ -182,6 +187,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
         *of_control,
+        *of_gravity,
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,

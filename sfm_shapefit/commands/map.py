@@ -28,6 +28,7 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.control_points import read_control
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import read_gravity, refine_with_gravity
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
@@ -42,6 +43,7 @@ from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
@@ -156,6 +158,7 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
                 raise InputError(f"known_distance: the database has no image {name}")
         positions = read_priors(unposed, inputs, options, priors)
         control = read_control(unposed, options)
+        gravity = read_gravity(path, unposed, options)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     return _Run(
         options=options,
@@ -168,6 +171,7 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         intrinsics=intrinsics,
         priors=positions,
         control=control,
+        gravity=gravity,
         without=inputs.left_out,
     )
 
@@ -189,6 +193,7 @@ class _Run(NamedTuple):
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
     control: ControlPoints | None
+    gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
@@ -310,6 +315,9 @@ class _Run(NamedTuple):
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
+                if self.gravity is not None:
+                    gravity = self.gravity.of_frames(self.frame_of_image, self.sensor_rotations)
+                    answer = refine_with_gravity(answer, local, gravity.among(members))
             left = members[~answer.registered]
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
@@ -348,6 +356,7 @@ class _Run(NamedTuple):
         if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
         control = None if self.control is None else self.control.of(members)
+        gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
@@ -371,6 +380,7 @@ class _Run(NamedTuple):
                 uncertainty=uncertainty,
                 intrinsics=intrinsics,
                 control=control,
+                gravity=gravity,
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
