@@ -91,6 +91,7 @@ def test_map_delivers_an_upright_model_and_names_a_wrong_gravity():
         located.reconstruction.find_image_with_name(r.name).projection_center() for r in located.cameras
     ]
     np.testing.assert_allclose([row.center for row in located.cameras], centers, atol=1e-12)
+    np.testing.assert_allclose(located.gauge.apply(located.placement.locations), centers, atol=1e-3)
 
 
 def test_the_gravity_of_pose_priors_is_read(tmp_path):
