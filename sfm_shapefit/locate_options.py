@@ -27,6 +27,9 @@ LEAST_MATCHES = 15
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""
 
+GRAVITY_OF_DATABASE = "database"
+"""In place of a file: the gravity of the database's pose priors."""
+
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
 # With more cameras, the adjustment would take longer than all the rest.
@@ -62,6 +65,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         (),
         "Two images by name, and how far apart they are in the output's units. May be repeated: of several "
         "the scale is a robust fit, and each is told with what the model has.",
+    )
+    control_points: str = option(
+        "",
+        "Ground control points, which set scale, origin and axes: a gcp_list.txt as of OpenDroneMap, whose "
+        "first line names the projection, and whose others are x y z, pixels, image, name of the point.",
     )
     fix: str = option(
         "",
@@ -132,6 +140,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_distance()
+        self._check_control_points()
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
@@ -160,6 +169,18 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         said = self.rotation_sigma_deg or self.rotations == "free"
         if said and not (self.adjust or self.bundle_adjust):
             raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
+
+    def _check_control_points(self) -> None:
+        """Refuse what would set the scale beside control points."""
+        others = {
+            f"the scale {self.scale}": self.scale != "auto",
+            "known distances": bool(self.known_distance),
+            "position priors": self.refine_with_priors,
+            "fixed cameras": bool(self.fix),
+        }
+        for other, is_asked in others.items():
+            if self.control_points and is_asked:
+                raise ValueError(f"control points and {other} would both set the scale; leave out one")
 
     def _check_distance(self) -> None:
         """Refuse a known distance that is none, or that the scale asked for has no use for."""
@@ -243,6 +264,12 @@ class MapOptions(LocateOptions):
         "Images that are frames of a video, told by a running number in their names: pairs far apart in time "
         'must agree with the chain of those near in time, or they are left out. "auto" asks that the matches '
         'look like a video too; "names" believes the names; "none" takes all pairs alike.',
+    )
+    gravity: str = option(
+        "",
+        "Directions of gravity, which take part in the averaging and turn the model so that z points up: a "
+        "text file of name x y z [sigma] per line, in axes of the camera (x right, y down, z ahead; sigma in "
+        'degrees, 1 if not given), or "database": those of its pose priors.',
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
     join: Join = option(

@@ -18,6 +18,7 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import (
+    control_point_rows,
     describe_adjustment,
     describe_points,
     intrinsics_rows,
@@ -81,6 +82,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
             *rig_rows(located.summary()),
+            *control_point_rows(located.summary()),
             *scene_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]

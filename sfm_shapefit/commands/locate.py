@@ -31,8 +31,10 @@ from sfm_shapefit.commands.stages.adjustment import (
     with_uncertainty,
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.control_points import bring_to_control_points, read_control
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import turn_model_upright
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -48,6 +50,7 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
@@ -64,6 +67,7 @@ from sfm_shapefit.results.warnings import (
     quality_warnings,
     trust_warnings,
 )
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.settings import merge_options
 
@@ -121,9 +125,10 @@ def locate(
         inputs = read_left_out(inputs, model.names, options)
         model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
+        control = read_control(model, options)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     with open_source(model, inputs, options) as opened:
-        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics)
+        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control)
         return locate_source(opened, known, options, clock)
 
 
@@ -147,6 +152,10 @@ class Locating(NamedTuple):
     """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
     rigs: "Mapping[int, pycolmap.Rigid3d] | None" = None
     """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
+    control: ControlPoints | None = None
+    """Ground control points of the images."""
+    gravity: Gravity | None = None
+    """Of the images, which turns the model upright."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -185,6 +194,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options, judge)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
+    seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
+    seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
@@ -203,6 +214,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
+        *of_control,
+        *of_gravity,
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -229,6 +242,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         rigs=refined_rigs(
             known.rigs or sensors_of(model.reconstruction), sensors_of(seeded.reconstruction), sensors
         ),
+        control_points=tuple(control_points),
     )
 
 

@@ -25,8 +25,10 @@ from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.control_points import read_control
 from sfm_shapefit.commands.stages.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import read_gravity, refine_with_gravity
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
@@ -34,6 +36,7 @@ from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
@@ -41,6 +44,7 @@ from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.results.rigs import sensors_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
@@ -163,6 +167,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
             if name not in unposed.names:
                 raise InputError(f"known_distance: the database has no image {name}")
         positions = read_priors(unposed, inputs, options, priors)
+        control = read_control(unposed, options)
+        gravity = read_gravity(path, unposed, options)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     return _Run(
         options=options,
@@ -174,6 +180,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         sensor_rotations=sensor_rotations,
         intrinsics=intrinsics,
         priors=positions,
+        control=control,
+        gravity=gravity,
         without=inputs.left_out,
     )
 
@@ -194,6 +202,8 @@ class _Run(NamedTuple):
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
+    control: ControlPoints | None
+    gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
     opened: MatchDatabase | None = None
@@ -318,6 +328,9 @@ class _Run(NamedTuple):
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
+                if self.gravity is not None:
+                    gravity = self.gravity.of_frames(self.frame_of_image, self.sensor_rotations)
+                    answer = refine_with_gravity(answer, local, gravity.among(members))
             left = members[~answer.registered]
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
@@ -357,6 +370,8 @@ class _Run(NamedTuple):
         priors = None if self.priors is None else self.priors.of(members)
         if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
+        control = None if self.control is None else self.control.of(members)
+        gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
@@ -386,8 +401,10 @@ class _Run(NamedTuple):
                 intrinsics=intrinsics,
                 sensors=sensors,
                 rigs=sensors_of(model.reconstruction),
-            )
+                control=control,
+                gravity=gravity,
                 relative=measured,
+            )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
@@ -413,7 +430,8 @@ class _Run(NamedTuple):
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
         settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
-        if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
+        is_told = bool(known or has_priors or has_rigs or self.options.control_points)
+        if not is_told and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)

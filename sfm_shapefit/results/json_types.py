@@ -283,6 +283,22 @@ class KnownDistance(TypedDict):
     found: Annotated[float | None, "In the output; null if one of them is not in it."]
 
 
+class ControlPoint(TypedDict):
+    """A ground control point, and where the model has it."""
+
+    name: Annotated[str, "As the file calls it, or else its coordinates."]
+    use: Annotated[
+        Literal["control", "check", "unused"],
+        "Whether it sets scale and axes, only checks the model, or contradicts the others or has no place.",
+    ]
+    known: Annotated[list[float], "Where it is, in the output's axes."]
+    residual: Annotated[list[float] | None, "The model's position minus the known one; null if it has none."]
+    error: Annotated[float | None, "Length of the residual."]
+    error_px: Annotated[float | None, "Mean distance of its marks from the point in the model, in pixels."]
+    num_marks: Annotated[int, "Images of the model in which it is marked."]
+    num_agreeing_marks: Annotated[int, "Of these, placed ones whose marks agree."]
+
+
 class Alignment(TypedDict):
     """A similarity of the world: scale * rotation @ center + translation."""
 
@@ -328,9 +344,11 @@ class LocateSummary(PlacementSummary):
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     scale_sigma: Annotated[
         float | None,
-        "Relative standard deviation of a scale that rigs, priors or known distances tell; else null.",
+        "Relative standard deviation of a scale that rigs, priors, known distances or control points tell; "
+        "else null.",
     ]
     known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
+    control_points: Annotated[list[ControlPoint], "Ground control points, with their residuals."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[

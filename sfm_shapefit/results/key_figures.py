@@ -24,6 +24,7 @@ UNITS = {
     "distance": "of the known distance's units",
     "prior": "of the priors' units",
     "fixed": "of the fixed cameras' units",
+    "control points": "of the control points' units",
 }
 """What a standard deviation is given in, by the choice of the scale."""
 SOLVER_UNITS = "of the solver's units"

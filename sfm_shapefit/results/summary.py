@@ -75,6 +75,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "scale": found.gauge.statement,
         "scale_sigma": found.gauge.scale_sigma,
         "known_distances": _known_distances(found),
+        "control_points": list(found.control_points),
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
