@@ -67,7 +67,7 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     usable = directions.usable()
     if len(usable) == 0:
         counts = directions.counts()
-        reasons = ", ".join(f"{count} {status.value}" for status, count in counts.items())
+        reasons = ", ".join(f"{status.value}: {count}" for status, count in counts.items())
         raise UnsolvableError(
             f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
             f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
