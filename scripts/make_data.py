@@ -38,7 +38,7 @@ class BundledScene(NamedTuple):
     """How its images are drawn; None for made-up keypoints."""
 
 
-GRAPH, GPS, NAMES = "graph40.txt", "gps.csv", "names.txt"
+GRAPH, GPS, GCP, NAMES, GRAVITY = "graph40.txt", "gps.csv", "gcp_list.txt", "names.txt", "gravity.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -98,7 +98,9 @@ def main() -> None:
     out = parser.parse_args().out
     (out / GRAPH).write_text(bundled_graph_text(), encoding="utf-8")
     (out / GPS).write_text(measured_positions_text(), encoding="utf-8")
+    (out / GCP).write_text(control_points_text(), encoding="utf-8")
     (out / NAMES).write_text(names_text(), encoding="utf-8")
+    (out / GRAVITY).write_text(gravity_text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
@@ -125,6 +127,41 @@ def measured_positions_text() -> str:
         f"{image_name(k)},{x:.3f},{y:.3f},{z:.3f},0.05\n" for k, (x, y, z) in enumerate(measured.tolist())
     ]
     return "name,x,y,z,sigma\n" + "".join(lines)
+
+
+def control_points_text() -> str:
+    """Return ground control points of the courtyard, 1 cm off: one of them 2 m too high, two to check."""
+    scene = make_scene(SCENES["courtyard"].scene)
+    seen = np.bincount(np.concatenate([own[own >= 0] for own in scene.keypoint_points]))
+    chosen = [int(np.argmax(seen))]
+    for _ in range(8):  # always the farthest from all that are chosen, of those in many images
+        apart = scene.points[: len(seen), None] - scene.points[chosen]
+        chosen.append(int(np.argmax(np.where(seen >= 6, np.linalg.norm(apart, axis=2).min(axis=1), 0.0))))
+    noise = 0.01 * np.random.default_rng(0).standard_normal((len(chosen), 3))
+    measured = scene.points[chosen] + noise + [100.0, 0.0, 0.0]
+    measured[3, 2] += 2.0
+    lines = ["local\n"]
+    for k, (x, y, z) in enumerate(measured.tolist()):
+        name = f"P{k + 1}" if k < 7 else f"CHK-{k - 6}"
+        marks = [
+            (image_name(image), *pixels[points == chosen[k]][0])
+            for image, (pixels, points) in enumerate(zip(scene.keypoints, scene.keypoint_points, strict=True))
+            if (points == chosen[k]).any()
+        ]
+        lines += [
+            f"{x:.3f} {y:.3f} {z:.3f} {u:.1f} {v:.1f} {image} {name}\n"
+            for image, u, v in marks[:: len(marks) // 5]
+        ]
+    return "".join(lines)
+
+
+def gravity_text() -> str:
+    """Return the gravity of the cameras of ring8, 1 degree off per axis, and one of them wrong."""
+    scene = make_scene(SCENES["ring8"].scene)
+    measured = -scene.rotations[:, :, 2] + np.radians(1.0) * np.random.default_rng(0).standard_normal((8, 3))
+    measured[5] = [1.0, 0.0, 0.0]
+    lines = [f"{image_name(k)} {x:.4f} {y:.4f} {z:.4f}\n" for k, (x, y, z) in enumerate(measured.tolist())]
+    return "# name, gravity in axes of the camera\n" + "".join(lines)
 
 
 def names_text() -> str:

@@ -27,6 +27,9 @@ LEAST_MATCHES = 15
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""
 
+GRAVITY_OF_DATABASE = "database"
+"""In place of a file: the gravity of the database's pose priors."""
+
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
 # With more cameras, the adjustment would take longer than all the rest.
@@ -62,6 +65,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         (),
         "Two images by name, and how far apart they are in the output's units. May be repeated: of several "
         "the scale is a robust fit, and each is told with what the model has.",
+    )
+    control_points: str = option(
+        "",
+        "Ground control points, which set scale, origin and axes: a gcp_list.txt as of OpenDroneMap, whose "
+        "first line names the projection, and whose others are x y z, pixels, image, name of the point.",
     )
     fix: str = option(
         "",
@@ -111,6 +119,12 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         'their distortion too; "none", nothing. What was given pulls by its own weight, and stays where the '
         "matches do not tell it. Cameras that images share stay shared.",
     )
+    refine_rigs: bool = option(
+        False,
+        "Let the adjustments change where sensors stand in their rigs, each by one pose for all frames. "
+        "The reference sensors stay, and so does the mean distance of the others from them: the scale is "
+        "still that of the rigs. Refused where the matches do not tell a sensor's pose.",
+    )
     min_trust: float = option(
         0.6,
         "Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. "
@@ -126,11 +140,14 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_distance()
+        self._check_control_points()
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
         if self.refine_intrinsics in ("focal", "all") and not (self.adjust or self.bundle_adjust):
             raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
+        if self.refine_rigs and not (self.adjust or self.bundle_adjust):
+            raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
         if self.adjuster != "own" and not self.bundle_adjust:
             raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
@@ -152,6 +169,18 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         said = self.rotation_sigma_deg or self.rotations == "free"
         if said and not (self.adjust or self.bundle_adjust):
             raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
+
+    def _check_control_points(self) -> None:
+        """Refuse what would set the scale beside control points."""
+        others = {
+            f"the scale {self.scale}": self.scale != "auto",
+            "known distances": bool(self.known_distance),
+            "position priors": self.refine_with_priors,
+            "fixed cameras": bool(self.fix),
+        }
+        for other, is_asked in others.items():
+            if self.control_points and is_asked:
+                raise ValueError(f"control points and {other} would both set the scale; leave out one")
 
     def _check_distance(self) -> None:
         """Refuse a known distance that is none, or that the scale asked for has no use for."""
@@ -235,6 +264,12 @@ class MapOptions(LocateOptions):
         "Images that are frames of a video, told by a running number in their names: pairs far apart in time "
         'must agree with the chain of those near in time, or they are left out. "auto" asks that the matches '
         'look like a video too; "names" believes the names; "none" takes all pairs alike.',
+    )
+    gravity: str = option(
+        "",
+        "Directions of gravity, which take part in the averaging and turn the model so that z points up: a "
+        "text file of name x y z [sigma] per line, in axes of the camera (x right, y down, z ahead; sigma in "
+        'degrees, 1 if not given), or "database": those of its pose priors.',
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
     join: Join = option(

@@ -174,6 +174,8 @@ READING = {
     "a graph": ("solve", "{pipe}", "{out}"),
     "a model file": ("convert", "{pipe}", "{out}"),
     "priors": ("locate", MODEL, "{out}", "--priors", "{pipe}"),
+    "control points": ("locate", MODEL, "{out}", "--control-points", "{pipe}"),
+    "gravity": ("map", str(RING / "database.db"), "{out}", "--gravity", "{pipe}"),
     "names": ("locate", MODEL, "{out}", "--fix", "{pipe}"),
     "options": ("locate", MODEL, "{out}", "--config", "{pipe}"),
 }

@@ -178,7 +178,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
 
 
 def test_every_scale_has_its_unit():
-    assert set(key_figures.UNITS) == {*get_args(Scale), "fixed"} - {"auto"}
+    assert set(key_figures.UNITS) == {*get_args(Scale), "fixed", "control points"} - {"auto"}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):

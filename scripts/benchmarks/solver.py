@@ -363,7 +363,7 @@ BENCHMARK = Benchmark(
     cases=cases,
     checks=checks,
     tables=tables,
-    packages=("numpy", "scipy", "numba", "cvxpy", "clarabel"),
+    packages=("numpy", "scipy", "numba", "cvxpy-base", "clarabel"),
     quantities=(
         Quantity("ours, cvxpy, Clarabel", "ms", "lower", 0.5, "wall-clock, median of the repeats"),
         Quantity("CPU", "ms", "lower", 0.25, "the same in processor time"),

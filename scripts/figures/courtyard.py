@@ -37,7 +37,7 @@ def run(_args: argparse.Namespace) -> Figure:
     for axes in (rotations, pairs, after):
         axes.set_aspect("equal")
         axes.title.set_fontsize(10)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0.0, 0.0, 1.0, 0.97))
     return figure
 
 

@@ -4,6 +4,7 @@ const box = document.getElementById("search");
 const list = document.getElementById("found");
 const menu = document.getElementById("menu");
 const MOST = 20;
+const REFERENCE = /^(api\/|scripts-results)/; // looked up by name: it stands behind the pages that explain
 
 if (innerWidth <= 800) menu.open = false;
 
@@ -20,7 +21,7 @@ function score(k, words) {
     if (!inTitle && !lowered[k].text.includes(word)) return 0;
     total += inTitle ? 10 : 1;
   }
-  return total / (1 + lowered[k].title.length / 200);
+  return (total / (1 + lowered[k].title.length / 200)) * (REFERENCE.test(INDEX[k].url) ? 0.1 : 1);
 }
 
 function around(k, word) {

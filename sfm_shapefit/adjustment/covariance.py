@@ -46,6 +46,9 @@ class FrameCovariances:
     """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
     lens_sigmas: FloatArray
     """(l, 8) standard deviations of the OPENCV parameters of each lens; 0 for what is held."""
+    sensor_sigmas: FloatArray
+    """(s, 6) standard deviations of the center of each free sensor, units of the world, and of its rotation,
+    in rad, along axes of its rig; those of a baseline that keeps its length are along and across it."""
 
 
 def estimate_covariances(
@@ -211,6 +214,7 @@ def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: i
         rotations=rotations,
         free_similarities=num_free,
         lens_sigmas=_by_lens(layout, blocks),
+        sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
     )
 
 

@@ -9,6 +9,8 @@ scaling; priors forbid what they inform about, however weakly. What is left is f
 so that the centers' best similarity to the start has no such part: the gauge stays the start's.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import expm
 
@@ -138,5 +140,34 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
     if turned:
         rotations = rotations.copy()
         rotations[moves] = rotations[moves] @ (motion[:3, :3] / size).T
-    points = _moved(values.points, motion)
-    return Values(rotations=rotations, centers=centers, points=points, lenses=values.lenses)
+    return replace(
+        values,
+        rotations=rotations,
+        centers=centers,
+        points=_moved(values.points, motion),
+        sensor_translations=_resized(problem, values, size),
+    )
+
+
+def _resized(problem: AdjustmentProblem, values: Values, size: float) -> FloatArray:
+    """Return the translations of all sensors (c, 3), those of free ones so many times as long."""
+    is_free = problem.free_sensors() >= 0
+    return np.where(is_free[:, None], size * values.sensor_translations, values.sensor_translations)
+
+
+def restore_baselines(problem: AdjustmentProblem, values: Values) -> Values:
+    """Return the values in the scale in which the free sensors' mean distance from their rigs' origins stays.
+
+    The longest alone had kept its length. All of them together are known better than any one.
+    """
+    assert problem.rig is not None
+    _, chosen = np.unique(problem.rig.free_sensors(), return_index=True)
+    own = chosen[problem.rig.free_sensors()[chosen] >= 0]
+    sizes = [
+        np.linalg.norm(t[own], axis=1).mean() for t in (problem.rig.translations, values.sensor_translations)
+    ]
+    size, fixed = float(sizes[0] / sizes[1]), problem.is_fixed()
+    origin = values.centers[fixed if fixed.any() else slice(None)].mean(axis=0)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = size * np.eye(3), (1.0 - size) * origin
+    return _apply(problem, values, motion, turned=False)

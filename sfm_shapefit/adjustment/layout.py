@@ -1,9 +1,13 @@
 """Where everything stands: unknowns in nodes, observations by point, and which nodes meet in which points.
 
 The camera side of the normal equations has one block of six unknowns for each node: a frame (center, then
-rotation vector) or a lens (focal lengths, then distortion). What is held leaves its slot empty, a frame that
-is fixed has no node. An entry is a node that sees a point; entries are sorted by point, then by node, lenses
-after frames. Two nodes that meet in a point are a pair (i < j): a block of the reduced system.
+rotation vector), a lens (focal lengths, then distortion), or a sensor that is free in its rig (center, then
+rotation vector, in axes of the rig). What is held leaves its slot empty, a frame that is fixed has no node.
+An entry is a node that sees a point; entries are sorted by point, then by node, frames before lenses before
+sensors. Two nodes that meet in a point are a pair (i < j): a block of the reduced system.
+
+Where nothing but free sensors tells the scale, the longest of their baselines keeps its length: its center
+moves in the plane across it, `sensor_bases` has no third column, and the slot is empty.
 """
 
 from dataclasses import dataclass
@@ -14,6 +18,7 @@ import numpy as np
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import NUM_VALUES, AdjustmentProblem
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.jit import kernel
 
 SLOTS = 6
@@ -28,6 +33,12 @@ class Layout:
     """(n,) -1 if it is fixed."""
     node_of_lens: IntArray
     """(l,) -1 if it is held."""
+    node_of_sensor: IntArray
+    """(s,) of each free sensor."""
+    sensor_bases: FloatArray
+    """(s, 3, 3) whose columns are the directions, in axes of the rig, in which each sensor's center moves."""
+    scale_sensor: int
+    """The sensor whose distance from the origin of its rig keeps its length; -1 if something else does."""
     active: BoolArray
     """(N, 6) which slots of each node are unknowns."""
     lens_slots: IntArray
@@ -45,19 +56,19 @@ class Layout:
     """(m,) entry of the observation's frame, or -1."""
     lens_entry: IntArray
     """(m,) entry of its lens, or -1."""
+    sensor_entry: IntArray
+    """(m,) entry of its sensor, or -1."""
 
     frame_of_camera: IntArray
     """(c,)"""
     lens_of_camera: IntArray
     """(c,)"""
-    sensor_rotations: FloatArray
-    """(c, 3, 3) of sensor_from_rig."""
-    sensor_translations: FloatArray
-    """(c, 3) of sensor_from_rig."""
-    link_of_camera: IntArray
-    """(c,) place in `links` of the camera's frame and lens, or -1."""
+    sensor_of_camera: IntArray
+    """(c,) free sensor, or -1."""
+    links_of_camera: IntArray
+    """(3, c) places in `links` of the camera's frame and lens, frame and sensor, lens and sensor; or -1."""
     links: IntArray
-    """(q, 2) frame nodes and lens nodes that one observation ties."""
+    """(q, 2) nodes that one observation ties."""
 
     first_entry: IntArray
     """(k + 1,) of each point."""
@@ -97,24 +108,32 @@ class Layout:
 
 def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     """Return the structure of an adjustment."""
-    frame_of_camera, sensor_rotations, sensor_translations = _sensors(problem)
-    node_of_frame, node_of_lens, active, lens_slots = _nodes(problem, options)
+    frame_of_camera = np.arange(problem.num_frames)
+    if problem.rig is not None:
+        frame_of_camera = np.asarray(problem.rig.frame_of_camera, dtype=np.int64)
+    sensor_of_camera, scale_sensor = problem.free_sensors(), find_scale_sensor(problem)
+    node_of_frame, node_of_lens, node_of_sensor, active, lens_slots = _nodes(problem, options, scale_sensor)
     order = np.argsort(problem.points_seen, kind="stable")
     point, camera = problem.points_seen[order], problem.cameras_seeing[order]
     frame_node = node_of_frame[frame_of_camera]
     lens_node = node_of_lens[problem.lens_of_camera]
-    keys, where = _entries(point, frame_node[camera], lens_node[camera], len(active))
+    sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
+    nodes = np.stack([frame_node, lens_node, sensor_node])
+    keys, where = _entries(point, nodes[:, camera], len(active))
     entry_point, entry_node = keys // max(len(active), 1), keys % max(len(active), 1)
     first_entry = np.searchsorted(entry_point, np.arange(problem.num_points + 1))
     by_node = np.argsort(entry_node, kind="stable")
     first_of_node = np.searchsorted(entry_node[by_node], np.arange(len(active) + 1))
     first_pair, seconds = _pairs(first_of_node, by_node, entry_point, entry_node, first_entry)
     pairs = np.stack([np.repeat(np.arange(len(active)), np.diff(first_pair)), seconds], axis=1)
-    links, link_of_camera = _links(frame_node, lens_node, camera)
+    links, links_of_camera = _links(nodes, camera)
     pair_keys = pairs[:, 0] * len(active) + pairs[:, 1]
     return Layout(
         node_of_frame=node_of_frame,
         node_of_lens=node_of_lens,
+        node_of_sensor=node_of_sensor,
+        sensor_bases=_sensor_bases(problem, scale_sensor),
+        scale_sensor=scale_sensor,
         active=active,
         lens_slots=lens_slots,
         observation=order,
@@ -123,11 +142,11 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         pixels=np.ascontiguousarray(problem.pixels[order]),
         frame_entry=where[0],
         lens_entry=where[1],
+        sensor_entry=where[2],
         frame_of_camera=frame_of_camera,
         lens_of_camera=problem.lens_of_camera,
-        sensor_rotations=sensor_rotations,
-        sensor_translations=sensor_translations,
-        link_of_camera=link_of_camera,
+        sensor_of_camera=sensor_of_camera,
+        links_of_camera=links_of_camera,
         links=links,
         first_entry=first_entry,
         entry_node=entry_node,
@@ -141,20 +160,35 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     )
 
 
-def _sensors(problem: AdjustmentProblem) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the frame of each camera and its sensor_from_rig."""
+def find_scale_sensor(problem: AdjustmentProblem) -> int:
+    """Return the free sensor farthest from the origin of its rig if nothing else tells the scale, or -1."""
     if problem.rig is None:
-        n = problem.num_frames
-        return np.arange(n), np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-    rotations = np.ascontiguousarray(problem.rig.rotations, dtype=np.float64)
-    translations = np.ascontiguousarray(problem.rig.translations, dtype=np.float64)
-    return np.asarray(problem.rig.frame_of_camera, dtype=np.int64), rotations, translations
+        return -1
+    free, sizes = problem.rig.free_sensors(), np.linalg.norm(problem.rig.translations, axis=1)
+    priors = 0 if problem.center_prior is None else len(problem.center_prior.indices)
+    known = sizes[free < 0].any() or max(int(problem.is_fixed().sum()), priors) > 1
+    seeing = np.zeros(len(free), np.bool_)
+    seeing[problem.cameras_seeing] = True  # a sensor that sees nothing says nothing of any scale
+    sizes = np.where(seeing & (free >= 0), sizes, 0.0)
+    return -1 if known or not sizes.any() else int(free[np.argmax(sizes)])
+
+
+def _sensor_bases(problem: AdjustmentProblem, scale_sensor: int) -> FloatArray:
+    """Return the directions in which the center of each free sensor moves, (s, 3, 3)."""
+    free = problem.free_sensors()
+    bases = np.tile(np.eye(3), (int(free.max(initial=-1)) + 1, 1, 1))
+    if scale_sensor >= 0:
+        assert problem.rig is not None
+        center = problem.rig.sensor_centers()[np.argmax(free == scale_sensor)]
+        bases[scale_sensor, :, :2] = tangent_bases(normalized(center)[None])[0]
+        bases[scale_sensor, :, 2] = 0.0
+    return bases
 
 
 def _nodes(
-    problem: AdjustmentProblem, options: AdjustmentOptions
-) -> tuple[IntArray, IntArray, BoolArray, IntArray]:
-    """Number the nodes, frames first; return node_of_frame, node_of_lens, active and lens_slots."""
+    problem: AdjustmentProblem, options: AdjustmentOptions, scale_sensor: int
+) -> tuple[IntArray, IntArray, IntArray, BoolArray, IntArray]:
+    """Number the nodes; return node_of_frame, node_of_lens, node_of_sensor, active and lens_slots."""
     moves = ~problem.is_fixed()
     node_of_frame = np.where(moves, np.cumsum(moves) - 1, -1)
     free = {"focal_lengths": options.free_focal_lengths, "distortion": options.free_distortion}
@@ -162,17 +196,19 @@ def _nodes(
     sizes = lens_slots.max(axis=1, initial=-1) + 1
     adjusted = sizes > 0
     node_of_lens = np.where(adjusted, int(moves.sum()) + np.cumsum(adjusted) - 1, -1)
+    num_sensors = int(problem.free_sensors().max(initial=-1)) + 1
+    node_of_sensor = int(moves.sum() + adjusted.sum()) + np.arange(num_sensors)
     size_of_frame = 3 if options.hold_rotations else SLOTS
-    size_of_node = np.concatenate([np.full(int(moves.sum()), size_of_frame), sizes[adjusted]])
+    of_frames, of_sensors = np.full(int(moves.sum()), size_of_frame), np.full(num_sensors, SLOTS)
+    size_of_node = np.concatenate([of_frames, sizes[adjusted], of_sensors])
     active = np.arange(SLOTS) < size_of_node[:, None]
-    return node_of_frame, node_of_lens, active, lens_slots
+    if scale_sensor >= 0:
+        active[node_of_sensor[scale_sensor], 2] = False
+    return node_of_frame, node_of_lens, node_of_sensor, active, lens_slots
 
 
-def _entries(
-    point: IntArray, frame_node: IntArray, lens_node: IntArray, num_nodes: int
-) -> tuple[IntArray, IntArray]:
-    """Return sorted entries, as point * N + node, and those of each observation's frame and lens (2, m)."""
-    nodes = np.stack([frame_node, lens_node])
+def _entries(point: IntArray, nodes: IntArray, num_nodes: int) -> tuple[IntArray, IntArray]:
+    """Return sorted entries, as point * N + node, and those of each observation's nodes (3, m)."""
     has = nodes >= 0
     keys, inverse = np.unique((point * num_nodes + nodes)[has], return_inverse=True)
     where = np.full(nodes.shape, -1)
@@ -180,16 +216,21 @@ def _entries(
     return keys, where
 
 
-def _links(frame_node: IntArray, lens_node: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the frame and lens nodes that an observation ties, and the place of each camera's, or -1."""
-    sees = np.zeros(len(frame_node), np.bool_)
+def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the nodes that an observation ties, and the places of each camera's three ties (3, c), or -1.
+
+    Args:
+        nodes: (3, c) of each camera's frame, lens and sensor.
+        camera: of each observation.
+    """
+    sees = np.zeros(nodes.shape[1], np.bool_)
     sees[camera] = True
-    linked = np.flatnonzero(sees & (frame_node >= 0) & (lens_node >= 0))
-    both = np.stack([frame_node[linked], lens_node[linked]], axis=1)
-    links, inverse = np.unique(both, axis=0, return_inverse=True)
-    link_of_camera = np.full(len(frame_node), -1)
-    link_of_camera[linked] = inverse.ravel()
-    return links, link_of_camera
+    both = np.stack([nodes[[0, 0, 1]], nodes[[1, 2, 2]]], axis=2)
+    linked = sees & (both >= 0).all(axis=2)
+    links, inverse = np.unique(both[linked], axis=0, return_inverse=True)
+    links_of_camera = np.full(linked.shape, -1)
+    links_of_camera[linked] = inverse.ravel()
+    return links, links_of_camera
 
 
 def _pairs(

@@ -5,6 +5,9 @@ through a lens, which it may share. A point X of the world has, in a camera of f
 
     x = R_s R_f (X - C_f) + t_s,        (R_s, t_s) = sensor_from_rig, the identity without a rig.
 
+Where a sensor is free, its center -R_s^T t_s and its rotation in the rig are unknowns that all its images
+share.
+
 Lens models and the order of their parameters are COLMAP's. All five are cases of OPENCV,
 
     u = x/z, v = y/z, s = u^2 + v^2,
@@ -108,6 +111,20 @@ class Rig:
     """(c, 3, 3) of sensor_from_rig."""
     translations: FloatArray
     """(c, 3) of sensor_from_rig, in units of the world."""
+    free_sensor_of_camera: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(c,) number of the sensor that each camera is, from 0, if its pose in the rig is unknown; -1 if it
+    stays, as that of a reference has to. Empty: all stay."""
+
+    def free_sensors(self) -> IntArray:
+        """Return the number of each camera's sensor, (c,); -1 for those that stay."""
+        if len(self.free_sensor_of_camera):
+            return self.free_sensor_of_camera
+        return np.full(len(self.frame_of_camera), -1)
+
+    def sensor_centers(self) -> FloatArray:
+        """Return where each camera stands in its rig, (c, 3)."""
+        centers: FloatArray = -np.einsum("cba,cb->ca", self.rotations, self.translations)
+        return centers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,10 +246,20 @@ class AdjustmentProblem:
             yield np.arange(self.num_frames), self.rotation_prior.information, slice(3, 6)
 
     def with_values(
-        self, rotations: FloatArray, centers: FloatArray, points: FloatArray, lenses: Sequence[Lens]
+        self,
+        rotations: FloatArray,
+        centers: FloatArray,
+        points: FloatArray,
+        lenses: Sequence[Lens],
+        rig: Rig | None = None,
     ) -> Self:
-        """Return the problem with the same observations at other values."""
-        return replace(self, rotations=rotations, centers=centers, points=points, lenses=lenses)
+        """Return the problem with the same observations at other values; the rig stays if it is None."""
+        rig = self.rig if rig is None else rig
+        return replace(self, rotations=rotations, centers=centers, points=points, lenses=lenses, rig=rig)
+
+    def free_sensors(self) -> IntArray:
+        """Return the number of each camera's free sensor, (c,); -1 for those that stay."""
+        return np.full(self.num_cameras, -1) if self.rig is None else self.rig.free_sensors()
 
     def of_points(self, chosen: BoolArray) -> Self:
         """Return the problem of some points (k,) and what sees them; frames and cameras stay."""
@@ -266,6 +293,11 @@ class AdjustmentProblem:
                 f"the rig's arrays have shapes {shapes}, they must be ({c},), ({c}, 3, 3), ({c}, 3)"
             )
         _check_range(self.rig.frame_of_camera, self.num_frames, "frame")
+        free = self.rig.free_sensors()
+        if free.shape != (c,) or not np.array_equal(
+            np.unique(free[free >= 0]), np.arange(free.max(initial=-1) + 1)
+        ):
+            raise InputError(f"free sensors must be {c} numbers from 0 without gaps, -1 for those that stay")
         _check_rotations(self.rig.rotations, "rotation of a sensor in its rig")
         if not np.isfinite(self.rig.translations).all():
             raise InputError("a translation of a sensor in its rig is not finite")

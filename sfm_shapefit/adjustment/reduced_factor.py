@@ -94,9 +94,10 @@ class DenseFactor:
         with one_blas_thread():
             inverse, _ = dpotri(self.matrix, lower=1)
         for node, rows in enumerate(self.rows):
-            taken = rows[rows >= 0]
+            slots = np.flatnonzero(rows >= 0)
+            taken = rows[slots]
             lower = np.tril(inverse[np.ix_(taken, taken)])
-            out[node, : len(taken), : len(taken)] = lower + np.tril(lower, -1).T
+            out[node][np.ix_(slots, slots)] = lower + np.tril(lower, -1).T
         return out
 
 

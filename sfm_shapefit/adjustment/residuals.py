@@ -1,15 +1,19 @@
 """Reprojection errors and their derivatives, summed into the normal equations: the kernels that see pixels.
 
-For an observation with residual r (2,), Jacobians J_p of its point, J_f of its frame and J_l of its lens, and
-the 2 x 2 weight M of the loss (see `adjustment`), a pass over the points writes
+For an observation with residual r (2,), Jacobians J_p of its point, J_f of its frame, J_l of its lens and J_s
+of its sensor, and the 2 x 2 weight M of the loss (see `adjustment`), a pass over the points writes
 
     V_p += J_p^T M J_p        b_p += J_p^T w r          for each point
     W_e += J_p^T M J_e                                  for each entry e (a node that sees the point)
     U_i += J_i^T M J_i        b_i += J_i^T w r          for each node
-    U_q += J_f^T M J_l                                  for each link of a frame with a lens.
+    U_q += J_f^T M J_l, J_f^T M J_s, J_l^T M J_s        for each link of two of its nodes.
 
 A frame's Jacobian by its center is that of the point with the other sign. So its part of W_e is -J_p^T M J_p,
 which is also what the point and the center's corner of U_i receive, and little else is left to multiply.
+
+A sensor with center c and rotation R in its rig sees the point at x = R (y - c), y = R_f (X - C_f). A small
+turn w in axes of the rig makes R exp(w) of R. With J the derivative of the pixel by x, a row, that by c is
+-J R and that by w is R^T (x cross J).
 
 Points are cut into the same chunks whatever the number of threads, and the sums of the chunks are added in
 order: the same bits always.
@@ -52,6 +56,10 @@ class Values:
     """(k, 3)"""
     lenses: FloatArray
     """(l, 8) as OPENCV models."""
+    sensor_rotations: FloatArray
+    """(c, 3, 3) of sensor_from_rig."""
+    sensor_translations: FloatArray
+    """(c, 3) of sensor_from_rig."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,8 +106,9 @@ def linearize(
     given = _inputs(layout, values, loss_scale_px)
     structure = (
         layout.lens_of_camera, layout.lens_slots, layout.turns, layout.frame_of_camera, layout.node_of_frame,
-        layout.node_of_lens, layout.frame_entry, layout.lens_entry, layout.link_of_camera, layout.first_entry,
-        least_curvature,
+        layout.node_of_lens, layout.frame_entry, layout.lens_entry, layout.links_of_camera,
+        layout.first_entry, least_curvature, layout.sensor_of_camera, layout.node_of_sensor,
+        layout.sensor_bases, layout.sensor_entry,
     )  # fmt: skip
     by_point_sums = (points, point_gradients, entries)
 
@@ -142,13 +151,13 @@ def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
 
 def _inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
     """Return what every kernel here reads."""
-    turned = layout.sensor_rotations @ values.rotations[layout.frame_of_camera]
+    turned = values.sensor_rotations @ values.rotations[layout.frame_of_camera]
     views = np.concatenate(
         [
             turned.reshape(-1, 9),
             values.centers[layout.frame_of_camera],
-            layout.sensor_translations,
-            layout.sensor_rotations.reshape(-1, 9),
+            values.sensor_translations,
+            values.sensor_rotations.reshape(-1, 9),
             values.lenses[layout.lens_of_camera],
         ],
         axis=1,
@@ -293,11 +302,12 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
     """Add the observations of the points begin..end-1, to nodes in their upper triangles only."""
     first, cameras, pixels, views, points, scale = given
     lens_of_camera, lens_slots, turns, frame_of_camera, node_of_frame, node_of_lens = structure[:6]
-    frame_entry, lens_entry, link_of_camera, first_entry, least_curvature = structure[6:]
+    frame_entry, lens_entry, links_of_camera, first_entry, least_curvature = structure[6:11]
+    sensor_of_camera, node_of_sensor, sensor_bases, sensor_entry = structure[11:]
     nodes, gradients, links = sums
     blocks, point_gradients, entries = by_point_sums
     by_point, by_values = np.empty((2, 3)), np.zeros((2, NUM_VALUES))
-    by_lens, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS))
+    by_lens, by_sensor, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS)), np.zeros((2, SLOTS))
     for p in range(begin, end):
         for e in range(first_entry[p], first_entry[p + 1]):
             for a in range(3):
@@ -393,20 +403,36 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
                 gradients[i, 3] += c0 * wx + d0 * wy
                 gradients[i, 4] += c1 * wx + d1 * wy
                 gradients[i, 5] += c2 * wx + d2 * wy
+            if lens_entry[k] < 0 and sensor_entry[k] < 0:
+                continue
+            by_turn = (c0, c1, c2, d0, d1, d2)
+            by_point[0, 0], by_point[0, 1], by_point[0, 2] = p0, p1, p2
+            by_point[1, 0], by_point[1, 1], by_point[1, 2] = q0, q1, q2
             if lens_entry[k] >= 0:
                 lens = lens_of_camera[camera]
-                by_point[0, 0], by_point[0, 1], by_point[0, 2] = p0, p1, p2
-                by_point[1, 0], by_point[1, 1], by_point[1, 2] = q0, q1, q2
                 _differentiate_by_lens(views, camera, u, v, lens_slots, lens, by_values, by_lens)
-                for q in range(SLOTS):
-                    weighted[0, q] = m00 * by_lens[0, q] + m01 * by_lens[1, q]
-                    weighted[1, q] = m01 * by_lens[0, q] + m11 * by_lens[1, q]
-                _add_lens(
+                _multiply(m00, m01, m11, by_lens, weighted)
+                _add_node(
                     by_point, by_lens, weighted, wx, wy, node_of_lens[lens], lens_entry[k],
                     nodes, gradients, entries,
                 )  # fmt: skip
-                by_turn = (c0, c1, c2, d0, d1, d2)
-                _add_link(by_point, by_turn, weighted, links, link_of_camera[camera])
+                _add_link(by_point, by_turn, weighted, links, links_of_camera[0, camera])
+            if sensor_entry[k] >= 0:
+                sensor = sensor_of_camera[camera]
+                c0, c1, c2 = _turn(views, camera, a0, a1, a2)
+                d0, d1, d2 = _turn(views, camera, b0, b1, b2)
+                by_center = (c0, c1, c2, d0, d1, d2)
+                c0, c1, c2 = _turn(views, camera, y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0)
+                d0, d1, d2 = _turn(views, camera, y * b2 - z * b1, z * b0 - x * b2, x * b1 - y * b0)
+                _differentiate_by_sensor(by_center, (c0, c1, c2, d0, d1, d2), sensor_bases, sensor, by_sensor)
+                _multiply(m00, m01, m11, by_sensor, weighted)
+                _add_node(
+                    by_point, by_sensor, weighted, wx, wy, node_of_sensor[sensor], sensor_entry[k],
+                    nodes, gradients, entries,
+                )  # fmt: skip
+                _add_link(by_point, by_turn, weighted, links, links_of_camera[1, camera])
+                if links_of_camera[2, camera] >= 0:
+                    _add_block(by_lens, weighted, links, links_of_camera[2, camera])
         blocks[p, 0], blocks[p, 1], blocks[p, 2] = v00, v01, v02
         blocks[p, 3], blocks[p, 4], blocks[p, 5] = v11, v12, v22
         point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2] = g0, g1, g2
@@ -442,22 +468,22 @@ def _weigh(x: float, y: float, scale: float, least: float) -> tuple[float, float
 
 
 @inner_kernel
-def _add_lens(
-    by_point: Any, by_lens: Any, weighted: Any, wx: float, wy: float, node: int, e: int,
+def _add_node(
+    by_point: Any, by_node: Any, weighted: Any, wx: float, wy: float, node: int, e: int,
     nodes: Any, gradients: Any, entries: Any,
 ) -> None:  # fmt: skip
-    """Add an observation to the node and the entry of its lens; `weighted` is M J."""
+    """Add an observation to the node and the entry of its lens or sensor; `weighted` is M J."""
     for c in range(SLOTS):
-        gradients[node, c] += by_lens[0, c] * wx + by_lens[1, c] * wy
+        gradients[node, c] += by_node[0, c] * wx + by_node[1, c] * wy
         for a in range(c + 1):
-            nodes[node, a, c] += by_lens[0, a] * weighted[0, c] + by_lens[1, a] * weighted[1, c]
+            nodes[node, a, c] += by_node[0, a] * weighted[0, c] + by_node[1, a] * weighted[1, c]
         for a in range(3):
             entries[e, a, c] += by_point[0, a] * weighted[0, c] + by_point[1, a] * weighted[1, c]
 
 
 @inner_kernel
 def _add_link(by_point: Any, by_turn: Any, weighted: Any, links: Any, link: int) -> None:
-    """Add an observation to the link of its frame with its lens, if that is not -1."""
+    """Add an observation to the link of its frame with its lens or sensor, if that is not -1."""
     c0, c1, c2, d0, d1, d2 = by_turn
     for q in range(SLOTS if link >= 0 else 0):
         x, y = weighted[0, q], weighted[1, q]
@@ -466,3 +492,34 @@ def _add_link(by_point: Any, by_turn: Any, weighted: Any, links: Any, link: int)
         links[link, 3, q] += c0 * x + d0 * y
         links[link, 4, q] += c1 * x + d1 * y
         links[link, 5, q] += c2 * x + d2 * y
+
+
+@inner_kernel
+def _add_block(by_first: Any, weighted: Any, links: Any, link: int) -> None:
+    """Add an observation to a link of its lens with its sensor; `weighted` is M J of the latter."""
+    for a in range(SLOTS):
+        for c in range(SLOTS):
+            links[link, a, c] += by_first[0, a] * weighted[0, c] + by_first[1, a] * weighted[1, c]
+
+
+@inner_kernel
+def _multiply(m00: float, m01: float, m11: float, jacobian: Any, weighted: Any) -> None:
+    """Write M J, (2, 6)."""
+    for q in range(SLOTS):
+        weighted[0, q] = m00 * jacobian[0, q] + m01 * jacobian[1, q]
+        weighted[1, q] = m01 * jacobian[0, q] + m11 * jacobian[1, q]
+
+
+@inner_kernel
+def _differentiate_by_sensor(by_center: Any, by_turn: Any, bases: Any, sensor: int, by_sensor: Any) -> None:
+    """Write the derivatives of the pixel by the unknowns of a sensor (2, 6), from those in axes of the rig.
+
+    Those by the center are still those of the point, of the other sign.
+    """
+    c0, c1, c2, d0, d1, d2 = by_center
+    for q in range(3):
+        u, v, w = bases[sensor, 0, q], bases[sensor, 1, q], bases[sensor, 2, q]
+        by_sensor[0, q] = -(c0 * u + c1 * v + c2 * w)
+        by_sensor[1, q] = -(d0 * u + d1 * v + d2 * w)
+    by_sensor[0, 3], by_sensor[0, 4], by_sensor[0, 5] = by_turn[0], by_turn[1], by_turn[2]
+    by_sensor[1, 3], by_sensor[1, 4], by_sensor[1, 5] = by_turn[3], by_turn[4], by_turn[5]

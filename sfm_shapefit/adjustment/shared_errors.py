@@ -113,7 +113,7 @@ def estimate_center_errors(
     system = ground_system(problem, replace(options, noise_px=options.noise_px / np.sqrt(kappa)))
     pulls = _Pulls(problem, options, system)
     freely = replace(problem, rotation_prior=None), replace(options, hold_rotations=False)
-    evidence, lens_errors_px = _Pulls(*freely, ground_system(*freely)).test_lenses(noise2)
+    evidence, lens_errors_px = _Pulls(*freely, ground_system(*freely)).detect_lens_errors(noise2)
     calibration_px = _CALIBRATION_OF_ERROR * float(np.median(errors) * np.sqrt(_doubt(evidence)))
     turn_sigmas = np.broadcast_to(np.asarray(turn_sigma_rad, dtype=np.float64), (problem.num_frames,))
     by_group, by_sample = pulls.draw(calibration_px, lens_errors_px, turn_sigmas)
@@ -216,7 +216,7 @@ class _Pulls:
         )  # fmt: skip
         return by_field, squares
 
-    def test_lenses(self, noise2: float) -> tuple[float, FloatArray]:
+    def detect_lens_errors(self, noise2: float) -> tuple[float, FloatArray]:
         """Return by how much fields of the lenses exceed noise of `noise2` px^2, and the size of each (l,).
 
         Lenses that few observations see, and those beyond the most used ones, get the mean of the others.
@@ -225,12 +225,12 @@ class _Pulls:
         counts = np.bincount(problem.lens_of_camera[problem.cameras_seeing], minlength=len(problem.lenses))
         most = np.argsort(-counts, kind="stable")[:_MOST_LENSES]
         tested = most[counts[most] >= _FEWEST_OF_A_LENS]
-        found = [self._test(lens, noise2) for lens in tested.tolist()]
-        variances = np.full(len(problem.lenses), np.mean([test.variance for test in found] or [0.0]))
-        variances[tested] = [test.variance for test in found]
-        return max((test.evidence for test in found), default=0.0), np.sqrt(variances)
+        found = [self._detect(lens, noise2) for lens in tested.tolist()]
+        variances = np.full(len(problem.lenses), np.mean([one.variance for one in found] or [0.0]))
+        variances[tested] = [one.variance for one in found]
+        return max((one.evidence for one in found), default=0.0), np.sqrt(variances)
 
-    def _test(self, lens: int, noise2: float) -> "_LensTest":
+    def _detect(self, lens: int, noise2: float) -> "_LensErrors":
         """Return what the visible part of the fields of a lens says of them."""
         own = self.problem.lens_of_camera == lens
         count = 2 * self.num_fields
@@ -247,14 +247,14 @@ class _Pulls:
         shares, modes = np.linalg.eigh(0.5 * (visible + visible.T))
         seen = shares > _VISIBLE * np.trace(squares[:count, :count]) / count
         if not seen.any() or noise2 <= 0.0:
-            return _LensTest(0.0, 0.0)
+            return _LensErrors(0.0, 0.0)
         amplitudes, variances = (modes.T @ wanted)[seen] / shares[seen], noise2 / shares[seen]
         excess = float(np.sum(amplitudes**2 / variances) - seen.sum())
         evidence = excess / np.sqrt(2.0 * seen.sum())
-        return _LensTest(evidence, _doubt(evidence) * likeliest_variance(amplitudes, variances))
+        return _LensErrors(evidence, _doubt(evidence) * likeliest_variance(amplitudes, variances))
 
 
-class _LensTest(NamedTuple):
+class _LensErrors(NamedTuple):
     """What the residuals say of smooth errors that all images of a lens share."""
 
     evidence: float

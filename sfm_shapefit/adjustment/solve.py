@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge
+from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
 from sfm_shapefit.adjustment.priors import (
@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.priors import (
     sum_priors,
     turn,
 )
-from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
@@ -41,6 +41,7 @@ _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, w
 _LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
 _STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual that is rounding
+_LEAST_LEFT = 0.25  # of two observations, what their point leaves
 _BEHIND_PX = 1e6  # what a point behind its camera counts as where frames are compared
 
 
@@ -131,14 +132,25 @@ def adjust(
     finally:
         run.workers.close()
     values = restore_gauge(problem, run.values, free_similarities(problem, options))
+    if run.layout.scale_sensor >= 0:
+        values = restore_baselines(problem, values)
     lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
     return Adjusted(
-        problem=problem.with_values(values.rotations, values.centers, values.points, lenses),
+        problem=problem.with_values(
+            values.rotations, values.centers, values.points, lenses, _rig(problem, values)
+        ),
         costs=np.array(run.costs),
         gradient_norm=run.gradient_norm,
         iterations=run.iterations,
         ending=ending,
     )
+
+
+def _rig(problem: AdjustmentProblem, values: Values) -> Rig | None:
+    """Return the rig of a problem with the poses of its sensors at other values."""
+    if problem.rig is None:
+        return None
+    return replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
 
 
 def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
@@ -179,31 +191,46 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
     the asymptotic variance of an M-estimator. Where most observations are far better than the worst, as
     those of features in photographs, small c are better; under normal errors 2.4 standard deviations are.
 
+    A point follows its own l observations: of their 2 l residuals 2 l - 3 are left. So |r|^2 is that share of
+    the error's square, and the observation tells that share about the cameras. Points of two observations
+    count where there are no others: with one residual left, they say little of what it is in the plane.
+
     Args:
         problem: at or near its minimum.
         scales_px: to choose from.
 
-    Source: Huber, "Robust Estimation of a Location Parameter", 1964; for adaptive scales, Huber, "Robust
-    Statistics", 1981, section 4.
+    Source: Huber, "Robust Estimation of a Location Parameter", 1964; for adaptive scales and the correction
+    for what is fitted, Huber, "Robust Statistics", 1981, sections 4 and 7.6.
     """
-    squares = reprojection_errors_px(problem) ** 2
-    squares = squares[np.isfinite(squares)]
+    lengths = np.bincount(problem.points_seen, minlength=problem.num_points)[problem.points_seen]
+    left = np.maximum(1.0 - 1.5 / lengths, _LEAST_LEFT)
+    squares = reprojection_errors_px(problem) ** 2 / left
+    counts = np.isfinite(squares) & (lengths >= min(3, int(lengths.max(initial=0))))
+    squares, left = squares[counts], left[counts]
 
     def variance(scale_px: float) -> float:
         weights = 1.0 / (1.0 + squares / scale_px**2)
-        slope = float(np.sum(weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
-        return float(np.sum(weights**2 * squares)) / max(slope, 1e-300) ** 2
+        slope = float(np.sum(left * weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
+        return float(np.sum(left * weights**2 * squares)) / max(slope, 1e-300) ** 2
 
     return min(scales_px, key=variance)
 
 
 def values_of(problem: AdjustmentProblem) -> Values:
     """Return the numbers of a problem that an adjustment changes."""
+    if problem.rig is None:
+        sensor_rotations = np.tile(np.eye(3), (problem.num_cameras, 1, 1))
+        sensor_translations = np.zeros((problem.num_cameras, 3))
+    else:
+        sensor_rotations = np.ascontiguousarray(problem.rig.rotations, dtype=np.float64)
+        sensor_translations = np.ascontiguousarray(problem.rig.translations, dtype=np.float64)
     return Values(
         rotations=problem.rotations,
         centers=problem.centers,
         points=problem.points,
         lenses=np.array([lens.values() for lens in problem.lenses]).reshape(-1, 8),
+        sensor_rotations=sensor_rotations,
+        sensor_translations=sensor_translations,
     )
 
 
@@ -344,7 +371,36 @@ def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatAr
     lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
     if (lenses[:, :2] <= 0.0).any():
         return None
-    return Values(rotations=rotations, centers=centers, points=values.points + point_steps, lenses=lenses)
+    sensor_rotations, sensor_translations = _move_sensors(layout, values, steps)
+    return Values(
+        rotations=rotations,
+        centers=centers,
+        points=values.points + point_steps,
+        lenses=lenses,
+        sensor_rotations=sensor_rotations,
+        sensor_translations=sensor_translations,
+    )
+
+
+def _move_sensors(layout: Layout, values: Values, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the poses of all cameras in their rigs after steps of nodes (N, 6)."""
+    rotations, translations = values.sensor_rotations, values.sensor_translations
+    cameras = np.flatnonzero(layout.sensor_of_camera >= 0)
+    if not len(cameras):
+        return rotations, translations
+    sensors = layout.sensor_of_camera[cameras]
+    own = steps[layout.node_of_sensor[sensors]]
+    before = -np.einsum("cba,cb->ca", rotations[cameras], translations[cameras])
+    after = before + np.einsum("cab,cb->ca", layout.sensor_bases[sensors], own[:, :3])
+    kept = sensors == layout.scale_sensor
+    after[kept] *= np.linalg.norm(before[kept], axis=1, keepdims=True) / np.linalg.norm(
+        after[kept], axis=1, keepdims=True
+    )
+    rotations, translations = rotations.copy(), translations.copy()
+    # R exp(w) = (exp(-w) R^T)^T
+    rotations[cameras] = turn(rotations[cameras].transpose(0, 2, 1), -own[:, 3:]).transpose(0, 2, 1)
+    translations[cameras] = -np.einsum("cab,cb->ca", rotations[cameras], after)
+    return rotations, translations
 
 
 def _gradient_norm(normal: NormalEquations, cost: float) -> float:

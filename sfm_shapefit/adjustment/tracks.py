@@ -4,8 +4,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.jit import kernel
@@ -105,8 +106,8 @@ class MatchedKeypoints:
     """(K, 2) as the adjustment's lens takes them."""
     on_plane: FloatArray
     """(K, 2) see `ObservedTracks`."""
-    matches: IntArray
-    """(m, 2) rows of the above."""
+    matches: npt.NDArray[np.integer]
+    """(m, 2) rows of the above, of any type of integer."""
 
     def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
         """Return the connected components under the matches that agree with the poses.
@@ -117,7 +118,11 @@ class MatchedKeypoints:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
         """
-        _, parents = self._agree(poses, limit_px)
+        parents = np.arange(len(self.cameras))
+        given = normalized(self._rays(poses)), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
+            _join(block, *given, parents)
         track = number_trees(parents, np.arange(len(parents)))
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
         rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
@@ -130,21 +135,6 @@ class MatchedKeypoints:
             ids=np.arange(len(lengths)),
         )
 
-    def agree(self, poses: CameraPoses, limit_px: float) -> BoolArray:
-        """Return which of the matches agree with the poses, (m,), as in `join`."""
-        return self._agree(poses, limit_px)[0]
-
-    def _agree(self, poses: CameraPoses, limit_px: float) -> tuple[BoolArray, IntArray]:
-        """Return which matches agree with the poses, and the forest in which they join the keypoints."""
-        agrees, parents = np.empty(len(self.matches), dtype=np.bool_), np.arange(len(self.cameras))
-        given = (
-            self.matches, normalized(self._rays(poses)), self.cameras, poses.centers, poses.focal_lengths_px,
-            limit_px, agrees, parents,
-        )  # fmt: skip
-        for begin in range(0, len(agrees), _MATCHES_A_SLICE):
-            _join(begin, min(begin + _MATCHES_A_SLICE, len(agrees)), *given)
-        return agrees, parents
-
     def _rays(self, poses: CameraPoses) -> FloatArray:
         """Return the rays (K, 3) in axes of the world, of no particular length."""
         ahead = np.concatenate([self.on_plane, np.ones((len(self.on_plane), 1))], axis=1)
@@ -153,12 +143,11 @@ class MatchedKeypoints:
 
 @kernel
 def _join(
-    begin: int, end: int, matches: Any, rays: Any, cameras: Any, centers: Any, focal_lengths_px: Any,
-    limit_px: float, agrees: Any, parents: Any,
-) -> None:  # fmt: skip
-    """Write which of the matches begin..end-1 agree with the poses, and join their keypoints."""
+    matches: Any, rays: Any, cameras: Any, centers: Any, focal_lengths_px: Any, limit_px: float, parents: Any
+) -> None:
+    """Join the keypoints of the matches that agree with the poses."""
     d = np.empty(3)
-    for m in range(begin, end):
+    for m in range(len(matches)):
         k, other = matches[m, 0], matches[m, 1]
         i, j = cameras[k], cameras[other]
         square = 0.0
@@ -168,6 +157,5 @@ def _join(
         for c in range(3):
             d[c] /= np.sqrt(square)
         angle = 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])
-        agrees[m] = sampson_px(rays[k], rays[other], d, angle) <= limit_px
-        if agrees[m]:
+        if sampson_px(rays[k], rays[other], d, angle) <= limit_px:
             unite(parents, k, other)

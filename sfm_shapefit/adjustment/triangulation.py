@@ -33,8 +33,6 @@ _STEPS = 5
 _STILL = 1e-9
 # Of so many rays one makes the widest angle with another, nearly always.
 _WIDE_AMONG = 64
-# So many points a track may be of.
-_MOST_POINTS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +45,8 @@ class PointLimits:
     """Between the rays of two of its observations."""
     min_length: int
     """Its fewest observations."""
+    most_points: int = 3
+    """So many points a track may be of."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,6 +59,13 @@ class TriangulatedPoints:
     """(k,) the track of each."""
     points_seen: IntArray
     """(m,) the point of each observation of the tracks, -1 for those that are of none."""
+
+    def of_length(self, least: int) -> "TriangulatedPoints":
+        """Return the points with so many observations; those of the others are of none."""
+        seen = self.points_seen
+        kept = np.bincount(seen[seen >= 0], minlength=len(self.points)) >= least
+        place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        return TriangulatedPoints(points=self.points[kept], tracks=self.tracks[kept], points_seen=place[seen])
 
 
 def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> TriangulatedPoints:
@@ -76,7 +83,7 @@ def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: Point
     figures = np.array(
         [limits.max_error_px**2, math.cos(math.radians(limits.min_angle_deg)), limits.min_length]
     )
-    most = _MOST_POINTS if tracks.may_split else 1
+    most = limits.most_points if tracks.may_split else 1
     given = (
         tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
         poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),

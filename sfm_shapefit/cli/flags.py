@@ -60,6 +60,8 @@ _METAVARS: dict[Any, str] = {
     "known_distance": "NAME NAME DISTANCE",
     "fix": "FILE|solved",
     "without": "FILE",
+    "control_points": "FILE",
+    "gravity": "FILE|database",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",

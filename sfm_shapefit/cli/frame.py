@@ -146,7 +146,10 @@ def command_run(
             from sfm_shapefit.report.thumbnails import refuse_no_folder
 
             refuse_no_folder(Path(flags.images))
-        named = [flags.images, *(getattr(options, name, "") for name in ("fix", "without"))]
+        named = [
+            flags.images,
+            *(getattr(options, name, "") for name in ("fix", "without", "control_points", "gravity")),
+        ]
         paths = [*inputs, config, *(Path(name) for name in named if name)]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)

@@ -33,6 +33,22 @@ def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     return [("intrinsics", shorten(lines))] if lines else []
 
 
+def rig_rows(facts: dict[str, Any]) -> Rows:
+    """Return a row on sensors that were refined in their rigs, if there are any."""
+    from sfm_shapefit.results.rigs import describe_rigs
+
+    lines = describe_rigs(facts["refined_rigs"])
+    return [("rigs", shorten(lines))] if lines else []
+
+
+def control_point_rows(facts: dict[str, Any]) -> Rows:
+    """Return a row on ground control points and their residuals, if there are any."""
+    from sfm_shapefit.results.control_points import describe_control_points
+
+    said = describe_control_points(facts["control_points"])
+    return [("control points", said)] if said else []
+
+
 def scene_rows(facts: dict[str, Any]) -> Rows:
     """Return rows on straight drives, loops of videos, and doubtful pairs, if there are any."""
     from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops

@@ -21,6 +21,7 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import (
+    control_point_rows,
     describe_adjustment,
     describe_points,
     further_piece_rows,
@@ -28,6 +29,7 @@ from sfm_shapefit.cli.lines import (
     name_pictures,
     next_steps,
     picture_rows,
+    rig_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import LocateOptions
@@ -95,6 +97,8 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
             *intrinsics_rows(facts),
+            *rig_rows(facts),
+            *control_point_rows(facts),
             *scene_rows(facts),
             *[("warning", warning) for warning in found.warnings],
             *picture_rows(flags, found.model.names),

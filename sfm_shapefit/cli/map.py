@@ -18,11 +18,13 @@ from sfm_shapefit.cli.flags import (
 )
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import (
+    control_point_rows,
     describe_adjustment,
     describe_points,
     intrinsics_rows,
     next_steps,
     picture_rows,
+    rig_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import MapOptions
@@ -79,6 +81,8 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *figure_rows(located.summary()),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
+            *rig_rows(located.summary()),
+            *control_point_rows(located.summary()),
             *scene_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]

@@ -21,7 +21,7 @@ from sfm_shapefit.cli.flags import Database, GroupedCommand, Images, Scene, one_
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
 
-Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
+Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or place wrote.")]
 
 
 @app.command(

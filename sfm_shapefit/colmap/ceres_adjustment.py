@@ -23,9 +23,11 @@ import pycolmap
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
+from sfm_shapefit.colmap.seed import transform_model
 from sfm_shapefit.colmap.structure import TrackSource, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import Similarity
 
 # Of each round, how much looser than asked the filter is, and the scale of the Cauchy loss in px.
 _ROUNDS = ((4.0, 2.0), (1.0, 1.0), (1.0, 1.0))
@@ -41,10 +43,13 @@ def adjust_by_ceres(
     structure_options: StructureOptions,
     fixed_frames: Collection[int],
     lenses: FreeLenses | None = None,
+    *,
+    free_rigs: bool = False,
 ) -> tuple[pycolmap.Reconstruction, int, bool]:
     """Return a new model, not yet filtered, the steps of all rounds, and whether the last one converged.
 
-    Lenses that may change are free here: Ceres knows of no prior on them.
+    Lenses that may change are free here: Ceres knows of no prior on them. So are rigs, but for the mean
+    distance of sensors from the references, which is restored.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or the adjustment diverges.
@@ -54,7 +59,11 @@ def adjust_by_ceres(
         limit_px = widening * structure_options.max_reprojection_error_px
         current = triangulate(current, tracks, replace(structure_options, max_reprojection_error_px=limit_px))
         refuse_without_points(current.num_points3D())
-        steps, converged = _solve(current, loss_scale_px, fixed_frames, lenses)
+        steps, converged = _solve(current, loss_scale_px, fixed_frames, lenses, free_rigs=free_rigs)
+        if free_rigs and not fixed_frames:
+            size = _mean_baseline(start) / _mean_baseline(current)
+            motion = Similarity(scale=size, rotation=np.eye(3), translation=np.zeros(3))
+            current = transform_model(current, motion)
         for image in map(current.image, sorted(current.reg_image_ids())):
             if not np.isfinite(image.cam_from_world().matrix()).all():  # such points are filtered later
                 raise UnsolvableError(
@@ -79,6 +88,8 @@ def _solve(
     loss_scale_px: float,
     fixed_frames: Collection[int],
     lenses: FreeLenses | None,
+    *,
+    free_rigs: bool,
 ) -> tuple[int, bool]:
     """Adjust our own `reconstruction` in place; return the number of steps and whether they converged."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -87,14 +98,14 @@ def _solve(
     for frame_id in sorted(set(fixed_frames) & set(reconstruction.reg_frame_ids())):
         config.set_constant_rig_from_world_pose(frame_id)
     has_scale = any(_has_offsets(rig) for rig in reconstruction.rigs.values())
-    if not has_scale:
+    if not has_scale or (free_rigs and not fixed_frames):
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     elif not fixed_frames:  # rigs know the scale, and one frame holds the rest
         config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
     settings = pycolmap.BundleAdjustmentOptions()
     settings.print_summary = is_heard()
     settings.refine_focal_length = settings.refine_principal_point = settings.refine_extra_params = False
-    settings.refine_sensor_from_rig = False
+    settings.refine_sensor_from_rig = free_rigs
     if lenses is not None and lenses.doubts:
         settings.refine_focal_length, settings.refine_extra_params = True, lenses.distortion
         for camera_id in sorted(set(reconstruction.cameras) - set(lenses.doubts)):
@@ -113,6 +124,13 @@ def _solve(
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps - 1  # the start counts as one
     return steps, converged
+
+
+def _mean_baseline(reconstruction: pycolmap.Reconstruction) -> float:
+    """Return the mean distance of all sensors from the references of their rigs."""
+    rigs = reconstruction.rigs.values()
+    poses = [pose for rig in rigs for pose in rig.non_ref_sensors.values() if pose is not None]
+    return float(np.mean([np.linalg.norm(pose.translation) for pose in poses]))
 
 
 def _has_offsets(rig: pycolmap.Rig) -> bool:

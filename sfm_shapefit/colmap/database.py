@@ -107,11 +107,15 @@ def find_database(model_folder: Path) -> Path | None:
 
 @contextmanager
 def open_database(
-    path: Path | str, model: PosedModel, left_out: PairNames = frozenset()
+    path: Path | str,
+    model: PosedModel,
+    left_out: PairNames = frozenset(),
+    rows: "PairRows | None" = None,
 ) -> Iterator["MatchDatabase"]:
     """Open a COLMAP database, for the matches of a model's images; neither it nor its folder is changed.
 
-    Pairs `left_out` are taken for unmatched.
+    Pairs `left_out` are taken for unmatched. With `rows`, as `MatchDatabase.rows` gave them for a model of
+    the same images, it has these pairs only, and the table of all pairs is not read again.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
@@ -122,7 +126,7 @@ def open_database(
         with _sqlite_errors(file):
             connection = stack.enter_context(_readonly_connection(file))
             _check_schema(file, connection)
-            database = MatchDatabase(file, connection, model, left_out)
+            database = MatchDatabase(file, connection, model, left_out, rows)
         yield database
 
 
@@ -162,8 +166,9 @@ class MatchDatabase:
         connection: sqlite3.Connection,
         model: PosedModel,
         left_out: PairNames = frozenset(),
+        rows: "PairRows | None" = None,
     ) -> None:
-        self.path, self.left_out = path, left_out
+        self.path = path
         self._connection = connection
         self._model = model
         self._cache_bytes = _CACHE_BYTES
@@ -172,7 +177,8 @@ class MatchDatabase:
         self._kept: dict[tuple[int, int], list[MatchBatch]] = {}
         index_of_id = _match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
-        self._pairs = _read_pairs(path, connection, index_of_id).without(_indices_of_names(model, left_out))
+        pairs = _read_pairs(path, connection, index_of_id) if rows is None else rows
+        self._pairs = pairs.without(_indices_of_names(model, left_out))
         self._looked_at: dict[int, _Keypoints] = {}
         self._sorted: SortedMatches | None = None
         if float(self._pairs.num_inliers.sum(dtype=np.float64)) <= MOST_MATCHES:
@@ -272,7 +278,7 @@ class MatchDatabase:
 
     def count_keypoints(self, image: int) -> int:
         """Return the number of keypoints of an image by its index; errors as of `keypoints`."""
-        return self._look_at(image).count
+        return self._look_at(image).number
 
     def parts(self, max_matches: int) -> list[tuple[int, int]]:
         """Return the ranges (first, stop) of pairs, in their order, of about so many matches each."""
@@ -281,6 +287,10 @@ class MatchDatabase:
         bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
         return list(itertools.pairwise(bounds.tolist()))
+
+    def rows(self, part: tuple[int, int]) -> "PairRows":
+        """Return where the matches of a range of pairs, one of `parts`, are, for another process."""
+        return self._pairs.subset(np.flatnonzero(self._pairs.has_matches)[slice(*part)])
 
     def iter_matches(
         self,
@@ -495,7 +505,7 @@ class MatchDatabase:
         both = both[np.append(True, both[1:] != both[:-1])[: len(both)]]
         matches = np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.uint32)
         for image, keypoints in zip(self._pairs.pairs[pair].tolist(), matches.T, strict=True):
-            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).count:
+            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).number:
                 raise self._damaged_pair(pair, "matches of keypoints that do not exist")
         return matches
 
@@ -644,12 +654,12 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
 class _Keypoints(NamedTuple):
     """Those of an image."""
 
-    count: int
+    number: int
     blind: BoolArray | None
-    """(count,) which have no ray; None if all have one."""
+    """(number,) which have no ray; None if all have one."""
 
 
-class _Pairs(NamedTuple):
+class PairRows(NamedTuple):
     """The pairs of posed images that have inlier matches, sorted by (i, j)."""
 
     pairs: IntArray
@@ -661,13 +671,17 @@ class _Pairs(NamedTuple):
     configs: IntArray
     num_inliers: IntArray
 
-    def without(self, left_out: set[tuple[int, int]]) -> "_Pairs":
+    def without(self, left_out: set[tuple[int, int]]) -> "PairRows":
         """Return all pairs but some (i, j), i < j."""
         if not left_out:
             return self
-        kept = np.array([(i, j) not in left_out for i, j in self.pairs.tolist()], dtype=np.bool_)
-        ends, rowids, swapped, configs, counts = self
-        return _Pairs(ends[kept], rowids[kept], swapped[kept], configs[kept], counts[kept])
+        return self.subset(
+            np.flatnonzero([(i, j) not in left_out for i, j in self.pairs.tolist()]).astype(np.int64)
+        )
+
+    def subset(self, chosen: IntArray) -> "PairRows":
+        """Return the chosen pairs."""
+        return PairRows(*(column[chosen] for column in self))
 
     @property
     def has_matches(self) -> BoolArray:
@@ -740,7 +754,7 @@ def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) 
     return index_of_id
 
 
-def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> _Pairs:
+def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> PairRows:
     """Read which pairs of posed images have inlier matches."""
     damaged = connection.execute(
         "SELECT pair_id FROM two_view_geometries WHERE typeof(pair_id) != 'integer' "
@@ -762,7 +776,7 @@ def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[in
     repeated = pair_ids[order[:-1]][(pairs[1:] == pairs[:-1]).all(axis=1)]
     if len(repeated):
         raise InputError(f"{path}: the two-view geometry of pair {repeated[0]} stands twice")
-    return _Pairs(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
+    return PairRows(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
 
 
 def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:

@@ -8,7 +8,7 @@ and later); `sensor_from_rig` is a quaternion w x y z and a translation, eight b
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,6 +54,17 @@ class DatabaseRigs:
         for sensor, pose in rig.non_ref_sensors.items():
             copy.add_sensor(sensor, pose)
         return copy
+
+    def with_sensors_of(self, model: pycolmap.Reconstruction) -> "DatabaseRigs":
+        """Return the same with the poses that sensors have in a model, where it has them."""
+        poses = {
+            sensor.id: pose for rig in model.rigs.values() for sensor, pose in rig.non_ref_sensors.items()
+        }
+        rigs = {rig_id: self.renumbered(rig_id, rig_id) for rig_id in self.rigs}
+        for rig in rigs.values():
+            for sensor in rig.non_ref_sensors:
+                rig.set_sensor_from_rig(sensor, poses.get(sensor.id, rig.sensor_from_rig(sensor)))
+        return replace(self, rigs=rigs)
 
     def sensor_from_rig(self, image: pycolmap.Image) -> pycolmap.Rigid3d:
         """Return the pose of an image's camera in its rig; the identity without rig."""

@@ -90,6 +90,13 @@ class PosedModel:
         """Return the camera of an image by its index."""
         return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
 
+    def image_sizes(self) -> FloatArray:
+        """Return width and height of each image in pixels, (n, 2)."""
+        cameras = [self.camera(k) for k in range(self.num_images)]
+        return np.array([[camera.width, camera.height] for camera in cameras], dtype=np.float64).reshape(
+            -1, 2
+        )
+
 
 def same_intrinsics(one: PosedModel, other: PosedModel) -> bool:
     """Return whether two models of the same images take them through the same lenses."""
@@ -165,7 +172,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
 
 def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
-    """Return the model with the frames' rotations, and the intrinsics, of another; no input is touched.
+    """Return the model with the frames' rotations, the rigs and the intrinsics of another; no input changes.
 
     Args:
         model: the posed images.
@@ -176,6 +183,9 @@ def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> 
     for camera_id, camera in turned.cameras.items():
         if camera.params.tolist() != copy.camera(camera_id).params.tolist():
             copy.camera(camera_id).params = camera.params
+    for rig_id, rig in turned.rigs.items():
+        for sensor, sensor_from_rig in rig.non_ref_sensors.items():
+            copy.rig(rig_id).set_sensor_from_rig(sensor, sensor_from_rig)
     for frame_id in sorted(turned.reg_frame_ids()):
         frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
         pose = frame.rig_from_world

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.colmap.model import PosedModel, observed_points
+from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.joining import sampson_px
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.jit import kernel
@@ -99,7 +99,7 @@ def judge_observations(
         if image is not None:
             checked = own[:, 0] >= _CHECKED_BY
             sees = np.zeros_like(checked)
-            sees[observed_points(image)[0]] = True
+            sees[image.get_observation_point2D_idxs()] = True
             matched += int(checked.sum())
             agreeing += int(np.sum(checked & sees))
             contradicting += int(np.sum(checked & ~sees & (2 * own[:, 1] > own[:, 0])))
@@ -116,8 +116,8 @@ def _count_misses(
 ) -> None:  # fmt: skip
     """Count the partners of each keypoint of all images, and those of them that miss their epipolar lines.
 
-    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take the rays to the cameras' axes. Two images in one place, whose baseline is 0,
-    contradict nothing.
+    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take
+    the rays to the cameras' axes. Two images in one place, whose baseline is 0, contradict nothing.
     """
     u, v = np.empty(3), np.empty(3)
     for p in range(len(pairs)):

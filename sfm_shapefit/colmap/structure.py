@@ -20,7 +20,7 @@ primitives are pycolmap's.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -49,16 +49,6 @@ class ImageMatches:
     keypoints: npt.NDArray[np.uint32]
     """(M, 2) index of the keypoint in the first image and in the second."""
 
-    def subset(self, kept: BoolArray) -> "ImageMatches":
-        """Return the matches that are kept, (M,), and the pairs that have any of them."""
-        sums = np.append(0, np.cumsum(kept))[self.offsets]
-        has_some = np.diff(sums) > 0
-        return ImageMatches(
-            image_pairs=self.image_pairs[has_some],
-            offsets=np.append(0, sums[1:][has_some]),
-            keypoints=self.keypoints[kept],
-        )
-
 
 TrackSource = ImageMatches | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
@@ -66,6 +56,10 @@ TrackSource = ImageMatches | pycolmap.Reconstruction
 Advance = Callable[[int, int], None]
 """Called with the work done so far and the work in all."""
 
+# Pairs of images whose matches are looked at together.
+_PAIRS_A_SLICE = 1000
+# Errors at the limit are left to the triangulator, whose sums are other ones.
+_ROUNDING = 1e-9
 # So many tracks are about half a second of work.
 _TRACKS_A_TASK = 1000
 # It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
@@ -89,7 +83,9 @@ def collect_matches(
         InputError: if a match refers to a keypoint that its image does not have.
     """
     registered = np.isin(image_ids, sorted(seed.reg_image_ids()))
-    images = [seed.image(i) if is_in else None for i, is_in in zip(image_ids.tolist(), registered, strict=True)]
+    images = [
+        seed.image(i) if is_in else None for i, is_in in zip(image_ids.tolist(), registered, strict=True)
+    ]
     num_keypoints = np.array([0 if image is None else image.num_points2D() for image in images])
     pairs, counts, keypoints = [], [], []
     for batch in batches:
@@ -127,7 +123,8 @@ def correspondence_graph(
         geometry = pycolmap.TwoViewGeometry()
         geometry.config = _CALIBRATED
         geometry.inlier_matches = matches.keypoints[matches.offsets[pair] : matches.offsets[pair + 1]]
-        graph.add_two_view_geometry(*matches.image_pairs[pair].tolist(), geometry)
+        first, second = matches.image_pairs[pair].tolist()
+        graph.add_two_view_geometry(first, second, geometry)
     graph.finalize()
     return graph
 
@@ -162,10 +159,10 @@ def triangulate(
     options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
     structure = seed if in_place else copy_without_points(seed)
     if isinstance(tracks, ImageMatches):
-        _triangulate_matches(structure, correspondence_graph(structure, tracks), options, advance)
+        _triangulate_matches(structure, tracks, options, advance)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
-    _filter(structure, options)
+    filter_in_place(structure, options)
     return structure
 
 
@@ -179,7 +176,7 @@ def filter_points(
     is none); short tracks.
     """
     result = pycolmap.Reconstruction(reconstruction)
-    _filter(result, options or StructureOptions())
+    filter_in_place(result, options or StructureOptions())
     return result
 
 
@@ -210,7 +207,7 @@ def color_points(
 # --- triangulation ---------------------------------------------------------------------------------
 
 
-def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
+def filter_in_place(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
     """Do to our own `structure` what `filter_points` does to a copy; update the errors of points."""
     manager = pycolmap.ObservationManager(structure)
     manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
@@ -218,13 +215,11 @@ def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> No
 
 
 def _triangulate_matches(
-    structure: pycolmap.Reconstruction,
-    graph: pycolmap.CorrespondenceGraph,
-    options: StructureOptions,
-    advance: Advance,
+    structure: pycolmap.Reconstruction, matches: ImageMatches, options: StructureOptions, advance: Advance
 ) -> None:
     """Add to our own `structure` the points of all matches, tracks completed and merged."""
     error_px = options.max_reprojection_error_px
+    graph = correspondence_graph(structure, matches)
     settings = pycolmap.IncrementalTriangulatorOptions()
     settings.random_seed = _RANDOM_SEED
     has_third_view = structure.num_reg_images() >= _IMAGES_OF_A_CHECKED_TRACK
@@ -237,10 +232,88 @@ def _triangulate_matches(
     registered = sorted(structure.reg_image_ids())
     for done, image_id in enumerate(registered, start=1):
         triangulator.triangulate_image(settings, image_id)
+        # A track that is not completed at once is found again, in pieces, from each of its other images.
+        triangulator.complete_tracks(settings, triangulator.get_modified_points3D())
+        triangulator.clear_modified_points3D()
         advance(done, len(registered))
     triangulator.complete_all_tracks(settings)
-    triangulator.merge_all_tracks(settings)
+    triangulator.merge_tracks(settings, _find_mergeable(structure, matches, error_px))
     triangulator.retriangulate(settings)
+
+
+def _find_mergeable(
+    structure: pycolmap.Reconstruction, matches: ImageMatches, max_error_px: float
+) -> set[int]:
+    """Return the ids of the points that a match joins to another one that may be the same.
+
+    Two points are merged if all observations of both fit the mean of them, weighted by the lengths of their
+    tracks. So the two observations of the match have to. pycolmap's `merge_all_tracks` instead walks from
+    every observation of every point to all that it is matched with, which takes longer than all the rest.
+    """
+    image_ids = sorted(structure.reg_image_ids())
+    images = [structure.image(i) for i in image_ids]
+    begins = np.append(0, np.cumsum([image.num_points2D() for image in images]))
+    joined, seen = _joined_points(images, np.array(image_ids), begins, matches)
+    pairs, rows = np.unique(np.sort(joined, axis=1), axis=0, return_index=True)
+    ids, places = np.unique(pairs, return_inverse=True)
+    points = [structure.point3D(i) for i in ids.tolist()]
+    xyz = np.array([point.xyz for point in points]).reshape(-1, 3)
+    lengths = np.array([point.track.length() for point in points], dtype=np.float64)
+    places = places.reshape(-1, 2)
+    weights = lengths[places] / lengths[places].sum(axis=1, keepdims=True)
+    means = np.einsum("pk,pka->pa", weights, xyz[places])
+    fits = np.ones(len(pairs), dtype=np.bool_)
+    for keypoints in seen[rows].T:
+        of_image = np.searchsorted(begins, keypoints, side="right") - 1
+        order = np.argsort(of_image, kind="stable")
+        ends = np.searchsorted(of_image[order], np.arange(len(images) + 1)).tolist()
+        for k, image in enumerate(images):
+            own = order[ends[k] : ends[k + 1]]
+            if len(own):
+                fits[own] &= _fits(structure, image, keypoints[own] - begins[k], means[own], max_error_px)
+    return set(pairs[fits].ravel().tolist())
+
+
+def _joined_points(
+    images: Sequence[pycolmap.Image], image_ids: IntArray, begins: IntArray, matches: ImageMatches
+) -> tuple[IntArray, IntArray]:
+    """Return the ids of the points that matches join to other ones, (j, 2), and the keypoints of the matches.
+
+    Keypoints are numbered through all images, those of an image from its entry in `begins` on.
+    """
+    point_of = np.full(int(begins[-1]), -1, dtype=np.int64)
+    for begin, image in zip(begins[:-1].tolist(), images, strict=True):
+        keypoints, ids = observed_points(image)
+        point_of[begin + keypoints] = ids.astype(np.int64)
+    joined, seen = [np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
+    known: BoolArray = np.asarray(np.isin(matches.image_pairs, image_ids).all(axis=1))
+    firsts = begins[np.searchsorted(image_ids, np.where(known[:, None], matches.image_pairs, image_ids[0]))]
+    for first in range(0, len(known), _PAIRS_A_SLICE):
+        pairs = slice(first, first + _PAIRS_A_SLICE)
+        bounds = matches.offsets[first : first + _PAIRS_A_SLICE + 1]
+        counts = np.diff(bounds)
+        ends = matches.keypoints[bounds[0] : bounds[-1]] + np.repeat(firsts[pairs], counts, axis=0)
+        ends = ends[np.repeat(known[pairs], counts)]
+        points = point_of[ends]
+        differ = (points >= 0).all(axis=1) & (points[:, 0] != points[:, 1])
+        joined.append(points[differ])
+        seen.append(ends[differ])
+    return np.concatenate(joined), np.concatenate(seen)
+
+
+def _fits(
+    structure: pycolmap.Reconstruction,
+    image: pycolmap.Image,
+    keypoints: IntArray,
+    points: FloatArray,
+    max_error_px: float,
+) -> BoolArray:
+    """Return which of the points (k, 3) an image has at its keypoints (k,)."""
+    pose = image.cam_from_world()
+    local = points @ pose.rotation.matrix().T + pose.translation
+    found = np.asarray(structure.camera(image.camera_id).img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+    errors = np.linalg.norm(found - points2d_xy(image)[keypoints], axis=1)
+    return np.asarray(errors <= max_error_px * (1.0 + _ROUNDING))
 
 
 def _triangulate_tracks(

@@ -28,8 +28,9 @@ class StructureOptions(Settings):
     )
     ignore_two_view_tracks: bool = option(
         True,
-        "Leave out matches that only two images share: a wrong one is not noticed, since one epipolar "
-        "constraint is all that checks it. Concerns matches of a database, not a model's own tracks, "
+        "Make no points of matches that only two images share: a wrong one is not noticed, since one "
+        "epipolar constraint is all that checks it. Our own adjustment moves cameras by them all the same, "
+        "through a robust loss. Concerns matches of a database, not a model's own tracks, "
         "and only models of three images or more: two have no other matches.",
     )
 

@@ -3,9 +3,10 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,7 +15,13 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import (
+    NO_SENSORS,
+    AdjustedPlacement,
+    GivenPoses,
+    SensorSigma,
+    Uncertainty,
+)
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
@@ -24,8 +31,10 @@ from sfm_shapefit.commands.stages.adjustment import (
     with_uncertainty,
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.control_points import bring_to_control_points, read_control
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import turn_model_upright
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -38,15 +47,18 @@ from sfm_shapefit.commands.stages.seed import (
     select_trusted,
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.placement.tied_groups import measure_unit
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
+from sfm_shapefit.results.rigs import refined_rigs, sensors_of
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
     focal_warnings,
@@ -55,6 +67,8 @@ from sfm_shapefit.results.warnings import (
     quality_warnings,
     trust_warnings,
 )
+from sfm_shapefit.rotations.gravity import Gravity
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -111,9 +125,10 @@ def locate(
         inputs = read_left_out(inputs, model.names, options)
         model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
+        control = read_control(model, options)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     with open_source(model, inputs, options) as opened:
-        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics)
+        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control)
         return locate_source(opened, known, options, clock)
 
 
@@ -131,6 +146,16 @@ class Locating(NamedTuple):
     """Of these centers, in their units."""
     intrinsics: Intrinsics = NO_DOUBTS
     """Which of the images' are in doubt, and what became of them so far."""
+    relative: RelativeRotations | None = None
+    """Relative rotations of pairs as far as they were measured with these intrinsics; None: not at all."""
+    sensors: Mapping[int, SensorSigma] = NO_SENSORS
+    """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
+    rigs: "Mapping[int, pycolmap.Rigid3d] | None" = None
+    """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
+    control: ControlPoints | None = None
+    """Ground control points of the images."""
+    gravity: Gravity | None = None
+    """Of the images, which turns the model upright."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -147,25 +172,39 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
             placement = _at_known_centers(placement, known, model, options)
-        given = GivenPoses(lenses=known.intrinsics.free)
+        given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
+    before = source, directions
     source, directions, located, adjustment, intrinsics = _adjust(
         source, directions, located, known, options, clock
     )
     with clock("trust"):
-        relative = ask_pairs(source, directions, options)
-        focal_doubts = question_focal_lengths(source, directions, options)
-        placement = doubt_cameras(located.placement, directions, relative, source.model, options)
+        relative = ask_pairs(source, directions, options, known.relative)
+        # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
+        asked = (source, directions) if known.intrinsics.free.doubts else before
+        focal_doubts = question_focal_lengths(*asked, options)
+
+        def judge(placement: Placement) -> Placement:
+            return doubt_cameras(placement, directions, relative, source.model, options)
+
+        placement = judge(located.placement)
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
-        further = place_further_pieces(source, placement, options)
+        further = place_further_pieces(source, placement, options, judge)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
+    seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
+    seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
+    sensors = dict(known.sensors)
+    for done in (adjustment, seeded.adjusted):
+        sensors |= {} if done is None else done.sensors
+    if options.refine_rigs and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out refine_rigs")
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, placement.scale_sigma)
     located = located._replace(placement=placement, gauge=gauge)
@@ -175,6 +214,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
+        *of_control,
+        *of_gravity,
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -198,19 +239,30 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
+        rigs=refined_rigs(
+            known.rigs or sensors_of(model.reconstruction), sensors_of(seeded.reconstruction), sensors
+        ),
+        control_points=tuple(control_points),
     )
 
 
 def _at_known_centers(
     placement: Placement, known: Locating, model: PosedModel, options: LocateOptions
 ) -> Placement:
-    """Return the placement with its cameras where an adjustment had them, and how well it knew that."""
+    """Return the placement with its cameras where an adjustment had them, and how well it knew that.
+
+    In units of the solver, those of the rigs are then as long as the adjustment has them, not as the
+    directions had: all pixels say it better.
+    """
     assert known.centers is not None
     centers = known.centers[placement.cameras]
     placed = bring_to_scale(placement, centers)
     there = np.isfinite(centers).all(axis=1)
     scale = median_spread(centers[there]) / median_spread(placed[there])
-    return with_uncertainty(move_cameras(placement, placed, options), model, known.uncertainty, scale)
+    moved = move_cameras(placement, placed, options)
+    if moved.unit is not None:
+        moved = replace(moved, unit=measure_unit(moved.measured_part(), moved.refined.locations))
+    return with_uncertainty(moved, model, known.uncertainty, scale)
 
 
 class _Adjusted(NamedTuple):

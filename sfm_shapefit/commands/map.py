@@ -16,17 +16,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import NO_SENSORS, Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
-from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.model import PosedModel, read_model, same_intrinsics
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
+from sfm_shapefit.commands.stages.control_points import read_control
+from sfm_shapefit.commands.stages.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import read_gravity, refine_with_gravity
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
@@ -34,14 +36,17 @@ from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
+from sfm_shapefit.results.rigs import sensors_of
 from sfm_shapefit.results.scene_words import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
@@ -155,6 +160,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
     """Read what a run works from, but for the matches."""
     with clock("read"):
         images = read_images(path)
+        if options.refine_rigs and not images.rigs.rigs:
+            raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         inputs = read_left_out(inputs, unposed.names, options)
@@ -162,6 +169,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
             if name not in unposed.names:
                 raise InputError(f"known_distance: the database has no image {name}")
         positions = read_priors(unposed, inputs, options, priors)
+        control = read_control(unposed, options)
+        gravity = read_gravity(path, unposed, options)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     return _Run(
         options=options,
@@ -173,6 +182,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         sensor_rotations=sensor_rotations,
         intrinsics=intrinsics,
         priors=positions,
+        control=control,
+        gravity=gravity,
         without=inputs.left_out,
     )
 
@@ -193,6 +204,8 @@ class _Run(NamedTuple):
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
+    control: ControlPoints | None
+    gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
     opened: MatchDatabase | None = None
@@ -312,6 +325,9 @@ class _Run(NamedTuple):
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
+                if self.gravity is not None:
+                    gravity = self.gravity.of_frames(self.frame_of_image, self.sensor_rotations)
+                    answer = refine_with_gravity(answer, local, gravity.among(members))
             left = members[~answer.registered]
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
@@ -348,7 +364,7 @@ class _Run(NamedTuple):
 
     def evidence_of(self, relative: RelativeRotations) -> FloatArray:
         """Return how much speaks for each pair of frames; nothing for frames of rigs, or without scores."""
-        if len(self.frame_of_image) > int(self.frame_of_image.max()) + 1:
+        if not np.array_equal(self.frame_of_image, np.arange(len(self.frame_of_image))):
             return np.zeros(len(relative.pairs))
         pairs = map(tuple, relative.pairs.tolist())
         shares = [self.scores.get(pair, (np.nan, np.nan))[1] for pair in pairs]
@@ -364,7 +380,7 @@ class _Run(NamedTuple):
         models = []
         for frames, members, averaging in self.average_images(relative, reasons):
             try:
-                located = self.locate_component(members, averaging)
+                located = self.locate_component(members, averaging, relative)
             except UnsolvableError as error:
                 reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
                 continue
@@ -375,29 +391,48 @@ class _Run(NamedTuple):
                 del reasons[k]
         return sorted(models, key=lambda model: -int(model.located.kept.sum()))
 
-    def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
+    def locate_component(
+        self, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
+    ) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
         priors = None if self.priors is None else self.priors.of(members)
         if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
+        control = None if self.control is None else self.control.of(members)
+        gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
-            intrinsics = self.intrinsics
+            intrinsics, sensors = self.intrinsics, NO_SENSORS
             if self.options.adjust:
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
                     first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
                 centers, uncertainty = first.centers, first.adjusted.uncertainty
                 intrinsics = intrinsics.after(first.adjusted.lenses)
-                source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
+                sensors = first.adjusted.sensors
+                source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+            measured = None
+            if self.options.relative_rotations == "matches" and same_intrinsics(source.model, model):
+                measured = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
+                measured = replace(measured, pairs=np.searchsorted(members, measured.pairs))
             locating = Locating(
-                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics
+                inputs,
+                rigid,
+                priors,
+                centers=centers,
+                uncertainty=uncertainty,
+                intrinsics=intrinsics,
+                sensors=sensors,
+                rigs=sensors_of(model.reconstruction),
+                control=control,
+                gravity=gravity,
+                relative=measured,
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
@@ -423,10 +458,18 @@ class _Run(NamedTuple):
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
-        if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
+        settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
+        is_told = bool(known or has_priors or has_rigs or self.options.control_points)
+        if not is_told and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)
+
+    def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
+        """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
+        return run._pose(image_ids, first.rotations, first.parameters())
 
     def _pose(
         self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None
@@ -488,9 +531,7 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
                 "trust it without a look"
             )
         if model.averaging.num_repeated:
-            yield (
-                f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
-            )
+            yield (f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}")
         if model.averaging.num_rivals:
             yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)

@@ -29,7 +29,7 @@ def sampson_px(a: Any, b: Any, d: Any, pixel_angle: float) -> float:
         + (a[0] * b[1] - a[1] * b[0]) * d[2]
     )
     gradient = np.sqrt(max(2.0 - along_a * along_a - along_b * along_b, 1e-12))
-    return abs(volume) / (gradient * pixel_angle)
+    return float(abs(volume) / (gradient * pixel_angle))
 
 
 @inner_kernel

@@ -98,6 +98,16 @@ def _residual(match: FloatArray, d: FloatArray) -> float:
 
 
 @inner_kernel
+def _squared_residual(match: FloatArray, d: FloatArray) -> float:
+    """Return the squared Sampson error in px^2, without a root: most of the time is spent here."""
+    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
+    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
+    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+    volume = match[6] * d[0] + match[7] * d[1] + match[8] * d[2]
+    return float(volume * volume / square)
+
+
+@inner_kernel
 def _find_hypothesis(matches: FloatArray, threshold_px: float, num_hypotheses: int, best: FloatArray) -> None:
     """Fill `best` with the two-match direction of least truncated cost; its draws are fixed."""
     count = np.uint64(len(matches))
@@ -120,8 +130,7 @@ def _find_hypothesis(matches: FloatArray, threshold_px: float, num_hypotheses: i
         d[0], d[1], d[2] = x / length, y / length, z / length
         cost = 0.0
         for k in range(len(matches)):
-            residual = _residual(matches[k], d)
-            cost += min(residual * residual, limit)
+            cost += min(_squared_residual(matches[k], d), limit)
             if cost >= best_cost:
                 break
         if cost < best_cost:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
@@ -33,6 +34,7 @@ _MIN_VIEWS = 3
 _MAX_MATCHES = 10_000_000
 # Rays farther apart gain nothing more, and are often wrong.
 _WIDEST_RAD = 0.5
+Int32Array = npt.NDArray[np.int32]
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -148,7 +150,7 @@ def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArra
     return np.asarray(drawn.any(axis=1))
 
 
-def _collect(places: IntArray, begins: IntArray, parents: IntArray, rays: FloatArray) -> Tracks:
+def _collect(places: Int32Array, begins: IntArray, parents: IntArray, rays: FloatArray) -> Tracks:
     """Return the tracks of joined observations, see `_join_batch`; (k,) `parents`, (k, 3) `rays`."""
     keypoints = np.flatnonzero(places >= 0)
     seen = places[keypoints].astype(np.int64)

@@ -145,11 +145,11 @@ def _add_samples(pair: Any, match: Any, factors: Any, score: Any, terms: Any, sc
         bits_i = _hash(pair[0], match[0], first)
         bits_j = _hash(pair[1], match[1], first)
         for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
-            signs = np.int64((bits_i & both) + four * (bits_j & both))
+            row = np.int64((bits_i & both) + four * (bits_j & both))
             bits_i >>= two
             bits_j >>= two
             for c in range(3):
-                scores[k, c] += terms[signs, c]
+                scores[k, c] += terms[row, c]
 
 
 @inner_kernel

@@ -1,24 +1,42 @@
 """Does another focal length than the given one fit the matches of a camera better?
 
 If the focal length of a camera is wrong by a factor, all its rays spread too much or too little about the
-optical axis. A rotation and a translation of a pair cannot make up for that where the other image is taken by
-another camera, or from another place. So for each camera the relative poses of some of its pairs are refined
-anew for each of some factors, from the given rotations on, and the mean robust weight of the matches says
-which factor fits best (`rotations.two_view_poses`):
+optical axis. So for each camera some of its pairs are fitted anew for each of some factors, and the mean
+robust weight W of the matches says which factor fits best:
 
-    gain(camera, factor) = mean over its pairs of W(factor) - W(1)
+    gain(pair, factor) = W(factor) - W(1)
 
-A camera is named if over its pairs with other cameras the gain of the best factor is above 0.03 and the
-pairs that gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if
-the pairs of its own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. One wrong
-camera makes others seem wrong, those that have pairs with it: the camera whose factor gains most in all is
-named first, gets that focal length, and those that were doubted with it are asked again. Chosen on five
-scenes, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
+Rotations held. The direction of each pair is estimated for its given relative rotation. Two views without
+their rotation hardly tell focal lengths where the optical axes meet, as on a ring about an object, or where
+the picture is flat: a rotation of its own makes up for most of a wrong focal length in each pair. One
+rotation for all pairs of an image does not.
 
-Residuals are in pixels of the image with the larger focal length: in those of the other, a shorter focal
-length would always fit better.
+Rotations free. Where the given rotations are as wrong as the focal length, because they were found with it,
+that says nothing. If no camera is named with rotations held, the relative pose of each pair is refined for
+each factor (`rotations.two_view_poses`).
+
+Residuals are in pixels of each image, as it was taken,
+
+    r = e / sqrt(|de/dpixel_i|^2 + |de/dpixel_j|^2),    e = t . (R a x b)
+
+The pixels are what is observed, and a factor must not gain by making the noise of one image smaller.
+
+A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that
+gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs
+of its own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. With rotations
+held, it must have two images, and three quarters of its images must gain: the pairs of a single one gain by a
+factor if its rotation is wrong, too.
+
+One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what these
+gain: the camera that gains most in all is named first, gets that focal length, and those that were doubted
+with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
+which of the two is wrong, and neither is named.
+
+Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and
+`photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +50,15 @@ from sfm_shapefit.rotations.two_view_poses import refine_two_view_poses
 
 _COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
 _FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)
-_LEAST_GAIN, _NOTICED, _LEAST_SIGMAS = 0.03, 0.01, 3.0
+_WIDTH_PX = 1.5
+# Of all pairs on average, with rotations held and free: a rotation of its own lets each pair gain by chance.
+_LEAST_GAINS = {True: 0.01, False: 0.03}
+_NOTICED, _LEAST_SIGMAS = 0.01, 3.0
 _LEAST_CHANGE = 0.05
+# With rotations held: images of a camera, and the share of them that gain.
+_FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 2, 0.75
+# A rival gains nearly as much from this share on.
+_RIVAL = 0.8
 _FEWEST_PAIRS = 5
 _MOST_NAMED = 5
 
@@ -74,20 +99,8 @@ def doubt_focal_lengths(
         lenses: of the n images.
         threads: number of threads to share the pairs among.
     """
-    factors = np.ones(int(lenses.camera_of.max(initial=-1)) + 1)
     asked = _Asked(rays, rotations, lenses, threads)
-    found: list[FocalDoubt] = []
-    open_questions = np.arange(len(factors))
-    while len(open_questions) and len(found) < min(_MOST_NAMED, len(factors) - 1):
-        # Only what was doubted at first is asked again: a right focal length makes no other one look wrong.
-        doubts = _ask(asked, factors, open_questions)
-        if not doubts:
-            break
-        worst = max(doubts, key=lambda doubt: doubt.gain * doubt.num_pairs)
-        factors[worst.camera] = worst.factor
-        found.append(worst)
-        open_questions = np.array([doubt.camera for doubt in doubts if doubt.camera != worst.camera])
-    return tuple(found)
+    return _name(asked, hold=True) or _name(asked, hold=False)
 
 
 class _Asked(NamedTuple):
@@ -99,75 +112,157 @@ class _Asked(NamedTuple):
     threads: int
 
 
-def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray) -> list[FocalDoubt]:
+def _name(asked: _Asked, *, hold: bool) -> tuple[FocalDoubt, ...]:
+    """Return the cameras that stay in doubt as one after the other is corrected; rotations held or free."""
+    factors = np.ones(int(asked.lenses.camera_of.max(initial=-1)) + 1)
+    found: list[FocalDoubt] = []
+    # Only what was doubted at first is asked again: a right focal length makes no other one look wrong.
+    doubts = _ask(asked, factors, np.arange(len(factors)), hold=hold)
+    while doubts and len(found) < min(_MOST_NAMED, len(factors) - 1):
+        worst = max(doubts, key=lambda doubt: doubt.gain * doubt.num_pairs)
+        factors[worst.camera] = worst.factor
+        others = [doubt for doubt in doubts if doubt is not worst]
+        doubts = (
+            _ask(asked, factors, np.array([doubt.camera for doubt in others]), hold=hold) if others else []
+        )
+        cleared = {doubt.camera for doubt in others} - {doubt.camera for doubt in doubts}
+        enough = _RIVAL * worst.gain * worst.num_pairs
+        if any(doubt.camera in cleared and doubt.gain * doubt.num_pairs > enough for doubt in others):
+            factors[worst.camera] = 1.0
+            break
+        found.append(worst)
+    return tuple(found)
+
+
+def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -> list[FocalDoubt]:
     """Return what the pairs of some cameras prefer to the given focal lengths, where they do."""
     of_images = asked.lenses.camera_of[asked.rays.pairs]
     shared, rows = np.nonzero((of_images[None] == cameras[:, None, None]).any(axis=2))
     asking = cameras[shared]
     is_mixed = (of_images[rows] != asking[:, None]).any(axis=1)
     enough = np.bincount(shared, is_mixed, len(cameras)) >= _FEWEST_PAIRS
-    rows, asking, is_mixed = (column[enough[shared]] for column in (rows, asking, is_mixed))
+    rows, asking = rows[enough[shared]], asking[enough[shared]]
     if len(rows) == 0:
         return []
-    part = asked._replace(rays=_subset(asked.rays, rows))
-    own = of_images[rows] == asking[:, None]
 
-    def fit(tried: FloatArray) -> FloatArray:
-        """Return the weight shares if the asking camera of each row has such a factor."""
-        return _weight_shares(part, np.where(own, tried[:, None], factors[of_images[rows]]))
+    def fit(chosen: IntArray, factor: float) -> FloatArray:
+        """Return the weight shares of some rows if the asking camera of each has such a factor."""
+        pairs = of_images[rows[chosen]]
+        tried = np.where(pairs == asking[chosen][:, None], factor, factors[pairs])
+        return _weight_shares(asked._replace(rays=_subset(asked.rays, rows[chosen])), tried, hold=hold)
 
-    given = fit(np.ones(len(rows)))
-    gains = {factor: fit(np.full(len(rows), factor)) - given for factor in _COARSE}
-    best = dict.fromkeys(cameras[enough].tolist(), 1.0)
-    for camera in best:
-        best[camera] = max(gains, key=lambda factor: float(gains[factor][asking == camera].mean()))
-    clear = {
-        camera: factor
-        for camera, factor in best.items()
-        if _is_clear(gains[factor][(asking == camera) & is_mixed])
-    }
+    everyone = np.arange(len(rows))
+    given = fit(everyone, 1.0)
+    coarse = {factor: fit(everyone, factor) - given for factor in _COARSE}
     doubts = []
-    for camera, coarse in clear.items():
+    for camera in cameras[enough].tolist():
         chosen = np.flatnonzero(asking == camera)
-        alone = part._replace(rays=_subset(part.rays, chosen))
-        finer = {coarse: gains[coarse][chosen]}
+        gains = {factor: gain[chosen] for factor, gain in coarse.items()}
+        own = of_images[rows[chosen]] == camera
+        images = np.where(own, asked.rays.pairs[rows[chosen]], -1)
+        best = _best(gains)
+        if not _is_doubtful(gains[best], images, hold=hold):
+            continue
         for step in _FINE_STEPS:
-            tried = np.where(own[chosen], coarse * step, factors[of_images[rows[chosen]]])
-            finer[coarse * step] = _weight_shares(alone, tried) - given[chosen]
-        factor = max(finer, key=lambda one: float(finer[one].mean()))
-        gain, mixed = finer[factor], is_mixed[chosen]
-        if abs(factor - 1.0) >= _LEAST_CHANGE and _is_clear(gain[mixed]) and not _is_clear(-gain[~mixed]):
-            doubts.append(FocalDoubt(camera, factor, float(gain.mean()), len(chosen)))
+            gains[best * step] = fit(chosen, best * step) - given[chosen]
+        best = _best(gains)
+        if abs(best - 1.0) >= _LEAST_CHANGE and _is_doubtful(gains[best], images, hold=hold):
+            doubts.append(FocalDoubt(camera, best, float(gains[best].mean()), len(chosen)))
     return doubts
 
 
-def _is_clear(gains: FloatArray) -> bool:
+def _best(gains: dict[float, FloatArray]) -> float:
+    """Return the factor whose pairs gain most."""
+    return max(gains, key=lambda factor: float(gains[factor].mean()))
+
+
+def _is_doubtful(gains: FloatArray, images: IntArray, *, hold: bool) -> bool:
+    """Return whether the gains (k,) of a camera's pairs speak against it.
+
+    Args:
+        gains: of its best factor.
+        images: (k, 2) those of the pair that the camera took, -1 for others.
+        hold: whether with rotations held.
+    """
+    least, inner = _LEAST_GAINS[hold], (images >= 0).all(axis=1)
+    if not _is_clear(gains, least) or _is_clear(-gains[inner], least):
+        return False
+    _, labels = np.unique(images, return_inverse=True)
+    of_images = np.bincount(labels.ravel(), np.repeat(gains, 2))[int(not inner.all()) :]
+    gaining = float(np.mean(of_images > 0.0))
+    return not hold or (len(of_images) >= _FEWEST_IMAGES and gaining >= _LEAST_SHARE_OF_IMAGES)
+
+
+def _is_clear(gains: FloatArray, least: float) -> bool:
     """Return whether the mean of the gains (k,) of pairs is large, and clearly more gain than lose."""
     up, down = int(np.sum(gains > _NOTICED)), int(np.sum(gains < -_NOTICED))
-    large = up > 0 and float(gains.mean()) > _LEAST_GAIN
+    large = up > 0 and float(gains.mean()) > least
     return large and up - down > _LEAST_SIGMAS * float(np.sqrt(up + down))
 
 
-def _weight_shares(asked: _Asked, factors: FloatArray) -> FloatArray:
+def _weight_shares(asked: _Asked, factors: FloatArray, *, hold: bool) -> FloatArray:
     """Return the weight share of each pair, (k,), for focal lengths that are factors (k, 2) as large."""
     rays, lenses = asked.rays, asked.lenses
     counts = np.diff(rays.offsets)
-    i, j = rays.pairs.T
-    rays_i, rays_j = (
-        _spread(own, np.repeat(factor, counts), np.repeat(lenses.is_angular[side], counts))
-        for own, factor, side in ((rays.rays_i, factors[:, 0], i), (rays.rays_j, factors[:, 1], j))
+    focal_lengths_px = factors * lenses.focal_lengths_px[rays.pairs]
+    sides = [
+        _Side(
+            _spread(own, np.repeat(factors[:, side], counts), is_angular),
+            np.repeat(focal_lengths_px[:, side], counts),
+            is_angular,
+        )
+        for side, own in enumerate((rays.rays_i, rays.rays_j))
+        for is_angular in [np.repeat(lenses.is_angular[rays.pairs[:, side]], counts)]
+    ]
+    rotations = asked.rotations[rays.pairs[:, 1]] @ asked.rotations[rays.pairs[:, 0]].transpose(0, 2, 1)
+    turned = np.einsum("kab,kb->ka", np.repeat(rotations, counts, axis=0), sides[0].rays)
+    given = replace(rays, rays_j=sides[1].rays, pixel_angles=1.0 / focal_lengths_px.max(axis=1))
+    found = estimate_directions(replace(given, rays_i=turned), None, asked.threads)
+    translations = np.where(is_usable(found.status)[:, None], found.directions, [1.0, 0.0, 0.0])
+    if not hold:
+        freed = replace(given, rays_i=sides[0].rays)
+        refined = refine_two_view_poses(freed, rotations, translations, asked.threads)
+        rotations, translations = refined.rotations, refined.translations
+    errors_px = _residuals_px(
+        sides[0], sides[1], np.repeat(rotations, counts, axis=0), np.repeat(translations, counts, axis=0)
     )
-    pixel_angles = 1.0 / (factors * lenses.focal_lengths_px[rays.pairs]).max(axis=1)
-    rotations = asked.rotations[j] @ asked.rotations[i].transpose(0, 2, 1)
-    turned = np.einsum("kab,kb->ka", np.repeat(rotations, counts, axis=0), rays_i)
-    columns = {"pairs": rays.pairs, "offsets": rays.offsets, "pixel_angles": pixel_angles}
-    directions = estimate_directions(RayMatches(rays_i=turned, rays_j=rays_j, **columns), None, asked.threads)
-    known = is_usable(directions.status)[:, None]
-    starts = np.where(known, directions.directions, [1.0, 0.0, 0.0])
-    refined = refine_two_view_poses(
-        RayMatches(rays_i=rays_i, rays_j=rays_j, **columns), rotations, starts, asked.threads
-    )
-    return refined.weight_shares
+    weights = (1.0 + (errors_px / _WIDTH_PX) ** 2) ** -2
+    sums = np.append(0.0, np.cumsum(weights))
+    return np.diff(sums[rays.offsets]) / np.maximum(counts, 1)
+
+
+class _Side(NamedTuple):
+    """One of the two rays of k matches, and the lens it came through."""
+
+    rays: FloatArray
+    """(k, 3) unit rays in camera axes."""
+    focal_lengths_px: FloatArray
+    """(k,)"""
+    is_angular: BoolArray
+    """(k,) as of `Lenses`."""
+
+    def change_per_pixel(self, normals: FloatArray) -> FloatArray:
+        """Return the length of the derivatives (k,) of normals (k, 3) . ray by the two coordinates in pixels.
+
+        In a plane picture (x, y) = f (X / Z, Y / Z), and where the product is 0 it changes by
+        (n_x, n_y) Z / f for a unit ray, as its length over Z does not count. An angular picture has f pixels
+        a radian, about.
+        """
+        rays, is_plane = self.rays, ~self.is_angular & (self.rays[:, 2] > 0.0)
+        across = normals - np.einsum("ka,ka->k", normals, rays)[:, None] * rays
+        on_plane = np.linalg.norm(normals[:, :2], axis=1) * rays[:, 2]
+        return np.asarray(
+            np.where(is_plane, on_plane, np.linalg.norm(across, axis=1)) / self.focal_lengths_px
+        )
+
+
+def _residuals_px(i: _Side, j: _Side, rotations: FloatArray, translations: FloatArray) -> FloatArray:
+    """Return the Sampson errors (k,) of matches under relative poses (k, 3, 3) and (k, 3)."""
+    turned = np.einsum("kab,kb->ka", rotations, i.rays)
+    by_j = np.cross(translations, turned)
+    by_i = np.einsum("kba,kb->ka", rotations, np.cross(j.rays, translations))
+    change = np.hypot(i.change_per_pixel(by_i), j.change_per_pixel(by_j))
+    return np.asarray(np.einsum("ka,ka->k", by_j, j.rays) / np.maximum(change, 1e-300))
 
 
 def _spread(rays: FloatArray, factors: FloatArray, is_angular: BoolArray) -> FloatArray:

@@ -210,12 +210,13 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     inflation = _inflation(case)
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
+    touching = _Touching.of(case.pairs, count)
     judged = [_Judged() for _ in range(count)]
     body_of = np.arange(count)
     done: BoolArray = np.zeros(count, dtype=np.bool_)
     for _ in range(_MOST_TURNED):
         bodies = _find_bodies(case, count)
-        worst = _worst_body(case, bodies, done, least_rad)
+        worst = _worst_body(case, touching, bodies, done, least_rad)
         if worst is None:
             break
         body, found = worst
@@ -229,12 +230,12 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     largest = bodies == 0
     for label in range(int(bodies.max(initial=-1)) + 1):
         inside = (bodies == label) & ~done
-        parts = [np.arange(count) == u for u in np.flatnonzero(inside)] if label == 0 else [inside]
-        for part in parts:
-            members = np.flatnonzero(part)
+        together = np.flatnonzero(inside)
+        for members in together[:, None] if label == 0 else [together]:
             if len(members) == 0:
                 continue
-            found = _judge(case, part, largest & ~part, least_rad)
+            part = np.isin(np.arange(count), members)
+            found = _judge(case.subset(touching.rows_of(members)), part, largest & ~part, least_rad)
             for member in members.tolist():
                 judged[member] = found
             body_of[members] = members[0]
@@ -277,6 +278,25 @@ class _Judged(NamedTuple):
         return Doubt.RIGHT if share >= RIGHT_SHARE else Doubt.AMBIGUOUS
 
 
+class _Touching(NamedTuple):
+    """The pairs that each of the groups has a part in."""
+
+    starts: IntArray
+    """(count + 1,) the pairs of group g are rows[starts[g]:starts[g + 1]]."""
+    rows: IntArray
+
+    @classmethod
+    def of(cls, pairs: IntArray, count: int) -> "_Touching":
+        """Return those of pairs (k, 2) of groups."""
+        ends = pairs.ravel()
+        starts = np.append(0, np.cumsum(np.bincount(ends, minlength=count)))
+        return cls(starts, np.argsort(ends, kind="stable") // 2)
+
+    def rows_of(self, members: IntArray) -> IntArray:
+        """Return the pairs that some groups have a part in, ascending."""
+        return np.unique(np.concatenate([self.rows[self.starts[g] : self.starts[g + 1]] for g in members]))
+
+
 def _angles(rotations: FloatArray) -> FloatArray:
     """Return the angles (k,) of rotations (k, 3, 3), radians in [0, pi]; exact for small ones too."""
     half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
@@ -307,7 +327,7 @@ def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
 
 
 def _worst_body(
-    pairs: PairTurns, bodies: IntArray, done: BoolArray, least_rad: float
+    pairs: PairTurns, touching: _Touching, bodies: IntArray, done: BoolArray, least_rad: float
 ) -> tuple[BoolArray, _Judged] | None:
     """Return the body whose turn mends most, the smallest of equals, and what is said of it."""
     found = []
@@ -315,7 +335,8 @@ def _worst_body(
         body = (bodies == label) & ~done
         if not body.any() or 2 * body.sum() > len(body):
             continue
-        judged = _judge(pairs, body, ~body, least_rad)
+        own = pairs.subset(touching.rows_of(np.flatnonzero(body)))
+        judged = _judge(own, body, ~body, least_rad)
         if judged.kind is Doubt.TURNED:
             found.append((body, judged))
     if not found:
@@ -326,7 +347,10 @@ def _worst_body(
 
 
 def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: float) -> _Judged:
-    """Weigh the two explanations of the pairs of a body (count,) with others (count,)."""
+    """Weigh the two explanations of the pairs of a body (count,) with others (count,).
+
+    `pairs` are those that touch the body, or more: all pairs for each of very many bodies would take long.
+    """
     is_first = body[pairs.pairs[:, 0]] & others[pairs.pairs[:, 1]]
     is_second = body[pairs.pairs[:, 1]] & others[pairs.pairs[:, 0]]
     rows = np.flatnonzero(is_first | is_second)

@@ -55,7 +55,7 @@ class Gauge:
 
     similarity: Similarity
     """Scale and shift in the input's axes; its rotation is the identity."""
-    scale: Scale | Literal["fixed"]
+    scale: Scale | Literal["fixed", "control points"]
     """The choice that was carried out."""
     statement: str
     """What scale, origin and axes the output has, for the report."""

@@ -10,14 +10,15 @@ other, so that errors which the matches of a pair share count once:
 
 A join is refused where it is not over-determined; where pairs that contradict it agree among themselves on
 another one, as those of a thing that stands there twice do; or where scale, turn or place stay too uncertain.
+Two models whose scales are known, as those of rigs, are joined by a rigid motion; how well the scale between
+them is known is then what is known of these.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment.priors import cross_matrices
@@ -113,7 +114,9 @@ class Ties(NamedTuple):
         )
 
 
-def join_by_matches(ties: Ties, turns: FloatArray, centers: FloatArray) -> ModelJoin:
+def join_by_matches(
+    ties: Ties, turns: FloatArray, centers: FloatArray, metric_sigma: float | None = None
+) -> ModelJoin:
     """Return the join of two models by matches between their images, which are too few to be pairs alone.
 
     A match whose keypoint in one model observes a point says where that is seen from the other; where neither
@@ -123,10 +126,13 @@ def join_by_matches(ties: Ties, turns: FloatArray, centers: FloatArray) -> Model
         ties: the matches.
         turns: (h, 3, 3) rotations first_from_second that single pairs of images suggest.
         centers: (n, 3) of the second model's cameras.
+        metric_sigma: relative standard deviation of what the scales of both models make of the one between
+            them, if both are known: it is 1 then.
 
     Raises:
         UnsolvableError: if it is not safe; the message is the reason, a clause.
     """
+    metric = metric_sigma is not None
     num_matches, num_pairs = len(ties.pairs), len(np.unique(ties.pairs))
     if num_matches < _FEWEST_MATCHES or num_pairs < FEWEST_WITNESSES:
         raise UnsolvableError(
@@ -134,21 +140,29 @@ def join_by_matches(ties: Ties, turns: FloatArray, centers: FloatArray) -> Model
             f"needs {_FEWEST_MATCHES} of {FEWEST_WITNESSES}"
         )
     used = ties.subset(np.arange(0, num_matches, -(-num_matches // _MOST_MATCHES)))
-    best = _search(used, turns)
+    best = _search(used, turns, metric=metric)
     agreeing = _misses(best, ties) <= 1.0
     supporting = _supporting_pairs(ties.pairs, agreeing)
     if agreeing.sum() < _FEWEST_MATCHES or len(supporting) < FEWEST_WITNESSES:
         raise UnsolvableError(
             f"no more than {len(supporting)} of {num_pairs} pairs of images between them agree on one join"
         )
-    _refuse_rivals(used.subset(~np.isin(used.pairs, supporting)), turns, len(supporting))
+    _refuse_rivals(used.subset(~np.isin(used.pairs, supporting)), turns, len(supporting), metric=metric)
     right = used.subset(np.isin(used.pairs, supporting))
-    fits = [_refine(best, right.subset(~np.isin(right.pairs, some))) for some in _groups_left_out(supporting)]
+    fits = [
+        _refine(best, right.subset(~np.isin(right.pairs, some)), metric=metric)
+        for some in _groups_left_out(supporting)
+    ]
     evidence = (
         f"{int(agreeing.sum())} of {num_matches} matches between them, of {len(supporting)} of "
         f"{num_pairs} pairs of images"
     )
     join = _with_errors(best, [fits], centers, evidence, agreeing)
+    if metric_sigma is not None:
+        # Errors of the size of the second model move its cameras about their middle.
+        spread = metric_sigma * median_spread(centers)
+        place = float(np.hypot(join.center_sigma, spread))
+        join = replace(join, scale_sigma=metric_sigma, center_sigma=place)
     refuse_uncertain(join, centers)
     return join
 
@@ -227,15 +241,15 @@ def _supporting_pairs(pairs: IntArray, agreeing: BoolArray) -> IntArray:
     return np.asarray(names[2.0 * np.bincount(place, agreeing, len(counts)) > counts])
 
 
-def _search(ties: Ties, turns: FloatArray) -> Similarity:
-    """Return the similarity of least cost of all that the matches suggest."""
-    starts = sorted(_starts(ties, turns), key=lambda fit: _cost(fit, ties))[:_NUM_REFINED]
+def _search(ties: Ties, turns: FloatArray, *, metric: bool) -> Similarity:
+    """Return the similarity of least cost of all that the matches suggest; of scale 1 if it is `metric`."""
+    starts = sorted(_starts(ties, turns, metric=metric), key=lambda fit: _cost(fit, ties))[:_NUM_REFINED]
     if not starts:
         raise UnsolvableError("the matches between them suggest no common scale")
-    return min((_refine(start, ties) for start in starts), key=lambda fit: _cost(fit, ties))
+    return min((_refine(start, ties, metric=metric) for start in starts), key=lambda fit: _cost(fit, ties))
 
 
-def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int) -> None:
+def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int, *, metric: bool) -> None:
     """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one.
 
     False pairs that contradict one another are no rivals, be they ever so many up to a limit.
@@ -249,7 +263,7 @@ def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int) -> None:
     if num_against < _LEAST_RIVAL_SHARE * num_supporting or len(rest.pairs) < _FEWEST_MATCHES:
         return
     try:
-        rival = _search(rest, turns)
+        rival = _search(rest, turns, metric=metric)
     except UnsolvableError:
         return
     num_rivals = len(_supporting_pairs(rest.pairs, _misses(rival, rest) <= 1.0))
@@ -260,8 +274,20 @@ def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int) -> None:
         )
 
 
-def _starts(ties: Ties, turns: FloatArray) -> Iterator[Similarity]:
+def _starts(ties: Ties, turns: FloatArray, *, metric: bool) -> Iterator[Similarity]:
     """Yield similarities that a few points of both models, or the rotation of a pair, suggest."""
+    for fit in _free_starts(ties, turns):
+        if not metric:
+            yield fit
+            continue
+        # The same motion without its scaling, about the middle of the second model's cameras.
+        middle = ties.eyes_second.mean(axis=0)
+        shift = fit.apply(middle[None])[0] - fit.rotation @ middle
+        yield Similarity(scale=1.0, rotation=fit.rotation, translation=shift)
+
+
+def _free_starts(ties: Ties, turns: FloatArray) -> Iterator[Similarity]:
+    """Yield the same, of any scale."""
     both = np.asarray(np.isfinite(ties.points_first + ties.points_second).all(axis=1), dtype=np.bool_)
     if both.sum() >= _FEWEST_POINTS:
         points = ties.subset(both)
@@ -346,14 +372,17 @@ def _cost(fit: Similarity, ties: Ties) -> float:
     return float(np.minimum(_misses(fit, ties), 1.0).sum())
 
 
-def _refine(start: Similarity, ties: Ties) -> Similarity:
-    """Return the similarity of least robust (Cauchy) angular cost, from a start."""
+def _refine(start: Similarity, ties: Ties, *, metric: bool) -> Similarity:
+    """Return the similarity of least robust (Cauchy) angular cost; it keeps a `metric` scale of its start."""
+    # Here, since it takes long to import, and every command that writes results loads this module.
+    from scipy.optimize import least_squares
+
     middle = ties.eyes_second.mean(axis=0)
     size = start.scale * (median_spread(ties.eyes_second) or 1.0)
 
     def moved(x: FloatArray) -> Similarity:
         turn = Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation
-        scale = start.scale * float(np.exp(x[6]))
+        scale = start.scale if metric else start.scale * float(np.exp(x[6]))
         there = start.apply(middle[None])[0] + size * x[3:6]
         return Similarity(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
 
@@ -361,7 +390,9 @@ def _refine(start: Similarity, ties: Ties) -> Similarity:
         off, apart = _off(moved(x), ties)
         return np.asarray(np.nan_to_num(np.concatenate([off.ravel(), apart]), nan=0.0))
 
-    return moved(least_squares(residuals, np.zeros(7), loss="cauchy", f_scale=0.3, max_nfev=50).x)
+    return moved(
+        least_squares(residuals, np.zeros(6 if metric else 7), loss="cauchy", f_scale=0.3, max_nfev=50).x
+    )
 
 
 def _with_errors(

@@ -41,7 +41,8 @@ from sfm_shapefit.report.sentences import (
     shorten,
     summary_sentences,
 )
-from sfm_shapefit.results.json_types import LoopOfVideo
+from sfm_shapefit.results.control_points import control_cells
+from sfm_shapefit.results.json_types import ControlPoint, LoopOfVideo
 from sfm_shapefit.results.scene_words import loop_cells
 
 MAX_PAIRS = 20_000
@@ -56,6 +57,8 @@ _MAX_HINGES = 20
 _STARTING_ITERATIONS = 2
 # So many loops are listed.
 _MAX_LOOPS = 50
+# So many control points are.
+_MAX_CONTROL_POINTS = 200
 _AXES = "xyz"
 _TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
 # What stands in the matrix of pairs where there is no pair.
@@ -143,6 +146,7 @@ def page_data(
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
+        "control": [[shorten(cell) for cell in control_cells(row)] for row in _control_points(facts)],
         "loops": [[shorten(cell) for cell in loop_cells(loop)] for loop in _loops(facts)],
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts["pieces"])],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
@@ -286,6 +290,12 @@ def _loops(facts: dict[str, Any]) -> list[LoopOfVideo]:
     return sorted(loops, key=lambda loop: (-loop["num_refused"], -loop["num_matches"]))[:_MAX_LOOPS]
 
 
+def _control_points(facts: dict[str, Any]) -> list[ControlPoint]:
+    """Return the ground control points, which earlier outputs lack, the farthest off first."""
+    rows: list[ControlPoint] = facts.get("control_points", [])
+    return sorted(rows, key=lambda row: -(row["error"] or 0.0))[:_MAX_CONTROL_POINTS]
+
+
 # --- words -----------------------------------------------------------------------------------------
 
 
@@ -339,6 +349,7 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
         "loops": "Pairs of frames far apart in time are used where the frames between say the same.",
+        "control": "The position in the model minus the known one; check points do not set scale and axes.",
         "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }
 

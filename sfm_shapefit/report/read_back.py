@@ -42,12 +42,14 @@ def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
     still is where it was.
 
     Raises:
-        InputError: if it is no output of `locate` or `solve`, or its files are damaged.
+        InputError: if it is no output of `locate` or `place`, or its files are damaged.
     """
+    if not folder.exists():
+        raise InputError(f"the folder {folder} does not exist")
     if (folder / MAP_MARKER).is_file():
         raise InputError(f"{folder} holds the models of map; give one of them, such as {folder / '0'}")
     if not (folder / MARKER).is_file():
-        raise InputError(f"{folder} has no {MARKER}; give a folder that locate or solve wrote")
+        raise InputError(f"{folder} has no {MARKER}; give a folder that locate or place wrote")
     try:
         facts = json.loads((folder / MARKER).read_text(encoding="utf-8"))
         dimension = int(facts.get("dimension", 3))

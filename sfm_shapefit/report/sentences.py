@@ -15,6 +15,7 @@ import numpy as np
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.results.intrinsics import describe_intrinsics
+from sfm_shapefit.results.rigs import describe_rigs
 from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
 MAX_TEXT = 160
@@ -58,6 +59,7 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         *_certainty(drawing, facts),
         _units(facts),
         *_intrinsics(facts),
+        *_rigs(facts),
         *_loops(facts),
     ]
 
@@ -135,6 +137,13 @@ def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
     lines = describe_intrinsics(facts.get("intrinsics", []))
     if lines:
         yield f"Intrinsics: {'; '.join(lines)}."
+
+
+def _rigs(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what became of rigs that were refined, which earlier outputs lack."""
+    lines = describe_rigs(facts.get("refined_rigs", []))
+    if lines:
+        yield f"Rigs: {'; '.join(lines)}."
 
 
 def _loops(facts: dict[str, Any]) -> Iterator[str]:

@@ -45,7 +45,7 @@ class KeyFigures(TypedDict):
         float | None, "Median angle between the direction of a pair and the line between its cameras."
     ]
     pair_error_px: Annotated[
-        float | None, "The same in pixels, at the cameras' median focal length; null for a bare graph."
+        float | None, "The same in pixels, at the images' median focal length; null for a bare graph."
     ]
     sigma: Annotated[
         float | None,
@@ -181,6 +181,17 @@ class CameraIntrinsics(TypedDict):
     parameters: Annotated[list[float], "All parameters of the output."]
 
 
+class RefinedSensor(TypedDict):
+    """A sensor whose pose in its rig was refined."""
+
+    camera: Annotated[int, "The id of its camera in the model."]
+    turned_deg: Annotated[float, "By how much its rotation changed."]
+    moved: Annotated[float, "How far it moved in its rig, in units of the output."]
+    distance: Annotated[float, "From the reference sensor, in units of the output."]
+    turn_sigma_deg: Annotated[float, "Standard deviation of its rotation per axis, by the noise alone."]
+    place_sigma: Annotated[float, "Standard deviation of its place per axis, by the noise alone."]
+
+
 class ModelInputs(TypedDict):
     """What `locate` worked from."""
 
@@ -272,6 +283,22 @@ class KnownDistance(TypedDict):
     found: Annotated[float | None, "In the output; null if one of them is not in it."]
 
 
+class ControlPoint(TypedDict):
+    """A ground control point, and where the model has it."""
+
+    name: Annotated[str, "As the file calls it, or else its coordinates."]
+    use: Annotated[
+        Literal["control", "check", "unused"],
+        "Whether it sets scale and axes, only checks the model, or contradicts the others or has no place.",
+    ]
+    known: Annotated[list[float], "Where it is, in the output's axes."]
+    residual: Annotated[list[float] | None, "The model's position minus the known one; null if it has none."]
+    error: Annotated[float | None, "Length of the residual."]
+    error_px: Annotated[float | None, "Mean distance of its marks from the point in the model, in pixels."]
+    num_marks: Annotated[int, "Images of the model in which it is marked."]
+    num_agreeing_marks: Annotated[int, "Of these, placed ones whose marks agree."]
+
+
 class Alignment(TypedDict):
     """A similarity of the world: scale * rotation @ center + translation."""
 
@@ -317,14 +344,17 @@ class LocateSummary(PlacementSummary):
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     scale_sigma: Annotated[
         float | None,
-        "Relative standard deviation of a scale that rigs, priors or known distances tell; else null.",
+        "Relative standard deviation of a scale that rigs, priors, known distances or control points tell; "
+        "else null.",
     ]
     known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
+    control_points: Annotated[list[ControlPoint], "Ground control points, with their residuals."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[
         list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
     ]
+    refined_rigs: Annotated[list[RefinedSensor], "Sensors whose poses in their rigs were refined."]
     line_sigma: Annotated[
         float | None,
         "Median standard deviation of a position along the line on which all cameras stand, as a share of "
@@ -374,6 +404,11 @@ class Averaging(TypedDict):
     certified: Annotated[
         bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
     ]
+    num_repeated_pairs: Annotated[
+        int,
+        "Pairs set aside since they would fold the images together, and lack matches that they should share.",
+    ]
+    num_rival_pairs: Annotated[int, "Pairs of another arrangement of the images that is as likely."]
 
 
 class Model(TypedDict):

@@ -24,6 +24,7 @@ UNITS = {
     "distance": "of the known distance's units",
     "prior": "of the priors' units",
     "fixed": "of the fixed cameras' units",
+    "control points": "of the control points' units",
 }
 """What a standard deviation is given in, by the choice of the scale."""
 SOLVER_UNITS = "of the solver's units"
@@ -41,7 +42,8 @@ def key_figures(
     Args:
         cameras: their rows; those that are not placed do not count.
         pair_error_deg: median angle between the direction of a pair and the line between its cameras.
-        focal_length_px: median of the cameras; NaN for a bare graph.
+        focal_length_px: median over the images, as pairs are of images, and one camera may take most of
+            them; NaN for a bare graph.
         unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
     """
     placed = [row for row in cameras if row.placed]

@@ -26,7 +26,7 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
 from sfm_shapefit.results.intrinsics import Intrinsics
-from sfm_shapefit.results.json_types import GraphSummary, Join, LocateSummary
+from sfm_shapefit.results.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.results.key_figures import figure_rows
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.notebook import notebook_html
@@ -137,6 +137,10 @@ class LocateResult(Displayed):
 
     intrinsics: Intrinsics = field(default_factory=Intrinsics)
     """Cameras whose intrinsics were in doubt, and what became of them."""
+    rigs: tuple[RefinedSensor, ...] = ()
+    """The sensors that were refined in their rigs."""
+    control_points: tuple[ControlPoint, ...] = ()
+    """Ground control points with their residuals, where some are given."""
     join: Join | None = None
     """What came of joining it to a larger model of `map`."""
 

@@ -44,8 +44,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
     solved = [(0, found.gauge.statement, int(np.sum(found.kept)))]
     solved += [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in found.further]
     num_unusable = len(found.directions.pairs) - placement.num_pairs
-    cameras = found.model.reconstruction.cameras.values()
-    focal_length_px = float(np.median([camera.mean_focal_length() for camera in cameras]))
+    focal_length_px = float(np.median(found.model.focal_lengths_px))
     return {
         **_summarize(found, solved, found.warnings, (focal_length_px, UNITS[found.gauge.scale])),
         "num_images": len(found.image_names),
@@ -76,9 +75,11 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "scale": found.gauge.statement,
         "scale_sigma": found.gauge.scale_sigma,
         "known_distances": _known_distances(found),
+        "control_points": list(found.control_points),
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
+        "refined_rigs": list(found.rigs),
         "line_sigma": found.line_sigma,
         "num_doubtful_pairs": len(found.doubtful_pairs),
         "loops": [_summarize_loop(loop) for loop in found.loops],

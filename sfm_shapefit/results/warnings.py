@@ -140,8 +140,8 @@ def ambiguity_warnings(placement: Placement) -> Iterator[str]:
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members[:_NAMED].tolist()]
         more = f" and {len(members) - _NAMED} more" if len(members) > _NAMED else ""
         yield (
-            f"the scene seems to repeat itself: as many matches say that {', '.join(names)}{more} should be "
-            f"turned by {doubts.angles_deg[members[0]]:.0f} degrees as say that they are right"
+            f"the scene seems to repeat itself: as many matches speak for turning {', '.join(names)}{more} "
+            f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
         )
 
 

@@ -143,9 +143,7 @@ def choose_arrangement(
     return Chosen(averaged, nothing, best.agree & ~plain.agree)
 
 
-def _arrange(
-    relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations
-) -> Arrangement:
+def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:
     """Return which pairs agree with averaged rotations, and what speaks for them."""
     i, j = relative.pairs.T
     predicted = averaged.rotations[j] @ averaged.rotations[i].transpose(0, 2, 1)

@@ -94,6 +94,8 @@ class AveragedRotations(Displayed):
             "median_sigma_deg": float(np.median(known)) if len(known) else None,
             "num_tried": self.num_tried,
             "certified": self.certified,
+            "num_repeated_pairs": self.num_repeated,
+            "num_rival_pairs": self.num_rivals,
         }
 
     def _headline(self) -> str:

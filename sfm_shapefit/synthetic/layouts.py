@@ -5,13 +5,14 @@ point faces also decides whether it is hidden.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.synthetic.mounts import Rigs, mounted
 from sfm_shapefit.synthetic.options import SceneOptions, Shape
 
 ByteArray = npt.NDArray[np.uint8]
@@ -32,6 +33,8 @@ class SceneCameras:
     """(n, 3) camera centers, true."""
     stated_rotations: FloatArray
     """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
+    rigs: Rigs
+    """What the cameras are mounted on; a frame is one image where `rig` is "none"."""
 
     @property
     def num_images(self) -> int:
@@ -182,6 +185,26 @@ LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], Layout]] = {
     "courtyard": _courtyard,
 }
 """By shape: (number of images, number of points, generator) -> layout."""
+
+
+def lay_out_scene(options: SceneOptions, rng: np.random.Generator) -> tuple[Layout, Rigs]:
+    """Return the layout of a scene, each camera of its shape replaced by a frame of the rig, and that rig."""
+    rigs = mounted(options.rig, options.num_images)
+    layout = LAYOUTS[options.shape](len(rigs.rig_of_frame), options.num_points, rng)
+    rotations, centers = layout.rotations, layout.centers
+    if options.rig != "none":
+        centers, rotations = rigs.centers_of(rotations, centers), rigs.rotations_of(rotations)
+    return replace(layout, centers=centers, rotations=rotations), rigs
+
+
+def state_rotations(
+    rotations: FloatArray, rigs: Rigs, options: SceneOptions, rng: np.random.Generator
+) -> FloatArray:
+    """Return the rotations (n, 3, 3) that a model states: true ones, the frames turned at random."""
+    if options.rotation_noise_deg == 0.0:
+        return rotations
+    frames = rotations[rigs.sensor_of_image == 0]
+    return rigs.rotations_of(turn_at_random(frames, np.radians(options.rotation_noise_deg), rng))
 
 
 def turn_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:

@@ -15,8 +15,8 @@ import pycolmap
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
+from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import ModelContent
-from sfm_shapefit.synthetic.rigs import Rigs
 
 
 class Points(NamedTuple):
@@ -92,7 +92,6 @@ class ModelParts(NamedTuple):
     """What the models of a scene have in common."""
 
     scene: SceneCameras
-    rigs: Rigs
     camera: pycolmap.Camera
     keypoints: Sequence[FloatArray]
     """Per image, (k, 2)."""
@@ -111,16 +110,16 @@ class ModelParts(NamedTuple):
     def _assemble(self, poses: list[pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
         """Return the model; a frame has the pose of the reference sensor of its rig."""
         model = pycolmap.Reconstruction()
-        cameras, rigs = new_rigs(self.rigs, self.camera)
-        images, frames = new_images(self.rigs, self.keypoints)
+        cameras, rigs = new_rigs(self.scene.rigs, self.camera)
+        images, frames = new_images(self.scene.rigs, self.keypoints)
         for camera in cameras:
             model.add_camera(camera)
         for rig in rigs:
             model.add_rig(rig)
-        for frame, k in zip(frames, np.flatnonzero(self.rigs.sensor_of_image == 0), strict=True):
+        for frame, k in zip(frames, np.flatnonzero(self.scene.rigs.sensor_of_image == 0), strict=True):
             frame.rig_from_world = poses[k]
             model.add_frame(frame)
-        for image, f in zip(images, self.rigs.frame_of_image, strict=True):
+        for image, f in zip(images, self.scene.rigs.frame_of_image, strict=True):
             image.frame_id = int(f) + 1
             model.add_image(image)
         if self.points is not None:

@@ -12,6 +12,7 @@ from sfm_shapefit.settings import Settings, explained, option
 if TYPE_CHECKING:  # numpy is not cheap
     from sfm_shapefit.arrays import FloatArray
 
+RigKind = Literal["none", "pair", "back-to-back", "four"]
 Shape = Literal["ring", "facade", "drive", "cloud", "courtyard"]
 ModelContent = Literal["full", "rotations"]
 
@@ -27,7 +28,13 @@ class SceneOptions(Settings):
         'forward along a street; "cloud": random cameras around random points; "courtyard": around '
         "the inside of four facades.",
     )
-    num_images: int = option(25, "Number of images, all by one camera.")
+    num_images: int = option(25, "Number of images, all by cameras of the same lens.")
+    rig: RigKind = option(
+        "none",
+        "What the cameras are mounted on, so that a rig of several stands where each single camera would; "
+        '"pair": two side by side; "back-to-back": two that look away from each other; "four": a pair '
+        "ahead, and one to either side. The number of images is rounded down to whole frames.",
+    )
     num_points: int = option(
         2000, "Number of surface points; those seen by fewer than two images stay out of the model."
     )

@@ -23,10 +23,17 @@ from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
-from sfm_shapefit.synthetic.models import ModelParts, Points, image_name, new_camera, write_models
+from sfm_shapefit.synthetic.models import (
+    ModelParts,
+    Points,
+    image_name,
+    new_camera,
+    new_images,
+    new_rigs,
+    write_models,
+)
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
-from sfm_shapefit.synthetic.rigs import single_cameras
 from sfm_shapefit.synthetic.workspace import compact_database
 from sfm_shapefit.viewgraph import connected_components
 
@@ -151,7 +158,26 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
             device=pycolmap.Device.cpu,
         )
         pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+    if scene.options.rig != "none":
+        _mount_cameras(scene, database)
     compact_database(database)
+
+
+def _mount_cameras(scene: RenderedScene, path: Path) -> None:
+    """Give a database of images by one camera the cameras, rigs and frames of a scene."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        cameras, rigs = new_rigs(scene.rigs, database.read_camera(1))
+        images, frames = new_images(scene.rigs, [np.empty((0, 2))] * scene.num_images)
+        database.clear_frames()
+        database.clear_rigs()
+        for camera in cameras[1:]:
+            database.write_camera(camera, use_camera_id=True)
+        for image in images:
+            database.update_image(image)
+        for rig in rigs:
+            database.write_rig(rig, use_rig_id=True)
+        for frame in frames:
+            database.write_frame(frame, use_frame_id=True)
 
 
 # --- models ------------------------------------------------------------------------------------------------
@@ -159,10 +185,10 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
 
 def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
     """Return what models are made of: judged keypoints and their points, or none."""
-    rigs, camera = single_cameras(scene.num_images), _camera(scene)
+    camera = _camera(scene)
     if judged is None:
-        return ModelParts(scene, rigs, camera, [np.empty((0, 2))] * scene.num_images, None)
-    return ModelParts(scene, rigs, camera, judged.keypoints, _true_points(judged))
+        return ModelParts(scene, camera, [np.empty((0, 2))] * scene.num_images, None)
+    return ModelParts(scene, camera, judged.keypoints, _true_points(judged))
 
 
 def _true_points(judged: JudgedMatches) -> Points:

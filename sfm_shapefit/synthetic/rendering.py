@@ -29,7 +29,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import inner_kernel, kernel
-from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, SceneCameras, turn_at_random
+from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras, lay_out_scene, state_rotations
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
@@ -83,15 +83,16 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
             )
     render = render or RenderOptions()
     rngs = np.random.default_rng(options.seed).spawn(6)  # the streams of `make_scene`
-    layout = LAYOUTS[options.shape](options.num_images, options.num_points, rngs[0])
+    layout, rigs = lay_out_scene(options, rngs[0])
     surface_rng = np.random.default_rng([options.seed, 1])
     scene = RenderedScene(
         options=options,
         render=render,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turn_at_random(layout.rotations, np.radians(options.rotation_noise_deg), rngs[5]),
-        surfaces=make_surfaces(options.shape, options.num_images, render.repeated_fraction, surface_rng),
+        stated_rotations=state_rotations(layout.rotations, rigs, options, rngs[5]),
+        rigs=rigs,
+        surfaces=make_surfaces(options.shape, len(rigs.rig_of_frame), render.repeated_fraction, surface_rng),
     )
     _refuse_folding(scene)
     return scene

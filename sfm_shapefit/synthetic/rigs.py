@@ -8,13 +8,14 @@ Rotations are known; the metric offsets of the sensors in their rigs are what fi
 A rig's axes are those of its first camera: x to the right, y down, z ahead.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
+from sfm_shapefit.synthetic.mounts import Rigs, yawed
 from sfm_shapefit.synthetic.options import SceneOptions
 from sfm_shapefit.synthetic.scenes import Scene, scene_of
 
@@ -34,44 +35,18 @@ _LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rigs:
-    """Which images belong to which rig: image k is what a sensor of a rig saw in a frame of it."""
-
-    rig_of_frame: IntArray
-    """(f,)"""
-    frame_of_image: IntArray
-    """(n,) ascending; each frame has all sensors of its rig."""
-    sensor_of_image: IntArray
-    """(n,) 0 is the reference sensor of the rig."""
-    sensor_rotations: FloatArray
-    """(rigs, sensors, 3, 3) sensor_from_rig."""
-    sensor_centers: FloatArray
-    """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigScene(Rigs):
     """A photographed scene with the rigs that its images belong to."""
 
     scene: Scene
 
 
-def single_cameras(num_images: int) -> Rigs:
-    """Return one rig of one camera, and a frame for each image."""
-    return Rigs(
-        rig_of_frame=np.zeros(num_images, dtype=np.int64),
-        frame_of_image=np.arange(num_images),
-        sensor_of_image=np.zeros(num_images, dtype=np.int64),
-        sensor_rotations=np.eye(3)[None, None],
-        sensor_centers=np.zeros((1, 1, 3)),
-    )
-
-
 def make_rig_drive(options: SceneOptions) -> RigScene:
     """Return the drive of two rigs of three cameras.
 
     Args:
-        options: `num_images` is rounded down to whole frames; `shape` is not read, and rotations are exact.
+        options: `num_images` is rounded down to whole frames; `shape` and `rig` are not read. Rotations are
+            exact.
 
     Raises:
         ValueError: if there is not a frame for each rig, or rotations are to be wrong.
@@ -87,26 +62,20 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     sensor_of_image = np.tile(np.arange(NUM_SENSORS), num_frames)
     rig_of_frame = np.arange(num_frames) % NUM_RIGS
     rotations, centers = _frames(num_frames, rig_of_frame, layout_rng)
-    # These sensor_from_rig turn about the rig's y axis, which points down.
-    yaw = np.radians(_YAW_DEG)
-    cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-    rows = [[cosine, zero, sine], [zero, one, zero], [-sine, zero, cosine]]
-    turns = np.tile(np.moveaxis(np.array(rows), 2, 0), (NUM_RIGS, 1, 1, 1))
-    rig_of_image, frame_rotations = rig_of_frame[frame_of_image], rotations[frame_of_image]
-    offsets = _OFFSETS_M[rig_of_image, sensor_of_image]
-    layout = replace(
-        LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng),
-        centers=centers[frame_of_image] + np.einsum("nji,nj->ni", frame_rotations, offsets),
-        rotations=turns[rig_of_image, sensor_of_image] @ frame_rotations,
-    )
-    return RigScene(
-        scene=scene_of(layout, options, rngs),
+    rigs = Rigs(
         rig_of_frame=rig_of_frame,
         frame_of_image=frame_of_image,
         sensor_of_image=sensor_of_image,
-        sensor_rotations=turns,
+        sensor_rotations=np.tile(yawed(_YAW_DEG), (NUM_RIGS, 1, 1, 1)),
         sensor_centers=_OFFSETS_M,
     )
+    layout = replace(
+        LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng),
+        centers=rigs.centers_of(rotations, centers),
+        rotations=rigs.rotations_of(rotations),
+    )
+    scene = scene_of(layout, rigs, options, rngs)
+    return RigScene(scene=scene, **{item.name: getattr(rigs, item.name) for item in fields(Rigs)})
 
 
 def _frames(

@@ -26,12 +26,14 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic.layouts import (
     FARTHEST_M,
-    LAYOUTS,
     ByteArray,
     Layout,
     SceneCameras,
+    lay_out_scene,
+    state_rotations,
     turn_at_random,
 )
+from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import SceneOptions
 
 # Nothing is photographed closer than this.
@@ -105,11 +107,10 @@ def make_scene(options: SceneOptions) -> Scene:
             than asked for.
     """
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
-    layout = LAYOUTS[options.shape](options.num_images, options.num_points, rngs[0])
-    return scene_of(layout, options, rngs[1:])
+    return scene_of(*lay_out_scene(options, rngs[0]), options, rngs[1:])
 
 
-def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
+def scene_of(layout: Layout, rigs: Rigs, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
     """Photograph, pair and corrupt a layout with five streams of draws; raises what `make_scene` does."""
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
@@ -128,12 +129,12 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
     scrambled = [_scramble(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
     relative = _relative_poses(layout, pairs, false_lists, ray_noise_rad, pose_rng)
-    noise_rad = np.radians(options.rotation_noise_deg)
     return Scene(
         options=options,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turn_at_random(layout.rotations, noise_rad, rotation_rng),
+        stated_rotations=state_rotations(layout.rotations, rigs, options, rotation_rng),
+        rigs=rigs,
         points=layout.points,
         colors=layout.colors,
         keypoints=tuple(keypoints),

@@ -20,33 +20,28 @@ from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts, Points
 from sfm_shapefit.synthetic.options import WorkspaceOptions
-from sfm_shapefit.synthetic.rigs import Rigs, single_cameras
 from sfm_shapefit.synthetic.scenes import Scene
 
 # This is a value of COLMAP's TwoViewGeometry::ConfigurationType.
 _CALIBRATED = 2
 
 
-def write_workspace(
-    scene: Scene, out: Path, options: WorkspaceOptions | None = None, rigs: Rigs | None = None
-) -> None:
+def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:
     """Write a scene as a COLMAP workspace, whole or not at all.
 
     Args:
         scene: what to write.
         out: a folder that does not exist yet; its parents are made.
         options: what stands in it; the defaults if None.
-        rigs: the rigs of that very scene; one camera and a frame per image if None.
 
     Raises:
         InputError: if `out` exists or cannot be written.
     """
     options = options or WorkspaceOptions()
-    rigs = rigs or single_cameras(scene.num_images)
     with atomic_folder(out) as workspace:
         if options.database:
-            _write_database(scene, workspace / "database.db", rigs, relative_poses=options.relative_poses)
-        parts = ModelParts(scene, rigs, _camera(scene), scene.keypoints, _points(scene))
+            _write_database(scene, workspace / "database.db", relative_poses=options.relative_poses)
+        parts = ModelParts(scene, _camera(scene), scene.keypoints, _points(scene))
         models.write_models(parts, workspace, options.model)
 
 
@@ -73,12 +68,12 @@ def _camera(scene: Scene) -> pycolmap.Camera:
 # --- database --------------------------------------------------------------------------------------------
 
 
-def _write_database(scene: Scene, path: Path, rigs: Rigs, *, relative_poses: bool) -> None:
+def _write_database(scene: Scene, path: Path, *, relative_poses: bool) -> None:
     """Write a new database; nothing but the file itself is left in the folder."""
     database = pycolmap.Database.open(path)
     try:
         with pycolmap.DatabaseTransaction(database):
-            _write_images(scene, rigs, database)
+            _write_images(scene, database)
             _write_pairs(scene, database, relative_poses=relative_poses)
     finally:
         database.close()
@@ -92,10 +87,10 @@ def compact_database(path: Path) -> None:
         connection.execute("VACUUM")
 
 
-def _write_images(scene: Scene, rigs: Rigs, database: pycolmap.Database) -> None:
+def _write_images(scene: Scene, database: pycolmap.Database) -> None:
     """Write cameras, rigs, frames, images and keypoints."""
-    cameras, made = models.new_rigs(rigs, _camera(scene))
-    images, frames = models.new_images(rigs, [np.empty((0, 2))] * scene.num_images)
+    cameras, made = models.new_rigs(scene.rigs, _camera(scene))
+    images, frames = models.new_images(scene.rigs, [np.empty((0, 2))] * scene.num_images)
     for camera in cameras:
         database.write_camera(camera, use_camera_id=True)
     for rig in made:

@@ -219,3 +219,42 @@ def test_normal_errors_call_for_a_wide_loss_and_sharp_ones_with_a_tail_for_a_nar
         for c in (0.25, 1.0)
     }
     assert errors[scale_px] == min(errors.values())
+
+
+def test_points_that_follow_their_own_observations_do_not_pretend_small_errors():
+    # Three views of a point leave half of the squares. Taken for all, 0.7 px would be 0.5.
+    problem = ring_problem(np.random.default_rng(1), num_points=1500, noise_px=0.5, share=0.25)
+    lengths = np.bincount(problem.points_seen, minlength=problem.num_points)
+    start = adjust(problem.of_points(lengths == 3), loss_scale_px=1.0).problem
+    assert choose_loss_scale_px(start, (0.5, 0.7)) == 0.7
+
+
+def test_points_of_two_images_do_not_choose_the_loss_unless_there_are_no_others():
+    problem = ring_problem(np.random.default_rng(0), num_points=400, noise_px=0.5)
+    two = ring_problem(np.random.default_rng(2), num_points=2000, noise_px=0.02, share=0.1)
+    two = two.of_points(np.bincount(two.points_seen, minlength=2000) == 2)
+    both = replace(
+        problem,
+        points=np.concatenate([problem.points, two.points]),
+        cameras_seeing=np.concatenate([problem.cameras_seeing, two.cameras_seeing]),
+        points_seen=np.concatenate([problem.points_seen, two.points_seen + problem.num_points]),
+        pixels=np.concatenate([problem.pixels, two.pixels]),
+    )
+    assert two.num_observations > 0.3 * problem.num_observations
+    scales = (0.0625, 0.25, 1.0)
+    assert choose_loss_scale_px(both, scales) == choose_loss_scale_px(problem, scales) == 1.0
+    assert choose_loss_scale_px(two, scales) < 1.0
+
+
+def test_points_are_chosen_by_their_length():
+    tracks, poses, _ = made(noise_px=0.5, num_points=200)
+    found = triangulate_tracks(tracks, poses, LIMITS)
+    lengths = np.bincount(found.points_seen[found.points_seen >= 0])
+    long = found.of_length(5)
+    np.testing.assert_array_equal(long.points, found.points[lengths >= 5])
+    np.testing.assert_array_equal(long.tracks, found.tracks[lengths >= 5])
+    is_long = (found.points_seen >= 0) & (lengths[found.points_seen] >= 5)
+    assert 0 < is_long.sum() < np.sum(found.points_seen >= 0)
+    np.testing.assert_array_equal(long.points_seen >= 0, is_long)
+    seen = long.points[long.points_seen[is_long]]
+    np.testing.assert_array_equal(seen, found.points[found.points_seen[is_long]])

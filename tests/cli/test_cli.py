@@ -442,6 +442,7 @@ def test_a_file_that_is_missing_is_said_to_be_missing(tmp_path):
         ("place", "missing.txt", tmp_path / "out"),
         ("locate", RING_MODEL, tmp_path / "out", "--priors", "missing.txt"),
         ("locate", RING_MODEL, tmp_path / "out", "--fix", "missing.txt"),
+        ("locate", RING_MODEL, tmp_path / "out", "--control-points", "missing.txt"),
     ):
         assert run_refused(*arguments) == "sfm-shapefit: missing.txt does not exist\n"
     flag = ("--config", "missing.toml")

@@ -20,8 +20,9 @@ from sfm_shapefit.colmap.adjustment import (
     with_points,
     with_poses,
 )
-from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, adjust_thinly, bundle_adjust
 from sfm_shapefit.colmap.structure import collect_matches
+from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.geometry import fit_similarity
 from tests.scenes import BUNDLED
@@ -206,12 +207,16 @@ def test_a_model_without_points_is_refused():
         sfm_shapefit.bundle_adjust(empty)
 
 
-def matches_of(model):
-    """The matches that a model's own tracks make."""
+def matches_of(model, images_of=None):
+    """The matches of a model's own tracks, or of those of `images_of` in these images only."""
     images = sorted(model.reg_image_ids())
     seen = [
         {p.point3D_id: k for k, p in enumerate(model.image(i).points2D) if p.has_point3D()} for i in images
     ]
+    for image, own in zip(images, seen, strict=True):
+        for point, among in (images_of or {}).items():
+            if image not in among:
+                own.pop(point, None)
     pairs, parts = [], []
     for a, b in itertools.combinations(range(len(images)), 2):
         common = sorted(seen[a].keys() & seen[b].keys())
@@ -266,12 +271,33 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    found = adjust_thinly(start, tracks, lenses=free)
+    found = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert found.lenses.undetermined == ()
     assert 0.0 < found.lenses.sigmas[1] < 0.01
     monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
-    held = adjust_thinly(start, tracks, lenses=free)
+    held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == start.camera(1).params.tolist()
+
+
+def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():
+    truth = scene(noise_px=0.5, seed=1)
+    images, points = sorted(truth.reg_image_ids()), sorted(truth.point3D_ids())
+    rng = np.random.default_rng(1)
+    pairs = {p: rng.choice(images, 2, replace=False).tolist() for p in points[6:]}
+    graph, start = matches_of(truth, pairs), disturbed(truth)
+    true = centers_of(truth)
+    errors = []
+    for least in (2, 3):
+        options = StructureOptions(min_track_length=least)
+        found = bundle_adjust(start, graph, options).reconstruction
+        assert 0 < found.num_points3D() <= 6
+        assert all(point.track.length() >= 3 for point in found.points3D.values())
+        x = centers_of(found)
+        errors.append(np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean())
+    # 7 images leave 11 residuals of each of 6 points, and 2 images one of each of 74: twice as much in all.
+    assert errors[0] < 0.8 * errors[1]
+    with_all = bundle_adjust(start, graph, StructureOptions(ignore_two_view_tracks=False)).reconstruction
+    assert with_all.num_points3D() > 40

@@ -877,3 +877,30 @@ def test_a_real_scene_is_read_in_well_under_ten_seconds():
     assert len(batch.pairs) == 378
     assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
     assert np.sum(np.diff(own.offsets) >= 15) == 273
+
+
+def test_what_was_read_once_is_not_read_again_by_any_model_of_the_database(path, model, monkeypatch):
+    with open_database(path, model) as database:
+        (whole,) = database.iter_matches(1)
+        monkeypatch.setattr(type(database), "_read_matches", None)  # nothing may be read from here on
+        other = database.among(model).turned(model)
+        few = np.unique(whole.pairs[:3])
+        (again,), (part,) = other.iter_keypoints(1), other.iter_keypoints(1, few)
+        (without,) = other.iter_keypoints(1, without=whole.pairs[:1, ::-1])
+    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
+    np.testing.assert_array_equal(again.offsets, whole.offsets)
+    np.testing.assert_array_equal(without.pairs, whole.pairs[1:])
+    np.testing.assert_array_equal(without.keypoints, whole.keypoints[whole.offsets[1] :])
+    inside = np.isin(whole.pairs, few).all(axis=1)
+    np.testing.assert_array_equal(part.pairs, whole.pairs[inside])
+    rows = np.repeat(inside, np.diff(whole.offsets))
+    np.testing.assert_array_equal(part.keypoints, whole.keypoints[rows])
+
+
+def test_matches_that_are_forgotten_are_read_again(path, model):
+    with open_database(path, model) as database:
+        (whole,) = database.iter_matches(1)
+        database.forget_matches()
+        (again,) = database.iter_matches(1)
+    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
+    np.testing.assert_array_equal(again.rays_i, whole.rays_i)

@@ -15,7 +15,7 @@ import pytest
 from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.adjustment import lens_of
+from sfm_shapefit.colmap.adjustment import lens_of, triangulate_in_blocks
 from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
@@ -264,6 +264,59 @@ def test_the_same_gives_the_same_bits_again_and_in_place(source):
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
     assert run() == first == run(in_place=True)
+
+
+def wrong_in_part(share):
+    """All matches of the ring, of which a share is of wrong keypoints."""
+    rng = np.random.default_rng(1)
+    batches = all_matches()
+    for batch in batches:
+        wrong = rng.random(len(batch.keypoints)) < share
+        batch.keypoints[wrong, 1] = rng.integers(0, 120, size=wrong.sum())
+    return batches
+
+
+def test_tracks_in_blocks_give_the_same_bits_whatever_the_blocks(monkeypatch):
+    original, _ = ring_model(noise_px=0.3)
+    found = []
+    for tracks, pairs, matches in ((10**9, 10**9, 10**9), (7, 2, 11), (120, 1, 500)):
+        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._TRACKS_A_BLOCK", tracks)
+        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._PAIRS_A_SLICE", pairs)
+        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._MATCHES_A_SLICE", matches)
+        monkeypatch.setattr("sfm_shapefit.adjustment.tracks._MATCHES_A_SLICE", matches)
+        found.append(
+            dump(triangulate_in_blocks(*seeded(original, batches=wrong_in_part(0.3)), StructureOptions()))
+        )
+    assert found[0] == found[1] == found[2]
+
+
+def test_tracks_in_blocks_are_the_points_of_colmaps_triangulator():
+    original, points = ring_model(noise_px=0.3)
+    seen = []
+    seed, matches = seeded(original)
+    ours = triangulate_in_blocks(seed, matches, StructureOptions(), lambda *done: seen.append(done))
+    theirs = triangulate(*seeded(original))
+    assert ours is seed
+    assert seen[-1] == (len(points), len(points))
+    assert ours.num_points3D() == theirs.num_points3D() == len(points)
+    assert ours.compute_num_observations() == theirs.compute_num_observations()
+    # ours are at the least squares of their observations, up to what lenses make of pixels
+    assert ours.compute_mean_reprojection_error() <= 1.01 * theirs.compute_mean_reprojection_error()
+    loose = triangulate_in_blocks(*seeded(original, batches=wrong_in_part(0.3)), StructureOptions())
+    assert loose.num_points3D() >= len(points)
+    assert max(reprojection_errors_px(loose)) <= 4.0
+
+
+def test_blocks_leave_out_what_only_two_images_share_as_colmaps_triangulator_does():
+    original, _ = ring_model()
+    two = [batch_of(np.array([[0, 1]]), 120)]
+    assert triangulate_in_blocks(*seeded(original, batches=two), StructureOptions()).num_points3D() == 0
+    both = StructureOptions(ignore_two_view_tracks=False)
+    assert triangulate_in_blocks(*seeded(original, batches=two), both).num_points3D() == 120
+    alone = seeded(original, placed=np.arange(NUM_IMAGES) < 2)
+    assert triangulate_in_blocks(*alone, StructureOptions()).num_points3D() == 120
+    nothing = triangulate_in_blocks(*seeded(original, batches=[]), StructureOptions())
+    assert nothing.num_points3D() == 0
 
 
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
@@ -565,3 +618,14 @@ def colmap(*arguments):
     )
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
+
+
+def test_a_long_track_is_one_point_though_its_ends_are_not_matched():
+    original, _ = ring_model(noise_px=0.3)
+    neighbors = np.array(
+        [[k, k + 1] for k in range(NUM_IMAGES - 1)] + [[k, k + 2] for k in range(NUM_IMAGES - 2)]
+    )
+    seed, matches = seeded(original, batches=[batch_of(neighbors, 120)])
+    structure = triangulate(seed, matches)
+    assert structure.num_points3D() == 120
+    assert structure.compute_mean_track_length() > NUM_IMAGES - 0.5

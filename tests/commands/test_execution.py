@@ -47,8 +47,8 @@ WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()
 def serial(workspace, model):
     cameras = posed_cameras(model)
     with open_database(workspace / "database.db", model) as database:
-        whole = (0, database.num_pairs)
-    task = PairTask(database=workspace / "database.db", part=whole, cameras=cameras, work=WORK)
+        whole = database.rows((0, database.num_pairs))
+    task = PairTask(database=workspace / "database.db", rows=whole, cameras=cameras, work=WORK)
     (found,) = measure_task(task)
     return found
 
@@ -84,6 +84,19 @@ def test_parts_cover_all_pairs_once_and_posed_cameras_give_the_same_rays_to_the_
     for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a.rays_i, b.rays_i)
         np.testing.assert_array_equal(a.rays_j, b.rays_j)
+
+
+def test_a_worker_does_not_read_the_table_of_all_pairs(workspace, model, monkeypatch):
+    expected = serial(workspace, model)
+    with open_database(workspace / "database.db", model) as database:
+        halves = [(0, database.num_pairs // 2), (database.num_pairs // 2, database.num_pairs)]
+        rows = [database.rows(half) for half in halves]
+    monkeypatch.delattr("sfm_shapefit.colmap.database._read_pairs")
+    tasks = [
+        PairTask(database=workspace / "database.db", rows=own, cameras=posed_cameras(model), work=WORK)
+        for own in rows
+    ]
+    assert_same_bits(concatenate([part for task in tasks for part in measure_task(task)]), expected)
 
 
 def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -164,6 +165,23 @@ def test_two_groups_joined_at_one_camera_are_two_pieces(hinged):
     left_out = [row for row in hinged.cameras if not row.placed]
     assert {row.reason for row in left_out} == {"another rigid piece, hinged at 0004.jpg; see pieces/1"}
     assert {row.piece for row in left_out} == {1}
+
+
+def test_figures_in_pixels_are_at_the_median_focal_length_of_the_images(hinged):
+    """Pairs are of images, and a camera counts as often as it took one; `report MODEL` says so, too."""
+    focal_lengths_px = np.array([900.0, 100.0, 100.0, 100.0, 100.0, 100.0, 800.0, 700.0])
+    model = replace(hinged.model, focal_lengths_px=focal_lengths_px)
+    figures = replace(hinged, model=model).summary()["figures"]
+    slope = np.tan(np.radians(figures["pair_error_deg"]))
+    assert figures["pair_error_px"] == pytest.approx(100.0 * slope)
+
+
+def test_cameras_of_a_further_piece_are_judged_by_their_pairs_as_those_of_the_largest(hinged):
+    for placement in (hinged.placement, hinged.further[0].placement):
+        doubts = placement.assessment.doubts
+        assert doubts is not None
+        assert len(doubts.kinds) == len(placement.cameras)
+        assert {kind.value for kind in doubts.kinds} == {"right"}
 
 
 def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):

@@ -143,7 +143,7 @@ def workspaces(tmp_path_factory):
     """Models with a database: plain, and of rigs."""
     folder = tmp_path_factory.mktemp("rigs") / "drive"
     rigs = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"), rigs)
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
     return {"plain": RING / "sparse" / "0", "rigs": folder / "sparse" / "0"}
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
@@ -13,8 +14,15 @@ from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
-from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+from sfm_shapefit.geometry import fit_similarity, rotation_angles_deg
+from sfm_shapefit.synthetic import (
+    SceneOptions,
+    WorkspaceOptions,
+    make_rendered_scene,
+    make_rig_drive,
+    make_scene,
+)
+from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run
 from tests.scenes import RING, copied, edit_database
@@ -30,7 +38,7 @@ def rigs():
 @pytest.fixture(scope="module")
 def workspace(rigs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs") / "drive"
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"), rigs)
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
     return folder
 
 
@@ -136,7 +144,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     parts |= {name: getattr(images, name)[rows] for name in ("matches", "match_is_wrong")}
     lonely = replace(images, **parts, match_offsets=np.append(0, np.cumsum(counts[kept])))
     out = workspace.parent / "lonely"
-    write_workspace(lonely, out, WorkspaceOptions(model="rotations"), rigs)
+    write_workspace(lonely, out, WorkspaceOptions(model="rotations"))
     located = sfm_shapefit.locate(out / "sparse" / "0", points="never")
     row = located.cameras[4]
     assert row.placed
@@ -170,7 +178,7 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False), rigs)
+    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
@@ -319,6 +327,151 @@ def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspac
             np.testing.assert_allclose(
                 ours.rig(rig_id).sensor_from_rig(sensor).matrix(), pose.matrix(), atol=1e-12
             )
+
+
+def assert_mapped_as_well_as_located(scene, workspace, largest_scale_error=1e-3, **options):
+    """`map` has no rotations: `locate` starts at the true ones and frees them."""
+    (model,) = sfm_shapefit.map_database(workspace / "database.db", **options).models
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", rotations="free", **options)
+    mean_errors = []
+    for found in (model.located, located):
+        ids, own = centers_of(found.reconstruction)
+        assert len(ids) == scene.num_images
+        fit = fit_similarity(own, scene.centers)
+        assert abs(fit.scale - 1.0) < largest_scale_error
+        metric = replace(fit, scale=1.0, translation=np.zeros(3)).apply(own - own.mean(axis=0))
+        mean_errors.append(
+            np.linalg.norm(metric - (scene.centers - scene.centers.mean(axis=0)), axis=1).mean()
+        )
+    assert mean_errors[0] < 1.2 * mean_errors[1]
+
+
+def test_a_rig_of_four_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1500, seed=3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard")
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory):
+    """A yard seen by a rig of four whose sensors are said to be 1 deg and 2 % of their distance off."""
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    workspace, rng = tmp_path_factory.mktemp("rigs") / "yard", np.random.default_rng(3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, workspace, WorkspaceOptions(model="rotations"))
+    statements, model = [], pycolmap.Reconstruction(workspace / "sparse" / "0")
+    for k, share in ((1, 0.02), (2, -0.02), (3, 0.02)):
+        axis = rng.standard_normal(3)
+        turn = Rotation.from_rotvec(np.radians(1.0) * axis / np.linalg.norm(axis)).as_matrix()
+        rotation = turn @ scene.rigs.sensor_rotations[0, k]
+        shift = -rotation @ scene.rigs.sensor_centers[0, k] * (1.0 + share)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift)
+        model.rig(1).set_sensor_from_rig(model.camera(k + 1).sensor_id, pose)
+        blob = pose.rotation.quat[[3, 0, 1, 2]].tobytes() + pose.translation.tobytes()
+        statements.append(
+            f"UPDATE rig_sensors SET sensor_from_rig = x'{blob.hex()}' WHERE sensor_id = {k + 1}"
+        )
+    edit_database(workspace / "database.db", *statements)
+    return scene, model, workspace / "database.db"
+
+
+@pytest.mark.parametrize("way", ["map", "locate", "ceres"])
+def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(disturbed, way):
+    scene, model, database = disturbed
+    if way == "locate":
+        found = sfm_shapefit.locate(model, database, refine_rigs=True)
+    else:
+        ceres = {"bundle_adjust": True, "adjuster": "ceres"} if way == "ceres" else {}
+        found = sfm_shapefit.map_database(database, refine_rigs=True, **ceres).models[0].located
+    said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
+    (rig,) = found.reconstruction.rigs.values()
+    poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
+    shifts = np.array([poses[camera].translation for camera in (2, 3, 4)])
+    mean = np.linalg.norm(shifts, axis=1).mean()
+    assert mean == pytest.approx(np.linalg.norm(said, axis=1).mean(), rel=1e-9)
+    true = scene.rigs.sensor_centers[0]
+    size = np.linalg.norm(true[1:], axis=1).mean() / mean
+    assert [row["camera"] for row in found.rigs] == [2, 3, 4]
+    for row in found.rigs:
+        camera, pose = row["camera"], poses[row["camera"]]
+        turn = scene.rigs.sensor_rotations[0, camera - 1].T @ pose.rotation.matrix()
+        center = -size * pose.rotation.matrix().T @ pose.translation
+        # Largest of three axes, of the noise and of what is left of the wrong matches: 2.5 times at most.
+        assert rotation_angles_deg(turn) < 5.0 * row["turn_sigma_deg"] < 0.1
+        assert np.linalg.norm(center - true[camera - 1]) < 5.0 * row["place_sigma"] < 0.02
+        assert row["turned_deg"] == pytest.approx(1.0, abs=0.05)
+    ids, own = centers_of(found.reconstruction)
+    assert len(ids) == 32
+    fit = fit_similarity(own, scene.centers)
+    assert np.linalg.norm(fit.apply(own) - scene.centers, axis=1).max() < 0.01  # as they are said: 0.2
+    assert abs(fit.scale / size - 1.0) < 2e-3
+
+
+def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
+    # The two that look to the sides see nothing of a facade.
+    scene = make_scene(SceneOptions(rig="four", shape="facade", num_images=24, num_points=1500, seed=2))
+    write_workspace(scene, tmp_path / "facade")
+    sentence = r"the matches do not tell where camera [34] is in its rig"
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", refine_rigs=True)
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", refine_rigs=True)
+    for call in (
+        lambda: sfm_shapefit.map_database(RING / "database.db", refine_rigs=True),
+        lambda: sfm_shapefit.locate(RING / "sparse" / "0", refine_rigs=True),
+    ):
+        with pytest.raises(InputError, match="no rig of several cameras to refine; leave out refine_rigs"):
+            call()
+    with pytest.raises(ValueError, match="refine_rigs needs an adjustment"):
+        LocateOptions(refine_rigs=True, adjust=False)
+
+
+def keep_few_matches(connection):
+    """Leave few matches of eight pairs between the first four frames and the others, and none of the rest."""
+    rng, first = np.random.default_rng(0), 16
+    rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+    ends = {row[0]: divmod(row[0], 2147483647) for row in rows}
+    between = [pair for pair, (i, j) in ends.items() if (i <= first) != (j <= first)]
+    query = "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?"
+    found = [(pair, *connection.execute(query, (pair,)).fetchone()) for pair in between]
+    for rank, (pair, count, data) in enumerate(sorted(found, key=lambda row: -row[1])):
+        kept = rng.permutation(count)[: 12 * (rank < 8)]
+        matches = np.frombuffer(data, np.uint32).reshape(-1, 2)[kept]
+        values = len(matches), matches.tobytes(), pair
+        connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+
+def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_together(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    scene = make_scene(options)
+    write_workspace(scene, tmp_path / "yard")
+    database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches)
+    found = sfm_shapefit.map_database(database)
+    assert [len(model.names) for model in found.models] == [16, 16]
+    (told,) = found.joins
+    assert told.join is not None, told.statement
+    assert told.join.first_from_second.scale == 1.0
+    sigmas = [model.located.gauge.scale_sigma for model in found.models]
+    assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
+    (joined,) = found.joined
+    whole = read_model(joined.reconstruction)
+    assert (whole.num_images, whole.groups.num_groups, whole.has_rigs) == (32, 8, True)
+    assert (joined.reconstruction.num_rigs(), joined.reconstruction.num_cameras()) == (1, 4)
+    own, truth = whole.centers, scene.centers[whole.image_ids - 1]
+    fit = fit_similarity(own, truth)
+    errors = np.linalg.norm(fit.apply(own) - truth, axis=1)
+    assert errors.max() < 4.0 * told.join.center_sigma + 0.005
+    assert abs(fit.scale - 1.0) < 2e-3
+
+
+@pytest.mark.slow
+def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 24}
+    scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
+    write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, bundle_adjust=True)
 
 
 def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_path):

@@ -70,9 +70,17 @@ def test_a_written_graph_is_read_back_to_the_bit(tmp_path, weighted):
 
 
 def test_the_bundled_graph_and_tables_are_those_that_their_script_makes():
-    from scripts.make_data import bundled_graph_text, measured_positions_text, names_text
+    from scripts.make_data import (
+        bundled_graph_text,
+        control_points_text,
+        gravity_text,
+        measured_positions_text,
+        names_text,
+    )
 
     assert (BUNDLED / "gps.csv").read_text() == measured_positions_text()
+    assert (BUNDLED / "gcp_list.txt").read_text() == control_points_text()
+    assert (BUNDLED / "gravity.txt").read_text() == gravity_text()
     assert (BUNDLED / "names.txt").read_text() == names_text()
 
     ours = read_graph(BUNDLED / "graph40.txt")

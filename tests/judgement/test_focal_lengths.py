@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.geometry import normalized
@@ -50,6 +51,53 @@ def test_a_camera_with_a_wrong_focal_length_is_named_with_the_right_one(factor, 
     assert [doubt.camera for doubt in found] == [1]
     # The factors that are tried are 5 % apart or less near the best one.
     assert factor * found[0].factor == pytest.approx(1.0, rel=0.06)
+
+
+def ring_about_an_object(factors, seed, count=30):
+    """Matches of images whose optical axes meet: without rotations, two views hardly tell focal lengths."""
+    rng = np.random.default_rng(seed)
+    camera_of = (np.arange(IMAGES) % 3 == 0).astype(np.int64)
+    angles = np.linspace(0.0, 2.0 * np.pi, IMAGES, endpoint=False)
+    centers = np.stack([8.0 * np.cos(angles), 8.0 * np.sin(angles), np.zeros(IMAGES)], axis=1)
+    forward, down = -centers / 8.0, np.tile([0.0, 0.0, -1.0], (IMAGES, 1))
+    rotations = np.stack([np.cross(down, forward), down, forward], axis=1)
+    pairs = np.array([(i, j) for i, j in all_pairs(IMAGES) if min(j - i, IMAGES - j + i) < 4])
+    read = ([], [])
+    for i, j in pairs.tolist():
+        points = rng.uniform(-2.0, 2.0, (count, 3))
+        for rays, k in zip(read, (i, j), strict=True):
+            inside = (points - centers[k]) @ rotations[k].T
+            pixels = FOCAL_PX * inside[:, :2] / inside[:, 2:] + 0.3 * rng.standard_normal((count, 2))
+            focal = FOCAL_PX * factors[camera_of[k]]
+            rays.append(normalized(np.column_stack([pixels / focal, np.ones(count)])))
+    given = RayMatches(
+        pairs=pairs,
+        offsets=count * np.arange(len(pairs) + 1),
+        rays_i=np.concatenate(read[0]),
+        rays_j=np.concatenate(read[1]),
+        pixel_angles=np.full(len(pairs), 1.0 / FOCAL_PX),
+    )
+    focal_lengths = FOCAL_PX * np.array(factors)[camera_of]
+    return given, rotations, Lenses(camera_of, focal_lengths, np.zeros(IMAGES, dtype=np.bool_))
+
+
+@pytest.mark.parametrize(("wrong", "factor"), [(0, 0.9), (1, 0.42), (1, 1.1)])
+def test_of_a_ring_about_an_object_the_camera_that_is_wrong_is_named(wrong, factor):
+    factors = [1.0, 1.0]
+    factors[wrong] = factor
+    found = doubt_focal_lengths(*ring_about_an_object(factors, 4))
+    assert [doubt.camera for doubt in found] == [wrong]
+    assert factor * found[0].factor == pytest.approx(1.0, rel=0.06)
+
+
+def test_a_wrong_rotation_is_not_taken_for_a_wrong_focal_length():
+    """Of a camera that took a single image, and of one that took several."""
+    rays, rotations, lenses = ring_about_an_object([1.0, 1.0], 5)
+    vectors = np.radians(1.0) * np.random.default_rng(0).standard_normal((IMAGES, 3))
+    turned = Rotation.from_rotvec(vectors).as_matrix() @ rotations
+    assert doubt_focal_lengths(rays, turned, lenses) == ()
+    rotations[4] = turned[4]
+    assert doubt_focal_lengths(rays, rotations, lenses._replace(camera_of=np.arange(IMAGES))) == ()
 
 
 def test_without_an_error_or_for_a_single_camera_nobody_is_named():

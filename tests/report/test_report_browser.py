@@ -2,6 +2,7 @@
 
 import base64
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -298,3 +299,23 @@ def test_a_thousand_cameras_are_there_in_two_seconds(driver, tmp_path):
     opened(driver, tmp_path / "report.html")
     assert time.perf_counter() - start < 8.0  # 2 s with a graphics card; drawing by software takes up to 4 s
     assert complaints(driver) == []
+
+
+def test_the_first_view_holds_the_ring_and_not_the_few_cameras_far_away(driver, tmp_path):
+    drawing, facts = make_drawing()
+    centers = drawing.cameras.centers.copy()
+    far = np.arange(25) % 5 == 2
+    centers[far] *= 2.8
+    trust = np.linspace(0.7, 1.0, 25)  # the page sorts by it
+    trust[~drawing.cameras.placed] = np.nan
+    drawing = replace(drawing, cameras=replace(drawing.cameras, centers=centers, trust=trust))
+    write_report(drawing, facts, tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    rows = np.flatnonzero(drawing.cameras.placed & ~far).tolist()
+    seen = np.array(driver.execute_script(f"{SCENE} return arguments[0].map(scene.project);", rows))[:, :2]
+    size = driver.find_element("id", "canvas").size
+    sides = np.array([size["width"], size["height"]])
+    assert (seen > 0).all()
+    assert (seen < sides).all()
+    spans = np.ptp(seen, axis=0) / sides
+    assert spans.max() > 0.8  # of 1/1.1, which the margin leaves

@@ -57,7 +57,7 @@ def test_a_bare_graph_has_its_report_too_and_a_report_can_be_made_again(located,
 
 @pytest.mark.parametrize(
     ("command", "advice"),
-    [("report", "holds no COLMAP model"), ("view", "give a folder that locate or solve wrote")],
+    [("report", "holds no COLMAP model"), ("view", "give a folder that locate or place wrote")],
 )
 def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, command, advice):
     result = run(command, tmp_path, code=3)
@@ -66,6 +66,8 @@ def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, 
     result = run(command, tmp_path, code=3)
     assert "damaged or of another version" in result.stderr
     assert "Traceback" not in result.output
+    missing = tmp_path / "missing"
+    assert f"{missing} does not exist" in run(command, missing, code=3).stderr
 
 
 def test_thresholds_decide_which_pairs_are_drawn():

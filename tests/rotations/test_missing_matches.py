@@ -29,10 +29,10 @@ def batch_of(matches):
     )
 
 
-def shares_of(matches):
+def shares_of(matches, pixels=(GRID,) * 4):
     batch = batch_of(matches)
     partners = count_partners([NUM] * 4, [batch])
-    return matched_shares([GRID] * 4, partners, batch)
+    return matched_shares(pixels, np.full((4, 2), 10.0), partners, batch)
 
 
 def test_what_third_images_find_in_the_overlap_must_be_matched():
@@ -42,11 +42,14 @@ def test_what_third_images_find_in_the_overlap_must_be_matched():
     assert shares[1] == len(half) / NUM
 
 
-def test_the_overlap_ends_at_the_matches():
-    left = np.flatnonzero(GRID[:, 0] <= 4)
-    shares = shares_of({(0, 1): np.arange(NUM), (0, 2): left, (1, 2): left})
-    assert shares[1] == shares[2] == 1.0
-    assert shares[0] == 1.0
+def test_the_overlap_is_what_the_matches_take_into_the_other_image():
+    half = np.flatnonzero(GRID[:, 0] <= 4)
+    every = {(0, 1): np.arange(NUM), (0, 2): half, (1, 2): half}
+    # Images of one view: the third finds all that it has in the first, which has the right half besides.
+    assert shares_of(every)[1] == (1.0 + len(half) / NUM) / 2.0
+    # The third image is moved by six pixels: five columns of the others are in it, and all of them are found;
+    # of its own, all that are matched anywhere are.
+    assert shares_of(every, (GRID, GRID, GRID + np.array([6.0, 0.0]), GRID))[1] == 1.0
 
 
 def test_keypoints_that_no_third_image_finds_do_not_count():

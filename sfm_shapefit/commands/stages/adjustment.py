@@ -5,13 +5,14 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import (
     AdjustedPlacement,
     Uncertainty,
@@ -20,9 +21,11 @@ from sfm_shapefit.colmap.bundle_adjustment import (
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
-from sfm_shapefit.commands.stages.measure import measure_directions
+from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
-from sfm_shapefit.directions.pair_directions import PairDirections
+from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
 from sfm_shapefit.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
@@ -97,12 +100,15 @@ def adjust_placed(
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
     locations = (centers - similarity.translation) / similarity.scale
-    if not adjusted.weight.hold or adjusted.lenses.sigmas:
+    if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
         corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
         directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
-        placement = replace(placement, measured=_turn(placement.measured, directions, turns))
+        measured = _turn(placement.measured, directions, turns)
+        if adjusted.sensors:  # which stand elsewhere in their frames now
+            measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
+        placement = replace(placement, measured=measured)
     moved = with_uncertainty(
         move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
     )
@@ -135,14 +141,39 @@ def _measure_again(
     """
     if source.kind == "relative-poses":
         return before
-    again = measure_directions(source, options, clock)
-    both = np.intersect1d(before.usable(), again.usable())
-    anew = both[corrected[before.pairs[both]].any(axis=1)]
-    rows = {"directions": both, **dict.fromkeys(_SAID_OF_MATCHES, anew)}
-    merged = {name: getattr(before, name).copy() for name in rows}
-    for name, taken in rows.items():
-        merged[name][taken] = getattr(again, name)[taken]
+    usable = before.usable()
+    others = np.delete(before.pairs, usable, axis=0)
+    batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
+    threads = options.num_threads()
+    again = concatenate([estimate_directions(batch, options, threads) for batch in batches])
+    rows = again.usable()
+    is_anew = corrected[again.pairs[rows]].any(axis=1)
+    taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}
+    merged = {name: getattr(before, name).copy() for name in taken}
+    for name, chosen in taken.items():
+        merged[name][usable[chosen]] = getattr(again, name)[chosen]
     return replace(before, **merged)
+
+
+def _without_pairs(batches: Iterator[MatchBatch], pairs: IntArray) -> Iterator[MatchBatch]:
+    """Yield the batches without some pairs (k, 2); those that have no others are left out."""
+    unwanted = {(min(i, j), max(i, j)) for i, j in pairs.tolist()}
+    for batch in batches:
+        dropped: BoolArray = np.array(
+            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
+        )
+        if dropped.all():
+            continue
+        counts = np.diff(batch.offsets)
+        kept = np.repeat(~dropped, counts)
+        yield MatchBatch(
+            pairs=batch.pairs[~dropped],
+            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
+            keypoints=batch.keypoints[kept],
+            rays_i=batch.rays_i[kept],
+            rays_j=batch.rays_j[kept],
+            pixel_angles=batch.pixel_angles[~dropped],
+        )
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:

@@ -26,8 +26,11 @@ _LEAST_MATCHES = 8
 # makes the camera doubtful.
 _POOR = 0.9
 _DOUBTFUL_SHARE = 0.1
-# Pairs of each camera that are asked at most, those of most matches, and matches of a pair.
+# Pairs of each camera that are asked at most, those of most matches, and matches of a pair. Beyond 750 images
+# they are fewer, so that about so many are asked in all: a thousand take more than a second.
 _MOST_PAIRS = 40
+_MOST_ASKED = 30_000
+_FEWEST_PAIRS = 6
 _MOST_MATCHES = 150
 # Of the focal lengths: cameras that are asked at most; pairs, about, and of each camera at least; pairs of
 # each two cameras at most; matches of a pair at least and at most.
@@ -40,9 +43,15 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource,
+    directions: PairDirections,
+    options: LocateOptions,
+    measured: RelativeRotations | None = None,
 ) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
+    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
+
+    Those that were `measured` already, with the intrinsics that the images have, are not measured again.
+    """
     if options.rotations == "measured" or source.kind == "relative-poses":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
@@ -50,7 +59,11 @@ def ask_pairs(
         return concatenate([])
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
-    for batch in source.batches():
+    if measured is not None:
+        known = [tuple(pair) in wanted for pair in measured.pairs.tolist()]
+        parts = [measured.subset(np.flatnonzero(known))]
+        wanted -= {tuple(pair) for pair in parts[0].pairs.tolist()}
+    for batch in source.batches() if wanted else ():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         parts.append(estimate_relative_rotations(rays, options.num_threads()))
@@ -81,7 +94,7 @@ def doubt_cameras(
     place_of[placement.cameras] = np.arange(len(placement.cameras))
     pairs = weigh_pairs(directions, _agreements(placement, directions), relative, model.rotations)
     ends = place_of[pairs.pairs]
-    inside = np.flatnonzero((ends >= 0).all(axis=1))
+    inside = np.flatnonzero((ends >= 0).all(axis=1) & _weighed(directions, model.num_images))
     pairs = pairs.subset(inside)._replace(pairs=ends[inside])
     labels = np.arange(len(placement.cameras))
     if placement.groups is not None:
@@ -102,6 +115,7 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, options: 
     if relative is None:
         return np.zeros(model.num_images, dtype=np.bool_)
     pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
+    pairs = pairs.subset(_weighed(directions, model.num_images))
     _, labels = np.unique(model.frame_ids, return_inverse=True)
     kinds = find_turned(pairs, labels.ravel().astype(np.int64)).kinds
     return np.array([kind is Doubt.RIGHT for kind in kinds])
@@ -167,13 +181,29 @@ def _doubtful_pairs(directions: PairDirections, num_images: int) -> BoolArray:
     total = np.bincount(ends, np.repeat(counts, 2), num_images)
     share = np.bincount(ends, np.repeat(counts * poor, 2), num_images) / np.maximum(total, 1.0)
     chosen = (share[directions.pairs] > _DOUBTFUL_SHARE).any(axis=1)
-    return np.asarray(chosen & (counts >= _LEAST_MATCHES) & _strongest(directions))
+    return np.asarray(chosen & (counts >= _LEAST_MATCHES) & _strongest(directions, num_images))
 
 
-def _strongest(directions: PairDirections) -> BoolArray:
+def _most_pairs(num_images: int) -> int:
+    """Return how many pairs of each camera are asked at most."""
+    return max(_FEWEST_PAIRS, min(_MOST_PAIRS, _MOST_ASKED // max(num_images, 1)))
+
+
+def _strongest(directions: PairDirections, num_images: int) -> BoolArray:
     """Return which pairs are among those of most matches of one of their cameras, (k,)."""
     rank = _rank_within(directions.pairs.T.ravel(), np.tile(-directions.num_matches, 2))
-    return np.asarray((rank < _MOST_PAIRS).reshape(2, -1).any(axis=0))
+    return np.asarray((rank < _most_pairs(num_images)).reshape(2, -1).any(axis=0))
+
+
+def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
+    """Return which pairs have a part in the doubts, (k,).
+
+    Where few of many are asked, only those that may be: the others would speak for their cameras, and never
+    against them.
+    """
+    if _most_pairs(num_images) == _MOST_PAIRS:
+        return np.ones(len(directions.pairs), dtype=np.bool_)
+    return _strongest(directions, num_images)
 
 
 def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:

@@ -20,13 +20,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.database import MatchDatabase, PairRows, open_database
 from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
 from sfm_shapefit.extras import MissingExtraError
-from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
 Measured = TypeVar("Measured")
@@ -55,13 +54,11 @@ class PairTask(Generic[Measured]):
 
     database: Path
     """Its absolute path, the same for all workers."""
-    part: tuple[int, int]
-    """The range of its pairs."""
+    rows: PairRows
+    """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
     cameras: PosedModelFile
     """Of the whole model: the indices of pairs refer to them."""
     work: PairWork[Measured]
-    left_out: PairNames = frozenset()
-    """Pairs that are taken for unmatched."""
 
 
 def measure_with_workers(
@@ -81,10 +78,7 @@ def measure_with_workers(
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
     parts = database.parts(work.matches_per_task)
-    tasks = [
-        PairTask(database=path, part=part, cameras=cameras, work=work, left_out=database.left_out)
-        for part in parts
-    ]
+    tasks = [PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts]
     found: list[Measured] = []
     for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
         found += measured
@@ -95,8 +89,9 @@ def measure_with_workers(
 def measure_task(task: PairTask[Measured]) -> list[Measured]:
     """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
     model = from_posed_cameras(task.cameras)
-    with open_database(task.database, model, task.left_out) as database:
-        batches = database.iter_matches(task.work.min_matches, part=task.part)
+    with open_database(task.database, model, rows=task.rows) as database:
+        everything = (0, database.num_pairs)  # whose rays are not kept: each batch is needed once
+        batches = database.iter_matches(task.work.min_matches, part=everything)
         return [task.work.estimate(batch) for batch in batches]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_thinly
+from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
@@ -65,7 +65,8 @@ def adjust_first_placement(
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
     seed, tracks = seed_and_tracks(source, located, clock.advance)
-    adjusted = adjust_thinly(seed, tracks, options, lenses=lenses, thorough=thorough)
+    given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
+    adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():

@@ -37,6 +37,10 @@ def read_priors(
     """
     if options.scale not in ("auto", "prior") and table is not None:
         raise InputError(f"priors have no effect with the scale {options.scale}; leave out one of the two")
+    if options.control_points and table is not None:
+        raise InputError(
+            "control points and position priors would both set the scale; leave out one of the two"
+        )
     if options.known_distance and (table is not None or options.refine_with_priors):
         raise InputError(
             "known distances and position priors would both set the scale; leave out one of the two"

@@ -42,9 +42,7 @@ class MatchSource:
             return track_matches(self.model)
         return self.database.iter_matches(1, self.economy.batch, among)
 
-    def counted(
-        self, batches: Iterator[Batch], advance: Callable[[int, int], None]
-    ) -> Iterator[Batch]:
+    def counted(self, batches: Iterator[Batch], advance: Callable[[int, int], None]) -> Iterator[Batch]:
         """Report progress while batches are consumed: pairs of a database, or images of a model."""
         total = self.model.num_images if self.database is None else self.database.num_pairs
         done = 0

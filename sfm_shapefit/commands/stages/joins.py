@@ -18,7 +18,7 @@ from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
-from sfm_shapefit.geometry import Similarity, compose
+from sfm_shapefit.geometry import METRIC_SIGMA, Similarity, compose
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import (
     ModelJoin,
@@ -177,11 +177,10 @@ class _Evidence:
         Raises:
             UnsolvableError: if neither is safe.
         """
-        if any(self.models[k].located.model.has_rigs for k in (first, second)):
-            raise UnsolvableError("models with rigs of several cameras are not joined")
+        metric_sigma = self._metric_sigma(first, second)
         known = [self._priors_of(k) for k in (first, second)]
         reasons = []
-        if known[0] is not None and known[1] is not None:
+        if metric_sigma is None and known[0] is not None and known[1] is not None:
             try:
                 return join_by_priors(known[0], known[1])
             except UnsolvableError as error:
@@ -190,10 +189,28 @@ class _Evidence:
         if between is not None:
             try:
                 ties = self._tie(between, first, second)
-                return join_by_matches(ties, between.turns, self._centers_of(second))
+                return join_by_matches(ties, between.turns, self._centers_of(second), metric_sigma)
             except UnsolvableError as error:
                 reasons.append(str(error))
         raise UnsolvableError("; ".join(reasons) or _NOTHING_IN_COMMON)
+
+    def _metric_sigma(self, first: int, second: int) -> float | None:
+        """Return how well two models know the scale between them, relative; None if neither's rigs tell one.
+
+        Raises:
+            UnsolvableError: if only one of them has rigs, which the scale of the other must not change, or
+                they do not know their scale.
+        """
+        located = [self.models[k].located for k in (first, second)]
+        has_rigs = [one.model.has_rigs for one in located]
+        if not any(has_rigs):
+            return None
+        if not all(has_rigs):
+            raise UnsolvableError("only one of them has rigs of several cameras, and a scale by that")
+        sigmas = [one.gauge.scale_sigma for one in located]
+        if any(sigma is None or sigma > METRIC_SIGMA for sigma in sigmas):
+            raise UnsolvableError("their rigs do not tell the scale of both")
+        return float(np.linalg.norm(np.array(sigmas, dtype=np.float64)))
 
     def _priors_of(self, number: int) -> tuple[FloatArray, PositionPriors] | None:
         """Return the centers of a model's cameras, and their priors, if there are any."""

@@ -67,7 +67,7 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     usable = directions.usable()
     if len(usable) == 0:
         counts = directions.counts()
-        reasons = ", ".join(f"{count} {status.value}" for status, count in counts.items())
+        reasons = ", ".join(f"{status.value}: {count}" for status, count in counts.items())
         raise UnsolvableError(
             f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
             f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
@@ -87,9 +87,7 @@ def build_graph(source: MatchSource, directions: PairDirections, options: Locate
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
     if not (options.uses_points(model.num_images) and source.economy.points):
         return MeasuredGraph(graph, covariance=covariance)
-    tracks = build_tracks(
-        source.batches(), directions, options.inlier_threshold_px, source.num_keypoints()
-    )
+    tracks = build_tracks(source.batches(), directions, options.inlier_threshold_px, source.num_keypoints())
     chosen = tracks.subset(covering_set(tracks, model.num_images))
     return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 

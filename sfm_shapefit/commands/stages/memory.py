@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.colmap.database import KEPT_MATCHES
+from sfm_shapefit.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
@@ -227,7 +228,9 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     model = 30e6 + 55.0 * work.num_keypoints
     rays = min(24.0 * work.num_keypoints, economy.rays_bytes)
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
-    throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results
+    is_sorted = not economy.statement and work.num_matches <= MOST_MATCHES
+    in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
+    throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
     peaks = {
         "reading": _STARTED_BYTES + model + 40.0 * work.num_keypoints,
         "measuring directions": throughout + batch,

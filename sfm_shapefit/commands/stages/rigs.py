@@ -57,16 +57,24 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
+    if options.refine_rigs and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to refine; leave out refine_rigs")
     if count and has_priors:
         raise InputError(
             "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"
         )
     if not model.has_rigs and count < 2:
         return Rigid(fixed, None, None)
-    if options.scale not in ("auto", "input", "rig") or options.known_distance or has_priors:
+    if (
+        options.scale not in ("auto", "input", "rig")
+        or options.known_distance
+        or has_priors
+        or options.control_points
+    ):
         source = "rigs" if model.has_rigs else "fixed cameras"
         raise InputError(
-            f"the scale is that of the {source}; leave out other scales, known distances and priors"
+            f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
+            "points"
         )
     refuse_options_of_groups(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)

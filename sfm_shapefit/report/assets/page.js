@@ -91,6 +91,11 @@ const drawPieces = () => {
   fill("pieces", plainTable(["Piece", "Cameras", "Placed", "Shared with others", "Scale", "Where"], rows));
   $("pieces-note").textContent = data.notes.pieces;
 };
+const drawControl = () => {
+  $("control-card").hidden = !data.control.length;
+  fill("control", plainTable(["Name", "Use", "Off by", "Along the axes", "Pixels", "Marks"], data.control));
+  $("control-note").textContent = data.notes.control;
+};
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;
   fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the chain", "What became of it"], data.loops));
@@ -192,6 +197,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolor);
 drawHead();
 drawFacts();
 drawPieces();
+drawControl();
 drawLoops();
 tables = drawTables(select);
 drawDetails();

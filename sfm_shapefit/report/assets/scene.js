@@ -81,6 +81,7 @@ const SEGMENT = [[[0, 0, 0], [1, 0, 0]]];
 const MANY_SHAPES = 3000; // more are drawn by lines of one pixel, which are a third of the work
 
 const HALF_FIELD = Math.tan((20 * Math.PI) / 180);
+const FRAMED = 1.1; // of the canvas, what is framed leaves this margin
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 
@@ -242,18 +243,22 @@ const makeEye = (canvas) => {
       ];
     };
   };
-  // The distance from which a share of some points is in sight around a target.
-  const fitting = (target, positions, share) => {
+  // The target and the distance from which some groups of points fill the canvas, seen as the view is turned now; of each
+  // group the given share may be outside on each side. With h the tangent of half the field of view, the point (x, y, z),
+  // in the view's axes, is left of the right edge of an eye at e if x - e_x <= h (e_z - z), so if x + h z <= e_x + h e_z,
+  // and likewise at the other three: four bounds, each a quantile, and an e_z that the wider of width and height decides.
+  const framing = (groups, depth) => {
     const { right, up, back } = axes();
-    const aspect = canvas.clientWidth / canvas.clientHeight;
-    return quantile(positions.map((position) => {
-      const from = position.map((part, c) => part - target[c]);
-      const reach = Math.max(Math.abs(dot(right, from)) / aspect, Math.abs(dot(up, from))) / HALF_FIELD;
-      return reach + dot(back, from);
-    }), share);
+    const halves = [HALF_FIELD * (canvas.clientWidth / canvas.clientHeight), HALF_FIELD].map((half) => half / FRAMED);
+    const bound = (axis, sign, half) => Math.max(...groups.map(({ positions, outside }) => (
+      quantile(positions.map((p) => sign * dot(axis, p) + half * dot(back, p)), 1 - outside))));
+    const sides = [right, up].map((axis, k) => [bound(axis, 1, halves[k]), bound(axis, -1, halves[k])]);
+    const away = Math.max(...sides.map(([high, low], k) => (high + low) / (2 * halves[k])));
+    const [x, y] = sides.map(([high, low]) => (high - low) / 2);
+    return [[0, 1, 2].map((c) => x * right[c] + y * up[c] + dot(back, depth) * back[c]), away - dot(back, depth)];
   };
   const pixelsPerUnit = () => canvas.clientHeight / (2 * HALF_FIELD * view.distance);
-  return { view, axes, near, matrix, projection, fitting, pixelsPerUnit };
+  return { view, axes, near, matrix, projection, framing, pixelsPerUnit };
 };
 
 // What a press, a wheel and the keys do to the eye; `changed` is called after each, `pressed` for a press in place.

@@ -2,7 +2,7 @@
 
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
 const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
-const MANY_IN_GOOD = 20; // contradicting pairs of a good model
+const MANY_WRONG = 20; // contradicting pairs, long lines across the scene
 const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
@@ -11,7 +11,8 @@ const SLOW_FRAME_MS = 50;
 const REST_MS = 200; // the scene rests so long after the last move, and the time of two frames
 const COARSEST = 3; // levels of detail while the scene moves
 const SHARES = [1, 1, 0.25, 0.06]; // of points and pairs, by level
-const LEAST_FRUSTUM_PX = 12; // at first sight, frusta are at least so deep
+const LEAST_FRUSTUM_PX = 12; // at first sight, frusta are at least so deep,
+const FRUSTUM_STEPS = 2.5; // but not more than so many times as far as the next camera is
 
 const makeScene = (onChoice) => {
   const canvas = $("canvas");
@@ -105,6 +106,14 @@ const makeScene = (onChoice) => {
   };
   // Cameras and points, without the few that are far out.
   const nearCameras = withoutFar(placed.map((k) => positionOf(k)));
+  // The first view may leave out more, so that a statue is seen although some photographs of it are from far away. On a
+  // line, a ring or an area the farthest camera is at twice the median distance, or less.
+  const mainCameras = (() => {
+    const center = [0, 1, 2].map((c) => quantile(nearCameras.map((p) => p[c]), 0.5));
+    const away = nearCameras.map((p) => Math.hypot(...p.map((part, c) => part - center[c])));
+    const limit = Math.max(2.2 * quantile(away, 0.5), quantile(away, 0.7));
+    return nearCameras.filter((_, k) => away[k] <= limit);
+  })();
   const nearPoints = (() => {
     const all = [];
     const step = Math.max(Math.floor(points.positions.length / 3 / 4000), 1);
@@ -176,7 +185,7 @@ const makeScene = (onChoice) => {
     const said = ["Pairs that agree", "that contradict", "that cannot be judged", "without a direction"][verdict];
     const amount = drawn.length === total ? count(total) : `${count(drawn.length)} of ${count(total)}`;
     const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
-      : verdict === 1 && data.banner.grade === "good" ? MANY_IN_GOOD : MOST_PAIRS;
+      : verdict === 1 ? MANY_WRONG : MOST_PAIRS;
     const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
     const order = spread(drawn.length).map((k) => drawn[k]);
     addLayer(name, `${said} (${amount})`, shown, {
@@ -413,8 +422,21 @@ const makeScene = (onChoice) => {
   const whole = () => {
     Object.assign(view, { yaw: Math.atan2(-0.84, 0.35), pitch: 0.43 });
     if (data.dimension === 2) Object.assign(view, { yaw: -Math.PI / 2, pitch: 1.57 });
-    const distance = Math.max(eye.fitting(middle, nearCameras, 0.96) || 0, eye.fitting(middle, nearPoints, 0.93) || 0);
-    return [middle, 1.08 * distance || 4 * radius];
+    const groups = [{ positions: mainCameras, outside: 0 }, { positions: nearPoints, outside: 0.03 }];
+    const [target, distance] = eye.framing(groups.filter(({ positions }) => positions.length), middle);
+    return distance > 0.5 * radius ? [target, distance] : [middle, 4 * radius];
+  };
+  // Along a street, frusta that are deeper than a few steps between cameras would be one band.
+  const roomOfFrusta = () => {
+    if (placed.length < 3 || placed.length > 1000) return Infinity;
+    const project = eye.projection();
+    const seen = placed.map((k) => project(...positionOf(k)));
+    const nearest = seen.map(([x, y], k) => {
+      let least = Infinity;
+      for (let j = 0; j < seen.length; j++) if (j !== k) least = Math.min(least, Math.hypot(x - seen[j][0], y - seen[j][1]));
+      return least;
+    });
+    return Math.max(FRUSTUM_STEPS * quantile(nearest, 0.5), LEAST_FRUSTUM_PX / 3);
   };
   const show = (choice) => {
     selected = choice;
@@ -547,7 +569,7 @@ const makeScene = (onChoice) => {
   };
 
   [view.target, view.distance] = whole();
-  const leastPixels = LEAST_FRUSTUM_PX * Math.min(Math.sqrt(400 / Math.max(placed.length, 1)), 1);
+  const leastPixels = Math.min(LEAST_FRUSTUM_PX * Math.min(Math.sqrt(400 / Math.max(placed.length, 1)), 1), roomOfFrusta());
   sizes.frustum = Math.max(data.frustum, leastPixels / eye.pixelsPerUnit());
   if (certain.length) {
     const size = quantile(certain.map((k) => Math.hypot(...cameras.ellipsoids.subarray(9 * k, 9 * k + 9))), 0.5);

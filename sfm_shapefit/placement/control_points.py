@@ -1,0 +1,206 @@
+"""Ground control points: points of known position that images show, which set scale, origin and axes.
+
+Their positions in the model are triangulated; a similarity maps these onto the known ones. It starts from
+the robust fit that position priors have. Then those that fit are told by the noise of all that fit: with n
+points of three coordinates and 7 parameters,
+
+    sigma^2 = sum |residual|^2 / (3 n - 7),
+
+a point outside the fit is off by sigma sqrt(1 + h) per axis, with its leverage h = tr(J N^-1 J^T) / 3, and
+fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma that few points tell badly. On
+made points, this left out 0.03 to 0.17 good ones a fit of 4 to 7, and found one that is 25 sigma off per
+axis in 67 % of the fits of 4 points, and in 97 % or more of those of 5 to 7. Three points check nothing.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, median_spread
+from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.placement.gauge import Datum, Gauge, PositionPriors, fit_to_priors
+
+FEWEST_CONTROL_POINTS = 3
+_PARAMETERS = 7
+_FITTING_SIGMAS = 4.0
+_MOST_ROUNDS = 20
+# Points within this share of their length from a line say nothing of the turn about it.
+_THIN = 1e-3
+# Nor do those within so many standard deviations.
+_FLAT = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlPoints:
+    """Points of known position, and where images show them."""
+
+    names: tuple[str, ...]
+    positions: FloatArray
+    """(k, 3) in axes and units of their own."""
+    is_check: BoolArray
+    """(k,) those that only check the model."""
+    points: IntArray
+    """(m,) the point of each mark, ascending."""
+    images: IntArray
+    """(m,) the image that it is in; of one point ascending, each once."""
+    pixels: FloatArray
+    """(m, 2)"""
+    statement: str
+    """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
+
+    def of(self, images: IntArray) -> "ControlPoints":
+        """Return them with the marks in some images (n,), ascending, numbered by their place among these."""
+        inside = np.isin(self.images, images)
+        return replace(
+            self,
+            points=self.points[inside],
+            images=np.searchsorted(images, self.images[inside]),
+            pixels=self.pixels[inside],
+        )
+
+    def seen_twice(self) -> BoolArray:
+        """Return which points have marks in two images, (k,)."""
+        return np.bincount(self.points, minlength=len(self.names)) > 1
+
+    def why_too_few(self) -> str:
+        """Return why these points cannot tell scale and axes, a clause; empty if they can."""
+        usable = self.seen_twice() & ~self.is_check
+        return why_too_few(self.positions[usable], "have marks in two images of the model")
+
+
+class TriangulatedControl(NamedTuple):
+    """Where a model has control points, and how well their marks agree."""
+
+    positions: FloatArray
+    """(k, 3), NaN for those that cannot be triangulated."""
+    errors_px: FloatArray
+    """(m,) of the marks, from the point to the mark; NaN where there is no point or the image is not in the
+    model."""
+    agreeing: BoolArray
+    """(m,) the marks that the point was triangulated from."""
+
+
+class ControlFit(NamedTuple):
+    """Control points after the similarity that maps the model onto them."""
+
+    motion: Similarity
+    """From the model to the control points."""
+    fitting: BoolArray
+    """(k,) those that set it."""
+    sigma: float
+    """Standard deviation of their coordinates; 0 if they are too few to tell."""
+    residuals: FloatArray
+    """(k, 3) the model's position minus the known one, in units of the latter; NaN where it has none."""
+    scale_sigma: float
+    """Relative standard deviation of the scale."""
+
+
+def why_too_few(positions: FloatArray, what: str) -> str:
+    """Return why points (k, 3) that are all there is cannot tell scale and axes, or nothing if they can."""
+    if len(positions) < FEWEST_CONTROL_POINTS:
+        return f"{len(positions)} of the control points {what}, and scale and axes need three"
+    lengths = _principal_lengths(positions)
+    if lengths[1] <= _THIN * lengths[0]:
+        return f"the control points that {what} lie on a line, and axes need one beside it"
+    return ""
+
+
+def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | str:
+    """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none."""
+    there: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
+    rows = np.flatnonzero(there & ~known.is_check)
+    source, target = found[rows], known.positions[rows]
+    reason = why_too_few(target, "can be triangulated")
+    if reason:
+        return reason
+    fits: BoolArray = _start(source, target)
+    for _ in range(_MOST_ROUNDS):
+        motion = fit_similarity(source, target, fits.astype(np.float64))
+        apart: FloatArray = np.asarray(np.linalg.norm(motion.apply(source) - target, axis=1))
+        freedom = 3.0 * float(fits.sum()) - _PARAMETERS
+        sigma = float(np.sqrt(np.sum(apart[fits] ** 2) / freedom))
+        nearest = np.argsort(apart, kind="stable")[:FEWEST_CONTROL_POINTS]
+        spread = np.sqrt(1.0 + np.where(fits, 0.0, _leverages(target, fits)))
+        limit = _FITTING_SIGMAS * np.sqrt(1.0 + _PARAMETERS / freedom) * sigma
+        again = np.array(apart <= limit * spread, dtype=np.bool_)
+        again[nearest] = True
+        if (again == fits).all():
+            break
+        fits = again
+    if motion.scale <= 0.0:
+        return "the control points contradict the model; check the order of their coordinates"
+    if _principal_lengths(target[fits])[1] <= _FLAT * sigma * np.sqrt(fits.sum()):
+        return (
+            f"the control points contradict one another: those that agree, {int(fits.sum())} of {len(rows)}, "
+            "lie on a line but for their errors; check coordinates and marks"
+        )
+    fitting = np.zeros(len(there), dtype=np.bool_)
+    fitting[rows[fits]] = True
+    residuals = np.where(there[:, None], motion.apply(found) - known.positions, np.nan)
+    size = float(np.linalg.norm(target[fits] - target[fits].mean(axis=0)))
+    return ControlFit(motion, fitting, sigma, residuals, sigma / size)
+
+
+def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge:
+    """Return the gauge of control points, for a model that stands in another one.
+
+    y = A (s x + b) becomes c R y + t = R A (c s x + c b + (R A)^T t).
+    """
+    motion = fit.motion
+    axes = motion.rotation if before.axes is None else motion.rotation @ before.axes
+    shift = axes.T @ motion.translation
+    total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
+    used = int(np.sum(~known.is_check & np.isfinite(fit.residuals[:, 0])))
+    told = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
+    warning = ""
+    if fit.scale_sigma > METRIC_SIGMA:
+        warning = f"{told} only, so it is not metric: the control points contradict one another, or the model"
+    return Gauge(
+        similarity=compose(total, before.similarity),
+        scale="control points",
+        axes=axes,
+        statement=(
+            f"control points: {known.statement}; {int(fit.fitting.sum())} of {used} agree, to "
+            f"{fit.sigma:.3g} per axis; origin and axes: theirs; {told}"
+        ),
+        warning=warning,
+        scale_sigma=fit.scale_sigma,
+        datum=known.datum,
+    )
+
+
+def _start(source: FloatArray, target: FloatArray) -> BoolArray:
+    """Return which points fit at first: all of three, else those of the robust fit if they are enough."""
+    everyone = np.ones(len(source), dtype=np.bool_)
+    if len(source) <= FEWEST_CONTROL_POINTS:
+        return everyone
+    unknown = np.full((len(target), 3, 3), np.nan)
+    priors = PositionPriors(
+        known=KnownPositions.measured(np.arange(len(target)), target, unknown), statement=""
+    )
+    fits = fit_to_priors(source, priors, median_spread(target), rotate=True)[1] >= 0.5
+    return fits if not why_too_few(target[fits], "") else everyone
+
+
+def _leverages(points: FloatArray, fits: BoolArray) -> FloatArray:
+    """Return the variance per axis that a fit to some points (k, 3) predicts for all, in their variances.
+
+    J of a shift, a turn and a scale about their mean is [I, -[x]_x, x].
+    """
+    x = points - points[fits].mean(axis=0)
+    x /= np.linalg.norm(x[fits])
+    jacobians = np.zeros((len(points), 3, _PARAMETERS))
+    jacobians[:, :, :3] = np.eye(3)
+    jacobians[:, :, 3:6] = np.cross(np.eye(3), x[:, None, :])
+    jacobians[:, :, 6] = x
+    normal = np.einsum("kab,kac->bc", jacobians[fits], jacobians[fits])
+    return np.asarray(np.einsum("kab,kab->k", jacobians @ np.linalg.pinv(normal), jacobians)) / 3.0
+
+
+def _principal_lengths(points: FloatArray) -> FloatArray:
+    """Return the singular values of points (k, 3) around their mean, largest first."""
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))

@@ -1,0 +1,214 @@
+"""Gravity as a term of rotation averaging: each measured direction fixes two degrees of freedom of a camera.
+
+The world is a further node W, with rotation R_W to axes whose z points up. Gravity g_i in axes of camera i
+says that R_W R_i^T takes g_i to d = (0, 0, -1): a pair (i, W) whose relative rotation is known up to a turn
+about d,
+
+    M_i = argmin { angle(M, R_W R_i^T) : M g_i = d },        information (I - d d^T) / sigma_i^2.
+
+Its residual is the smallest turn that would bring the gravity down, M_i is found anew in each round, and all
+else is a round with the full information (`rotations.annealing`): a Laplacian system, and the loss of Geman
+and McClure.
+
+W starts where most gravities put it, at the rotations that the pairs alone give. Pairs that contradict these
+by more than 5 degrees have no part. Gravities may be off by more, because chains of pairs drift.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import angle_between, normalized
+from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
+from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
+from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
+from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas, residual_variance
+
+DOWN = np.array([0.0, 0.0, -1.0])
+"""In axes of the world."""
+
+# Gravities that are within so much of one another say the same of the world in the beginning.
+_VOTING = np.radians(10.0)
+# A gravity that is farther off has no part.
+_LIMIT = np.radians(45.0)
+_ROUNDS = 60
+_SETTLED = 1e-7
+_SCALE_OF_MEDIAN = 3.0
+_REDUCTION = 1e-4
+_LONGEST_STEP = 0.5
+# Share of the information about the axis of gravity, which it says nothing of, that keeps blocks definite.
+_ABOUT_DOWN = 1e-9
+# A residual variance is not asked of pairs that hide more of theirs.
+_MOST_LEVERAGE = 0.9
+# A gravity is wrong beyond so many of its standard deviations, or of the level of all.
+_WRONG_SIGMAS = 5.0
+# Median of the length of two normal components of variance 1.
+_MEDIAN_LENGTH = 1.1774
+FEWEST_GRAVITIES = 2
+
+
+class Gravity(NamedTuple):
+    """Measured directions of gravity, in axes of cameras (x right, y down, z ahead)."""
+
+    indices: IntArray
+    """(k,) whose they are, ascending without repetition."""
+    directions: FloatArray
+    """(k, 3) unit vectors."""
+    sigmas: FloatArray
+    """(k,) standard deviations about each of two axes, in radians."""
+
+    def among(self, members: IntArray) -> "Gravity":
+        """Return those of some members (n,), ascending, numbered by their place among these."""
+        _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
+        return Gravity(places, self.directions[rows], self.sigmas[rows])
+
+    def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
+        """Return the gravities of frames, by the frame (n,) and sensor_from_rig (n, 3, 3) of each image.
+
+        Of a frame with several the most certain counts: sensors of one rig share their errors.
+        """
+        turned = np.einsum("kba,kb->ka", sensor_rotations[self.indices], self.directions)
+        frames = frame_of_image[self.indices]
+        order = np.lexsort((self.sigmas, frames))
+        found, first = np.unique(frames[order], return_index=True)
+        rows = order[first]
+        return Gravity(found, turned[rows], self.sigmas[rows])
+
+
+def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:
+    """Return the direction (3,) in the world that most gravities of cameras (n, 3, 3) agree on."""
+    down = normalized(np.einsum("kba,kb->ka", rotations[gravity.indices], gravity.directions))
+    votes = np.array([np.sum(np.maximum(0.0, 1.0 - angle_between(down, one) / _VOTING)) for one in down])
+    best = np.asarray(down[int(np.argmax(votes))])
+    spread = np.maximum(gravity.sigmas, np.median(gravity.sigmas))
+    for _ in range(20):
+        off = angle_between(down, best)
+        near = off <= _VOTING
+        level = max(float(np.median(off[near])) / _MEDIAN_LENGTH, 1e-9)
+        scale = _SCALE_OF_MEDIAN * np.maximum(spread, level)
+        best = normalized(down.T @ (1.0 / (spread * (1.0 + (off / scale) ** 2)) ** 2))
+    return np.asarray(best)
+
+
+def turn_upright(down: FloatArray) -> FloatArray:
+    """Return the smallest turn (3, 3) of the world that brings a direction to where gravity points."""
+    return np.asarray(_shortest_turns(down[None], DOWN)[0].as_matrix())
+
+
+def judge_gravity(rotations: FloatArray, gravity: Gravity) -> tuple[FloatArray, BoolArray]:
+    """Return how far gravities are off an upright world's, in radians, and which of them are wrong, (k,)."""
+    off = angle_between(np.einsum("kba,kb->ka", rotations[gravity.indices], gravity.directions), DOWN)
+    near = off <= _VOTING
+    level = float(np.median(off[near])) / _MEDIAN_LENGTH if near.any() else 0.0
+    return off, np.asarray(off > _WRONG_SIGMAS * np.maximum(gravity.sigmas, level))
+
+
+def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gravity) -> AveragedRotations:
+    """Return averaged rotations refined on pairs and gravities together, in a world whose z points up.
+
+    Args:
+        averaged: of n images, by the pairs alone.
+        given: the pairs, among these images.
+        gravity: of images that have a rotation; two at least, or the rotations are returned as they are.
+    """
+    members = np.flatnonzero(averaged.registered).astype(np.int64)
+    own = gravity.among(members)
+    if len(own.indices) < FEWEST_GRAVITIES:
+        return averaged
+    upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], own)).T
+    inside: BoolArray = np.asarray(averaged.registered[given.pairs].all(axis=1))
+    kept = given.subset(inside)
+    pairs = np.ascontiguousarray(np.searchsorted(members, kept.pairs))
+    found = _refine(upright[members], replace(kept, num_cameras=len(members), pairs=pairs), own)
+    rotations, sigmas = averaged.rotations.copy(), averaged.sigmas_deg.copy()
+    to_world = Rotation.from_quat(found.turns[:-1]) * Rotation.from_quat(found.turns[-1]).inv()
+    rotations[members] = to_world.as_matrix()
+    sigmas[members] = np.degrees(estimate_sigmas(found.graph, found.system, found.last))[:-1]
+    return replace(averaged, rotations=rotations, sigmas_deg=sigmas, certified=None)
+
+
+class _Refined(NamedTuple):
+    """The end of the rounds: all cameras, then the world."""
+
+    turns: FloatArray
+    """(n + 1, 4)"""
+    last: Linearized
+    graph: AveragingPairs
+    system: AveragingSystem
+
+
+def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Refined:
+    """Return the rotations of cameras (n, 3, 3) and of the world after rounds on pairs and gravities."""
+    turns = np.ascontiguousarray(Rotation.from_matrix(upright).as_quat())
+    graph = _join_world(given, turns, gravity)
+    turns = np.concatenate([turns, [[0.0, 0.0, 0.0, 1.0]]])
+    system = plan_system(graph.num_cameras, graph.pairs, np.sqrt(graph.supports), 1)
+    k, m = len(graph.pairs), len(gravity.indices)
+    distances, blocks, gradient = np.empty(k), np.empty((k, 3, 3)), np.empty((graph.num_cameras, 3))
+
+    def weigh(scale: float) -> float:
+        graph.measured[k - m :] = _follow(turns, gravity)
+        weigh_blocks(
+            graph.pairs, graph.measured, turns, graph.information, float(_LIMIT), scale, distances, blocks,
+            gradient,
+        )  # fmt: skip
+        inside = distances[: k - m][~np.isnan(distances[: k - m])]
+        median = float(np.median(inside)) if len(inside) else 1.0
+        return _SCALE_OF_MEDIAN * max(median, 1.0)
+
+    scale = weigh(weigh(_SCALE_OF_MEDIAN))
+    for _ in range(_ROUNDS):
+        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, _REDUCTION), _LONGEST_STEP)
+        scale = weigh(scale)
+        if turned <= _SETTLED:
+            break
+    return _Refined(turns, Linearized(blocks, distances), graph, system)
+
+
+def _join_world(given: AveragingPairs, turns: FloatArray, gravity: Gravity) -> AveragingPairs:
+    """Return the pairs that agree with rotations (n, 4), and those of the gravities with the world, node n.
+
+    The information of pairs is divided by what their residuals exceed it by, as `averaging_uncertainty` has
+    it, lest pairs that state too much outweigh the gravities; it is never multiplied.
+    """
+    n, k, m = given.num_cameras, len(given.pairs), len(gravity.indices)
+    distances, limit = np.empty(k), float(np.radians(AGREEMENT_DEG))
+    weigh_blocks(
+        given.pairs, given.measured, turns, given.information, limit, 1.0, distances, np.empty((k, 3, 3)),
+        np.empty((n, 3)),
+    )  # fmt: skip
+    agreeing = given.subset(~np.isnan(distances))
+    # On average, of a connected graph.
+    leverage = min((n - 1) / max(len(agreeing.pairs), 1), _MOST_LEVERAGE)
+    excess = max(1.0, residual_variance(distances, np.full(k, leverage)))
+    # What gravity does not say, of the axis along it, keeps the blocks definite.
+    across = np.eye(3) - (1.0 - _ABOUT_DOWN) * np.outer(DOWN, DOWN)
+    return AveragingPairs(
+        num_cameras=n + 1,
+        pairs=np.concatenate([agreeing.pairs, np.column_stack([gravity.indices, np.full(m, n)])]),
+        measured=np.concatenate([agreeing.measured, np.zeros((m, 4))]),
+        information=np.concatenate(
+            [agreeing.information / excess, across / gravity.sigmas[:, None, None] ** 2]
+        ),
+        supports=np.concatenate([agreeing.supports, np.full(m, float(np.median(given.supports)))]),
+    )
+
+
+def _follow(turns: FloatArray, gravity: Gravity) -> FloatArray:
+    """Return M_i (k, 4): R_W R_i^T after the smallest turn that takes the gravity down."""
+    world = Rotation.from_quat(turns[-1]) * Rotation.from_quat(turns[gravity.indices]).inv()
+    return np.asarray((_shortest_turns(world.apply(gravity.directions), DOWN) * world).as_quat())
+
+
+def _shortest_turns(sources: FloatArray, target: FloatArray) -> Rotation:
+    """Return the smallest rotations that take unit vectors (k, 3) to one."""
+    axes = np.cross(sources, target)
+    sines = np.linalg.norm(axes, axis=1)
+    opposite = sines < 1e-12
+    axes[opposite] = np.cross(target, np.eye(3)[int(np.argmin(np.abs(target)))])
+    angles = angle_between(sources, np.broadcast_to(target, sources.shape))
+    return Rotation.from_rotvec(angles[:, None] * normalized(axes))

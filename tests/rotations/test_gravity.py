@@ -1,0 +1,141 @@
+"""Gravity as a term of the averaging: rotations get better and upright, and wrong gravities do no harm."""
+
+import sqlite3
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from sfm_shapefit.colmap.gravity import database_gravity, table_gravity
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands.stages.gravity import refine_with_gravity
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
+from sfm_shapefit.rotations.average import average_relative_rotations
+from sfm_shapefit.rotations.gravity import DOWN, Gravity, judge_gravity
+from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
+from tests.scenes import BUNDLED, RING
+
+SIGMA_DEG = 0.5
+
+
+def drifting_chain(num_images=60, wrong_gravities=0.0):
+    """A chain whose pairs are six times as noisy as they state, with a measured gravity of each camera."""
+    pairs = np.array([(i, j) for i in range(num_images) for j in range(i + 1, min(num_images, i + 4))])
+    problem = rotation_problem(num_images, pairs, wrong_share=0.1, noise=6.0, seed=3)
+    rng = np.random.default_rng(1)
+    noise = Rotation.from_rotvec(np.radians(SIGMA_DEG) * rng.standard_normal((num_images, 3)))
+    directions = noise.apply(problem.rotations @ DOWN)
+    wrong = rng.uniform(size=num_images) < wrong_gravities
+    directions[wrong] = normalized(rng.standard_normal((int(wrong.sum()), 3)))
+    sigmas = np.full(num_images, np.radians(SIGMA_DEG))
+    return problem, Gravity(np.arange(num_images), directions, sigmas), wrong
+
+
+def median_error_deg(rotations, truth):
+    turn = mean_rotation_l1(rotations.transpose(0, 2, 1) @ truth)
+    return np.median(rotation_angles_deg((rotations @ turn).transpose(0, 2, 1) @ truth))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_gravity_halves_the_errors_of_a_drifting_chain_and_wrong_ones_are_found(share):
+    problem, gravity, wrong = drifting_chain(wrong_gravities=share)
+    without = average_relative_rotations(60, problem.relative)
+    found = refine_with_gravity(without, problem.relative, gravity)
+    before, after = (median_error_deg(one.rotations, problem.rotations) for one in (without, found))
+    assert after < 0.5 * before
+    # A gravity that is off by sigma about two axes tilts by 1.18 sigma in the median; neighbors share theirs.
+    tilts = angle_between_deg(found.rotations @ DOWN, problem.rotations @ DOWN)
+    assert np.median(tilts) < 1.18 * SIGMA_DEG
+    named = judge_gravity(found.rotations, gravity)[1]
+    assert named[wrong].all()
+    assert named[~wrong].sum() <= 1
+    assert np.median(found.sigmas_deg) < np.median(without.sigmas_deg)
+
+
+def test_one_gravity_says_too_little():
+    problem, gravity, _ = drifting_chain(12)
+    without = average_relative_rotations(12, problem.relative)
+    assert refine_with_gravity(without, problem.relative, gravity.among(np.array([3]))) is without
+
+
+def test_gravities_of_a_rig_are_those_of_its_frames():
+    sensors = Rotation.random(4, random_state=0).as_matrix()
+    frames = Rotation.random(2, random_state=1).as_matrix()
+    frame_of_image = np.array([0, 0, 1, 1])
+    own = np.einsum("kab,kbc,c->ka", sensors, frames[frame_of_image], DOWN)
+    found = Gravity(np.arange(4), own, np.array([0.2, 0.1, 0.1, 0.2])).of_frames(frame_of_image, sensors)
+    np.testing.assert_allclose(found.directions, frames @ DOWN, atol=1e-12)
+    np.testing.assert_array_equal(found.sigmas, [0.1, 0.1])
+
+
+def up_in(model):
+    """The z axis of the true world in a model of the ring."""
+    truth = read_model(RING / "sparse" / "0")
+    ours = [model.find_image_with_name(name).cam_from_world().rotation.matrix() for name in truth.names]
+    turn = mean_rotation_l1(np.array(ours).transpose(0, 2, 1) @ truth.rotations)
+    return turn[:, 2]
+
+
+def test_map_delivers_an_upright_model_and_names_a_wrong_gravity():
+    found = sfm_shapefit.map_database(RING / "database.db", gravity=str(BUNDLED / "gravity.txt"))
+    located = found.models[0].located
+    # The mean of seven gravities, each 1 deg off per axis, is off by 1.18 / sqrt(7) deg in the median.
+    assert angle_between_deg(up_in(located.reconstruction), np.array([0.0, 0.0, 1.0])) < 3 * 1.18 / np.sqrt(7)
+    assert located.gauge.statement.endswith("; z up by 7 of 8 gravities")
+    assert any("1 of 8 images contradict their rotations and have no part" in w for w in located.warnings)
+    assert any("0006.jpg" in w for w in located.warnings)
+    centers = [
+        located.reconstruction.find_image_with_name(r.name).projection_center() for r in located.cameras
+    ]
+    np.testing.assert_allclose([row.center for row in located.cameras], centers, atol=1e-12)
+    np.testing.assert_allclose(located.gauge.apply(located.placement.locations), centers, atol=1e-3)
+
+
+def test_the_gravity_of_pose_priors_is_read(tmp_path):
+    path = tmp_path / "database.db"
+    path.write_bytes((RING / "database.db").read_bytes())
+    model = read_model(RING / "sparse" / "0")
+    with pytest.raises(InputError, match="has no gravity of its images; give a table with --gravity"):
+        database_gravity(path, model)
+    with pycolmap.Database.open(path) as database:
+        for image in database.read_all_images():
+            prior = pycolmap.PosePrior(gravity=[0.0, 2.0, 0.0], corr_data_id=image.data_id)
+            database.write_pose_prior(prior)
+    found = database_gravity(path, model)
+    np.testing.assert_array_equal(found.indices, np.arange(8))
+    np.testing.assert_array_equal(found.directions, np.tile([0.0, 1.0, 0.0], (8, 1)))
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE pose_priors SET gravity = x'00'")
+    with pytest.raises(InputError, match=r"the gravity of image .* is damaged"):
+        database_gravity(path, model)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("0001.jpg 0 1", "line 1: expected the name of an image, three components"),
+        ("0001.jpg 0 1 0\n0002.jpg 0 down 0", "line 2: expected the name of an image"),
+        ("0001.jpg 0 0 0", "line 1: the direction must be finite and not zero"),
+        ("0001.jpg 0 nan 0", "line 1: the direction must be finite"),
+        ("0001.jpg 0 1 0 -2", "the standard deviation between 0 and 90 deg"),
+        ("0001.jpg 0 1 0\n0001.jpg 0 1 0", "line 2: 0001.jpg stands twice; keep one of its gravities"),
+        ("other.jpg 0 1 0", "has no gravity of the model's images, such as 0001.jpg"),
+    ],
+)
+def test_a_bad_table_is_refused(tmp_path, text, said):
+    (tmp_path / "gravity.txt").write_text(text)
+    with pytest.raises(InputError) as refused:
+        table_gravity(tmp_path / "gravity.txt", read_model(RING / "sparse" / "0"))
+    assert said in str(refused.value)
+
+
+def test_a_table_may_have_a_header_and_sigmas(tmp_path):
+    (tmp_path / "gravity.csv").write_text(
+        "name,x,y,z,sigma\n0002.jpg,0,3,0,2\n0001.jpg,0,0,1\nno.jpg,1,0,0\n"
+    )
+    found = table_gravity(tmp_path / "gravity.csv", read_model(RING / "sparse" / "0"))
+    np.testing.assert_array_equal(found.directions, [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(np.degrees(found.sigmas), [1.0, 2.0])
