@@ -452,7 +452,8 @@ def _matched_keypoints(
         ends[rows] = own[rows] + shifts
         is_matched[ends[rows]] = True
     matched = np.flatnonzero(is_matched)
-    place = np.cumsum(is_matched, dtype=number) - number(1)
+    place: IntArray = np.cumsum(is_matched, dtype=number)
+    place -= 1
     for first in range(0, len(ends), _MATCHES_A_SLICE):
         rows = slice(first, first + _MATCHES_A_SLICE)
         ends[rows] = place[ends[rows]]

@@ -681,7 +681,13 @@ class PairRows(NamedTuple):
 
     def subset(self, chosen: IntArray) -> "PairRows":
         """Return the chosen pairs."""
-        return PairRows(*(column[chosen] for column in self))
+        return PairRows(
+            pairs=self.pairs[chosen],
+            rowids=self.rowids[chosen],
+            swapped=self.swapped[chosen],
+            configs=self.configs[chosen],
+            num_inliers=self.num_inliers[chosen],
+        )
 
     @property
     def has_matches(self) -> BoolArray:
