@@ -9,24 +9,13 @@ each half turns the frames by itself (common turns of all frames taken off):
     agreement   d_f^1 . d_f^2 / 3        has the mean |e_f|^2 / 3 = sigma^2, whatever the noise is
     chance      |d_f^1 - d_f^2|^2 / 12   has the mean of |n_f|^2 / 3 for all points together
 
-Noise that neighboring keypoints share is in both, other than in a covariance from residuals.
+Noise that neighboring keypoints share is in both, other than in a covariance from residuals. If the median
+agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
+away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it.
 
-Single frames first. A few that are far off must not say what is usual, so that is the median agreement over
-what it is of a normal error. With the noise s^2 of a half, |d_f^1 + d_f^2|^2 / 6 has the mean 2 sigma^2 + s^2
-and |d_f^1 - d_f^2|^2 / 6 has s^2, both by three degrees of freedom. Frames differ in noise, and three
-numbers hardly tell it: it is drawn towards what is common, as far as the frames' own numbers say that it
-is (Smyth, "Linear models and empirical Bayes methods for assessing differential expression", 2004): if
-1 / s^2 is spread by nu degrees of freedom, the numbers are s_0^2 F(3, nu), and their quartiles tell nu and
-s_0. With what is usual for sigma^2 the ratio of the former to 2 sigma^2 + s^2 is F(3, m), where s^2 has
-nu + 3 degrees of freedom and the sum m = (nu + 3) (1 + 2 sigma^2 / s^2)^2 (Satterthwaite). A frame beyond
-what that gives to any one of all frames once in a hundred times has its agreement for its sigma^2, and no
-part in what follows.
-
-Then all others. If their median agreement does not exceed their median chance, freeing the rotations brings
-more noise than it takes errors away: they are held, and what that leaves open is what is usual. Otherwise
-sigma^2 is their mean agreement, and the adjustment weighs rotations by it. Where single frames are off and
-the others would be held, all are weighted: those by their own sigma, the others by what is usual, and by a
-tenth of the chance at least, which is a hundred times what the matches say of them.
+What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
+one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
+right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance.
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
@@ -36,7 +25,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc, fdtri
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import rotation_vectors
@@ -56,11 +44,10 @@ _LEAST_REDUNDANCY = 0.1
 _MEDIAN_LENGTH = 1.1774
 # Of a normal error in space, the median square over the mean.
 _MEDIAN_SQUARE = 0.7887
-# How probable it may be that any frame at all is singled out by chance.
-_FALSE_ALARM = 0.01
-_FREEDOM = 3.0
-# Of the chance: rotations that pull by that stay what they are, for all that the matches say.
-_AS_GOOD_AS_HELD = 0.1
+# An agreement of so many times its chance is three standard deviations beyond 0.
+_CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
+# Of a normal error in space, the mean square is once in 300 times larger than so many variances per axis.
+_RARE = 4.6
 
 
 class RotationWeight(NamedTuple):
@@ -102,13 +89,12 @@ class RotationErrors:
     """What the matches say of the given rotations; standard deviations per axis."""
 
     sigma_rad: float
-    """Of the given rotations' errors but those that are clearly larger; 0 where all are held."""
-    is_chance: bool = True
-    """Whether chance explains what the matches would change, but for frames that are clearly off."""
+    """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
     chance_rad: float
     """Median over the frames of what chance turns them by, all points together."""
     frame_sigmas_rad: FloatArray
-    """(n,) of the errors of each frame's rotation: what is usual, or what the halves clearly say of it."""
+    """(n,) of the errors of each frame's rotation: the same, the median where chance explains it, or what the
+    halves clearly say of the frame."""
     noise_px: float
     """Of an observation, from the median of all errors with free rotations."""
     num_frames: int
@@ -149,48 +135,19 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         )
     agreement = np.einsum("fa,fa->f", first, second) / 3.0
     chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
-    usual = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0)
-    clear = _are_clearly_off(first, second, usual) & (agreement > usual)
-    rest, by_chance = agreement[~clear], float(np.median(chance[~clear]))
-    is_chance = bool(np.median(rest) <= by_chance)
-    if not is_chance:
-        variance = open_variance = max(float(rest.mean()), usual)
-    elif clear.any():
-        variance = open_variance = max(usual, _AS_GOOD_AS_HELD**2 * by_chance)
-    else:
-        variance, open_variance = 0.0, usual
+    is_chance = np.median(agreement) <= np.median(chance)
+    variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
+    open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
     variances = np.full(problem.num_frames, open_variance)
-    variances[known] = np.where(clear, agreement, open_variance)
+    clear = agreement > np.maximum(_CLEAR * np.maximum(chance, np.median(chance)), _RARE * open_variance)
+    variances[known] = np.where(clear, agreement, variances[known])
     return RotationErrors(
         sigma_rad=float(np.sqrt(variance)),
-        is_chance=is_chance,
-        chance_rad=float(np.sqrt(by_chance)),
+        chance_rad=float(np.sqrt(np.median(chance))),
         frame_sigmas_rad=np.sqrt(variances),
         noise_px=noise_px,
         num_frames=len(first),
     )
-
-
-def _are_clearly_off(first: FloatArray, second: FloatArray, usual: float) -> BoolArray:
-    """Return which frames (n,) turn more in both halves, by (n, 3) each, than a usual variance explains."""
-    both, apart = (np.sum(d**2, axis=1) / 6.0 for d in (first + second, first - second))
-    low, middle, high = np.maximum(np.percentile(apart, [25.0, 50.0, 75.0]), 1e-300)
-    nu = _spread_of_noise(float(high / low))
-    common = middle / fdtri(_FREEDOM, nu, 0.5)
-    noise = (nu * common + _FREEDOM * apart) / (nu + _FREEDOM)
-    freedom = (nu + _FREEDOM) * (1.0 + 2.0 * usual / noise) ** 2
-    chance = fdtrc(_FREEDOM, freedom, both / (2.0 * usual + noise))
-    return np.asarray(len(first) * chance < _FALSE_ALARM)
-
-
-def _spread_of_noise(quartiles: float) -> float:
-    """Return nu of an F(3, nu) whose upper quartile is so many times its lower one, in [1, 1e6]."""
-    low, high = 1.0, 1e6
-    while high > 1.001 * low:
-        nu = float(np.sqrt(low * high))
-        wider = fdtri(_FREEDOM, nu, 0.75) / fdtri(_FREEDOM, nu, 0.25) > quartiles
-        low, high = (nu, high) if wider else (low, nu)
-    return low
 
 
 def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:

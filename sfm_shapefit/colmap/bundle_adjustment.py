@@ -68,7 +68,6 @@ from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import METRIC_SIGMA
 from sfm_shapefit.known_positions import KnownPositions
-from sfm_shapefit.wording import counted
 
 # Of the Cauchy loss, in pixel thresholds, for the errors to choose from.
 _SCALES = (0.0625, 0.125, 0.25)
@@ -185,14 +184,6 @@ class AdjustedPlacement:
         chance = f"{math.degrees(self.errors.chance_rad):.2g} deg"
         if self.weight.hold:
             return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
-        if self.errors.is_chance:
-            frames = counted(int(self.weight.singled_out(len(self.frame_ids)).sum()), "frame")
-            open_deg = math.degrees(self.errors.sigma_rad)
-            return (
-                f"centers, points and rotations adjusted: the matches put the given rotations of {frames} "
-                f"clearly off, which were weighted by that; the others, which freed would turn by chance "
-                f"({chance}), were weighted by the {open_deg:.2g} deg that they leave open"
-            )
         sigma_deg = math.degrees(self.errors.sigma_rad)
         return (
             f"centers, points and rotations adjusted: the matches put the given rotations off by "

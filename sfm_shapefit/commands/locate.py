@@ -150,7 +150,7 @@ class Locating(NamedTuple):
     """Relative rotations of pairs as far as they were measured with these intrinsics; None: not at all."""
     sensors: Mapping[int, SensorSigma] = NO_SENSORS
     """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
-    rigs: "Mapping[int, pycolmap.Rigid3d] | None" = None
+    rigs: Mapping[int, Any] | None = None
     """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
     control: ControlPoints | None = None
     """Ground control points of the images."""

@@ -43,7 +43,7 @@ from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.results.rigs import sensors_of
 from sfm_shapefit.results.scene_words import describe_repeated_pairs, describe_rival_pairs
-from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
+from sfm_shapefit.rotations.arrangements import agreeing_pairs, choose_arrangement, evidence_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.gravity import Gravity
@@ -403,7 +403,13 @@ class _Run(NamedTuple):
         gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
+        among = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
+        among = replace(among, pairs=np.searchsorted(members, among.pairs))
         inputs = self.inputs_of(model)
+        if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
+            false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
+            names = {tuple(sorted((model.names[i], model.names[j]))) for i, j in false}
+            inputs = replace(inputs, left_out=inputs.left_out | names)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
@@ -417,10 +423,8 @@ class _Run(NamedTuple):
                 sensors = first.adjusted.sensors
                 source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            measured = None
-            if self.options.relative_rotations == "matches" and same_intrinsics(source.model, model):
-                measured = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-                measured = replace(measured, pairs=np.searchsorted(members, measured.pairs))
+            is_measured = self.options.relative_rotations == "matches"
+            is_measured &= same_intrinsics(source.model, model)
             locating = Locating(
                 inputs,
                 rigid,
@@ -432,7 +436,7 @@ class _Run(NamedTuple):
                 rigs=sensors_of(model.reconstruction),
                 control=control,
                 gravity=gravity,
-                relative=measured,
+                relative=among if is_measured else None,
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))

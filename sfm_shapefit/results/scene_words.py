@@ -44,8 +44,8 @@ def describe_doubtful_pairs(count: int) -> str:
 def describe_repeated_pairs(count: int) -> str:
     """Say that pairs of a folded arrangement were not followed."""
     return (
-        f"the scene repeats itself: {counted(count, 'pair')} would fold the images together: they lack "
-        "matches that such pairs should share, and were not followed"
+        "the scene repeats itself: pairs that would fold the images together were not followed "
+        f"({counted(count, 'pair')}), as they lack matches that such pairs should share"
     )
 
 

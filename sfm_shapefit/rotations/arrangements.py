@@ -143,10 +143,15 @@ def choose_arrangement(
     return Chosen(averaged, nothing, best.agree & ~plain.agree)
 
 
-def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:
-    """Return which pairs agree with averaged rotations, and what speaks for them."""
+def agreeing_pairs(relative: RelativeRotations, averaged: AveragedRotations) -> BoolArray:
+    """Return which pairs agree with averaged rotations within 5 degrees, (k,)."""
     i, j = relative.pairs.T
     predicted = averaged.rotations[j] @ averaged.rotations[i].transpose(0, 2, 1)
     angles = rotation_angles_deg(relative.rotations.transpose(0, 2, 1) @ predicted)
-    agree = averaged.registered[i] & averaged.registered[j] & (angles <= AGREEMENT_DEG)
-    return Arrangement(averaged, np.asarray(agree), float(evidence[agree].sum()))
+    return np.asarray(averaged.registered[i] & averaged.registered[j] & (angles <= AGREEMENT_DEG))
+
+
+def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:
+    """Return which pairs agree with averaged rotations, and what speaks for them."""
+    agree = agreeing_pairs(relative, averaged)
+    return Arrangement(averaged, agree, float(evidence[agree].sum()))
