@@ -68,7 +68,6 @@ from sfm_shapefit.results.warnings import (
     trust_warnings,
 )
 from sfm_shapefit.rotations.gravity import Gravity
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -146,8 +145,6 @@ class Locating(NamedTuple):
     """Of these centers, in their units."""
     intrinsics: Intrinsics = NO_DOUBTS
     """Which of the images' are in doubt, and what became of them so far."""
-    relative: RelativeRotations | None = None
-    """Relative rotations of pairs as far as they were measured with these intrinsics; None: not at all."""
     sensors: Mapping[int, SensorSigma] = NO_SENSORS
     """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
     rigs: Mapping[int, Any] | None = None
@@ -181,7 +178,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         source, directions, located, known, options, clock
     )
     with clock("trust"):
-        relative = ask_pairs(source, directions, options, known.relative)
+        relative = ask_pairs(source, directions, options)
         # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
         asked = (source, directions) if known.intrinsics.free.doubts else before
         focal_doubts = question_focal_lengths(*asked, options)

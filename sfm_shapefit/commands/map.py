@@ -20,7 +20,7 @@ from sfm_shapefit.colmap.bundle_adjustment import NO_SENSORS, Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
-from sfm_shapefit.colmap.model import PosedModel, read_model, same_intrinsics
+from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
@@ -423,8 +423,6 @@ class _Run(NamedTuple):
                 sensors = first.adjusted.sensors
                 source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            is_measured = self.options.relative_rotations == "matches"
-            is_measured &= same_intrinsics(source.model, model)
             locating = Locating(
                 inputs,
                 rigid,
@@ -436,14 +434,18 @@ class _Run(NamedTuple):
                 rigs=sensors_of(model.reconstruction),
                 control=control,
                 gravity=gravity,
-                relative=among if is_measured else None,
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
         unknown = (np.nan, np.nan)
         scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
-        return replace(found, triplet_scores=scores[:, 0], matched_shares=scores[:, 1])
+        return replace(
+            found,
+            triplet_scores=scores[:, 0],
+            matched_shares=scores[:, 1],
+            suspicions=tuple(_suspicions(averaging)),
+        )
 
     def inputs_of(self, model: PosedModel) -> Inputs:
         """Return what the images of a component are located from."""
@@ -482,6 +484,14 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
+
+
+def _suspicions(averaging: AveragedRotations) -> Iterator[str]:
+    """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
+    if averaging.num_repeated:
+        yield "the scene repeats itself, and pairs that would fold it were not followed"
+    if averaging.num_rivals:
+        yield "the images can be arranged in another way"
 
 
 def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:

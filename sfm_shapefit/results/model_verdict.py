@@ -15,6 +15,7 @@ placed but are not in the output. Look also, though no camera can be named, if
     many rejected pairs agree on a second configuration
     the matches of a camera prefer another focal length than the given one
     fewer than three quarters of the observations see a 3D point
+    the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
 Otherwise the model is good. On thirteen real scenes with good rotations 62 to 99.8 % of the observations see
 a point (least of all images of several facing cameras in a park), and 45 to 100 % of the pairs agree: wrong
@@ -98,7 +99,7 @@ def judge_model(found: "LocateResult") -> ModelVerdict:
     lenses = tuple(
         f"the matches of camera {d.camera} prefer another focal length" for d in found.focal_doubts
     )
-    return _judge(found.placement, shares, outside, lenses + repeats)
+    return _judge(found.placement, shares, outside, lenses + repeats + found.suspicions)
 
 
 def judge_graph(found: "GraphResult") -> ModelVerdict:

@@ -141,6 +141,8 @@ class LocateResult(Displayed):
     """The sensors that were refined in their rigs."""
     control_points: tuple[ControlPoint, ...] = ()
     """Ground control points with their residuals, where some are given."""
+    suspicions: tuple[str, ...] = ()
+    """What those who gave the rotations saw that speaks against the model, for its verdict."""
     join: Join | None = None
     """What came of joining it to a larger model of `map`."""
 

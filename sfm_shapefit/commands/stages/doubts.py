@@ -43,15 +43,9 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource,
-    directions: PairDirections,
-    options: LocateOptions,
-    measured: RelativeRotations | None = None,
+    source: MatchSource, directions: PairDirections, options: LocateOptions
 ) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
-
-    Those that were `measured` already, with the intrinsics that the images have, are not measured again.
-    """
+    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
     if options.rotations == "measured" or source.kind == "relative-poses":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
@@ -59,11 +53,7 @@ def ask_pairs(
         return concatenate([])
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
-    if measured is not None:
-        known = [tuple(pair) in wanted for pair in measured.pairs.tolist()]
-        parts = [measured.subset(np.flatnonzero(known))]
-        wanted -= {tuple(pair) for pair in parts[0].pairs.tolist()}
-    for batch in source.batches() if wanted else ():
+    for batch in source.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         parts.append(estimate_relative_rotations(rays, options.num_threads()))
