@@ -27,14 +27,14 @@ Rendered scenes with sides or houses alike, mean error of the rotations in degre
     tower, 5 of 8                      40      82, 35     none          144 -> 166
     courtyard, 7 of 12 houses          36      78, 25     .05, 0         20 -> 161
 
-Rotations that are right do not make all centers right: the first tower is placed to .0010 m, but the parts of
-the second stand .3 to 1.5 m off against one another, and of the courtyard 20 cameras are kept, .4 m off. So no
+Right rotations do not make all centers right: the first tower is placed to .0010 m, but the parts of the
+second stand .3 to 1.5 m off against one another, and of the courtyard 20 cameras are kept, .4 m off. So no
 model of another arrangement is called good.
 
-The first three scenes chose the form, all six that half and third. None is taken, as it should be, on the
-facade and the courtyard of half their houses alike, the drive, castle-P19, castle-P30, lego100, liberty,
-fountain-P11, Herz-Jesus-P25, brighton-beach, and the bundled scenes: there no other arrangement keeps all
-images and reaches half of the largest evidence (0.48 at most).
+The first tower and a courtyard of half its houses alike chose the form, all six scenes that half and third.
+None is taken, as it should be, on the facade and the courtyard of half their houses alike, the drive,
+castle-P19, castle-P30, lego100, liberty, fountain-P11, Herz-Jesus-P25, brighton-beach, and bundled scenes:
+there no other arrangement keeps all images and reaches half of the largest evidence (0.48 at most).
 
 Sources: missing correspondences as evidence are Zach, Irschara, Bischof's (CVPR 2008); choosing among whole
 reconstructions by them, after the fact, is Heinly, Dunn, Frahm, "Correcting for duplicate scene structure in
