@@ -74,16 +74,16 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
     figures: Rows = []
     details: Rows = [("pairs", f"{counted(found.num_pairs, 'pair')} with a relative rotation")]
     for number, model in enumerate(found.models):
-        located = model.located
+        located, facts = model.located, model.located.summary()
         title = [(f"model {number}", located.verdict.statement)] if several else []
         figures += [
             *title,
-            *figure_rows(located.summary()),
-            ("points", describe_points(located.summary())),
-            *intrinsics_rows(located.summary()),
-            *rig_rows(located.summary()),
-            *control_point_rows(located.summary()),
-            *scene_rows(located.summary()),
+            *figure_rows(facts),
+            ("points", describe_points(facts)),
+            *intrinsics_rows(facts),
+            *rig_rows(facts),
+            *control_point_rows(facts),
+            *scene_rows(facts),
             *[("warning", warning) for warning in located.warnings],
         ]
         details += [

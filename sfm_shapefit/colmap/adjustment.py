@@ -26,7 +26,6 @@ from sfm_shapefit.known_positions import KnownPositions
 
 # Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
 _TRACKS_A_BLOCK = 20_000
-_FEWEST_IMAGES_OF_A_CHECKED_TRACK = 3
 # Of a track: the share of the pixel threshold that a match may miss by, and the points it may be of. Where a
 # fifth of the matches is wrong, those within the whole threshold join a third of all observations to long
 # chains: on a made facade (a fifth wrong), fountain-P11, castle-P30 and lego100 the share 1 finds 3.6, 0.1,
@@ -233,8 +232,7 @@ def triangulate_in_blocks(
     )
     poses = frames.poses()
     tracks = _matched_keypoints(frames, seed, matches).join(poses, _JOINING_SHARE * limits.max_error_px)
-    checked = options.ignore_two_view_tracks and len(frames.image_ids) >= _FEWEST_IMAGES_OF_A_CHECKED_TRACK
-    chosen = np.flatnonzero(tracks.lengths() >= (_FEWEST_IMAGES_OF_A_CHECKED_TRACK if checked else 2))
+    chosen = np.flatnonzero(tracks.lengths() >= options.fewest_views(len(frames.image_ids)))
     for first in range(0, len(chosen), _TRACKS_A_BLOCK):
         block = tracks.subset(chosen[first : first + _TRACKS_A_BLOCK])
         add_points(seed, frames, block, triangulate_tracks(block, poses, limits))

@@ -82,7 +82,6 @@ _FINE_TIMES = 3
 _FINE = 0.9
 # So often lenses are held that turn out to be left open, and all is solved for again.
 _MOST_REPETITIONS = 2
-_FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
 # With more frames, the standard deviations would take longer than all the rest.
 _MOST_FRAMES = 2_000
 _FREE = RotationWeight()
@@ -425,9 +424,8 @@ class _Run:
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
-        few = len(self.frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
-        checks = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
-        fewest = _FEWEST_IMAGES_OF_A_CHECKED_POINT if checks else 2
+        is_matched = isinstance(self.source, MatchedKeypoints)
+        fewest = options.fewest_views(len(self.frames.image_ids)) if is_matched else 2
         self.checked_length = max(options.min_track_length, fewest)
 
     def frees_more_than_poses(self) -> bool:

@@ -22,6 +22,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
+from sfm_shapefit.colmap.model import sensors_of
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
 from sfm_shapefit.colmap.seed import transform_model
 from sfm_shapefit.colmap.structure import TrackSource, triangulate
@@ -128,9 +129,7 @@ def _solve(
 
 def _mean_baseline(reconstruction: pycolmap.Reconstruction) -> float:
     """Return the mean distance of all sensors from the references of their rigs."""
-    rigs = reconstruction.rigs.values()
-    poses = [pose for rig in rigs for pose in rig.non_ref_sensors.values() if pose is not None]
-    return float(np.mean([np.linalg.norm(pose.translation) for pose in poses]))
+    return float(np.mean([np.linalg.norm(pose.translation) for pose in sensors_of(reconstruction).values()]))
 
 
 def _has_offsets(rig: pycolmap.Rig) -> bool:

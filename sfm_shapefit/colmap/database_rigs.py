@@ -18,6 +18,7 @@ import pycolmap
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, NO_ID, is_between, readonly_rows
+from sfm_shapefit.colmap.model import sensors_of
 from sfm_shapefit.errors import InputError
 
 _CAMERA = 0
@@ -57,9 +58,7 @@ class DatabaseRigs:
 
     def with_sensors_of(self, model: pycolmap.Reconstruction) -> "DatabaseRigs":
         """Return the same with the poses that sensors have in a model, where it has them."""
-        poses = {
-            sensor.id: pose for rig in model.rigs.values() for sensor, pose in rig.non_ref_sensors.items()
-        }
+        poses = sensors_of(model)
         rigs = {rig_id: self.renumbered(rig_id, rig_id) for rig_id in self.rigs}
         for rig in rigs.values():
             for sensor in rig.non_ref_sensors:

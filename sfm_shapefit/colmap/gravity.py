@@ -11,11 +11,11 @@ import numpy as np
 
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.colmap.priors import PRIORS_OF_IMAGES
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, lines_of_cells
 from sfm_shapefit.rotations.gravity import Gravity
 
-_SENSOR_IS_CAMERA = 0
 _SIGMA_DEG = 1.0
 _LARGEST = 1e30
 _FORM = "the name of an image, three components of its gravity and at most a standard deviation in degrees"
@@ -60,8 +60,7 @@ def database_gravity(path: Path, model: PosedModel) -> Gravity:
     Raises:
         InputError: if the database has none of these images, or a damaged one.
     """
-    by_data = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
-    query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {by_data}"
+    query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {PRIORS_OF_IMAGES}"
     index_of_name = {name: index for index, name in enumerate(model.names)}
     found: dict[int, list[float]] = {}
     columns = ("corr_data_id", "corr_sensor_type", "gravity")

@@ -92,10 +92,16 @@ class PosedModel:
 
     def image_sizes(self) -> FloatArray:
         """Return width and height of each image in pixels, (n, 2)."""
-        cameras = [self.camera(k) for k in range(self.num_images)]
-        return np.array([[camera.width, camera.height] for camera in cameras], dtype=np.float64).reshape(
-            -1, 2
-        )
+        cameras = map(self.camera, range(self.num_images))
+        return np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+
+
+def sensors_of(reconstruction: pycolmap.Reconstruction) -> dict[int, pycolmap.Rigid3d]:
+    """Return the poses of all sensors in their rigs but the references, by the ids of their cameras."""
+    rigs = reconstruction.rigs.values()
+    return {
+        sensor.id: pose for rig in rigs for sensor, pose in rig.non_ref_sensors.items() if pose is not None
+    }
 
 
 def same_intrinsics(one: PosedModel, other: PosedModel) -> bool:

@@ -23,6 +23,8 @@ from sfm_shapefit.placement.gauge import Datum, PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
 _SENSOR_IS_CAMERA = 0
+PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
+"""What joins pose priors to their images, of databases whose priors may be of other sensors too."""
 # A row has name and position, and no standard deviation, one or three.
 _TABLE_COLUMNS = (4, 5, 7)
 _GEODETIC_NAMES = {"lat", "latitude"}
@@ -41,10 +43,9 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
     index_of_name = {name: index for index, name in enumerate(model.names)}
     selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
     by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
-    by_data = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
     # Of each version of the schema, the newest first, by the columns that it has.
     queries = {
-        ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, by_data),
+        ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, PRIORS_OF_IMAGES),
         ("image_id", covariances): selected.format(covariances, by_image),
         ("image_id", "position"): selected.format("NULL", by_image),
     }

@@ -64,7 +64,6 @@ _ROUNDING = 1e-9
 _TRACKS_A_TASK = 1000
 # It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
 _RANDOM_SEED = 0
-_IMAGES_OF_A_CHECKED_TRACK = 3
 # The triangulator only asks that there is a configuration of the two-view geometry.
 _CALIBRATED = 2
 
@@ -222,8 +221,7 @@ def _triangulate_matches(
     graph = correspondence_graph(structure, matches)
     settings = pycolmap.IncrementalTriangulatorOptions()
     settings.random_seed = _RANDOM_SEED
-    has_third_view = structure.num_reg_images() >= _IMAGES_OF_A_CHECKED_TRACK
-    settings.ignore_two_view_tracks = options.ignore_two_view_tracks and has_third_view
+    settings.ignore_two_view_tracks = options.fewest_views(structure.num_reg_images()) > 2
     settings.min_angle = options.min_triangulation_angle_deg
     settings.complete_max_reproj_error = error_px
     settings.merge_max_reproj_error = error_px

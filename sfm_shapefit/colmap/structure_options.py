@@ -34,6 +34,10 @@ class StructureOptions(Settings):
         "and only models of three images or more: two have no other matches.",
     )
 
+    def fewest_views(self, num_images: int) -> int:
+        """Return how many images must share a match of a database before it may make a point, 2 or 3."""
+        return 3 if self.ignore_two_view_tracks and num_images >= 3 else 2
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.0 < self.max_reprojection_error_px < float("inf"):

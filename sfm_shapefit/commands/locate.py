@@ -22,7 +22,7 @@ from sfm_shapefit.colmap.bundle_adjustment import (
     SensorSigma,
     Uncertainty,
 )
-from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
     pull_cameras,
@@ -58,7 +58,7 @@ from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.placement.tied_groups import measure_unit
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
-from sfm_shapefit.results.rigs import refined_rigs, sensors_of
+from sfm_shapefit.results.rigs import refined_rigs
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
     focal_warnings,

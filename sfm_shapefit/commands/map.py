@@ -20,7 +20,7 @@ from sfm_shapefit.colmap.bundle_adjustment import NO_SENSORS, Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
-from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
@@ -41,7 +41,6 @@ from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
-from sfm_shapefit.results.rigs import sensors_of
 from sfm_shapefit.results.scene_words import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.rotations.arrangements import agreeing_pairs, choose_arrangement, evidence_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -265,8 +264,8 @@ class _Run(NamedTuple):
 
     def share_of_doubted_lenses(self) -> float:
         """Return the share of images whose intrinsics are in doubt."""
-        images = [self.unposed.reconstruction.image(i) for i in self.unposed.image_ids.tolist()]
-        return float(np.mean([image.camera_id in self.intrinsics.free.doubts for image in images]))
+        cameras = map(self.unposed.camera, range(self.unposed.num_images))
+        return float(np.mean([camera.camera_id in self.intrinsics.free.doubts for camera in cameras]))
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
@@ -306,7 +305,9 @@ class _Run(NamedTuple):
 
         Why a frame belongs to none is written to `reasons`.
         """
-        waiting = _group_frames(num_frames, relative.pairs)
+        waiting, gravity = _group_frames(num_frames, relative.pairs), self.gravity
+        if gravity is not None:
+            gravity = gravity.of_frames(self.frame_of_image, self.sensor_rotations)
         while waiting:
             members = waiting.pop(0)
             least = self.options.min_model_size
@@ -318,15 +319,13 @@ class _Run(NamedTuple):
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
             with self.clock("rotation averaging"):
-                inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-                local = replace(inside, pairs=np.searchsorted(members, inside.pairs))
+                inside, local = _pairs_among(relative, members)
                 try:
                     answer = self.average(len(members), local, self.evidence_of(inside))
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
-                if self.gravity is not None:
-                    gravity = self.gravity.of_frames(self.frame_of_image, self.sensor_rotations)
+                if gravity is not None:
                     answer = refine_with_gravity(answer, local, gravity.among(members))
             left = members[~answer.registered]
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
@@ -403,10 +402,9 @@ class _Run(NamedTuple):
         gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
-        among = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-        among = replace(among, pairs=np.searchsorted(members, among.pairs))
         inputs = self.inputs_of(model)
         if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
+            _, among = _pairs_among(relative, members)
             false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
             names = {tuple(sorted((model.names[i], model.names[j]))) for i, j in false}
             inputs = replace(inputs, left_out=inputs.left_out | names)
@@ -486,6 +484,14 @@ class _Run(NamedTuple):
         return read_model(pose_at_origin(images, image_ids, rotations))
 
 
+def _pairs_among(
+    relative: RelativeRotations, members: IntArray
+) -> tuple[RelativeRotations, RelativeRotations]:
+    """Return the pairs among some images or frames, ascending, and the same by their place among these."""
+    inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
+    return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
+
+
 def _suspicions(averaging: AveragedRotations) -> Iterator[str]:
     """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
     if averaging.num_repeated:
@@ -545,7 +551,7 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
                 "trust it without a look"
             )
         if model.averaging.num_repeated:
-            yield (f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}")
+            yield f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
         if model.averaging.num_rivals:
             yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)

@@ -15,14 +15,6 @@ if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
 
 
-def sensors_of(model: "pycolmap.Reconstruction") -> "dict[int, pycolmap.Rigid3d]":
-    """Return the poses of all sensors in their rigs but the references, by the ids of their cameras."""
-    rigs = model.rigs.values()
-    return {
-        sensor.id: pose for rig in rigs for sensor, pose in rig.non_ref_sensors.items() if pose is not None
-    }
-
-
 def refined_rigs(
     given: "Mapping[int, pycolmap.Rigid3d]",
     found: "Mapping[int, pycolmap.Rigid3d]",

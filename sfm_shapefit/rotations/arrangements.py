@@ -149,10 +149,8 @@ def choose_arrangement(
 
 def agreeing_pairs(relative: RelativeRotations, averaged: AveragedRotations) -> BoolArray:
     """Return which pairs agree with averaged rotations within 5 degrees, (k,)."""
-    i, j = relative.pairs.T
-    predicted = averaged.rotations[j] @ averaged.rotations[i].transpose(0, 2, 1)
-    angles = rotation_angles_deg(relative.rotations.transpose(0, 2, 1) @ predicted)
-    return np.asarray(averaged.registered[i] & averaged.registered[j] & (angles <= AGREEMENT_DEG))
+    known = averaged.registered[relative.pairs].all(axis=1)
+    return np.asarray(known & (relative.residuals_deg(averaged.rotations) <= AGREEMENT_DEG))
 
 
 def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:

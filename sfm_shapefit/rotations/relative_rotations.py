@@ -6,6 +6,7 @@ from typing import Any, Self
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import rotation_angles_deg
 
 SOUND = 2.0
 """Least W ln n of a pair that is believed."""
@@ -35,6 +36,12 @@ class RelativeRotations:
             field.name: getattr(self, field.name) for field in fields(RelativeRotations)
         }
         return replace(self, **{name: column[rows] for name, column in columns.items()})
+
+    def residuals_deg(self, rotations: FloatArray) -> FloatArray:
+        """Return the angle between each pair's rotation and that of absolute rotations (n, 3, 3), (k,)."""
+        i, j = self.pairs.T
+        predicted = rotations[j] @ rotations[i].transpose(0, 2, 1)
+        return rotation_angles_deg(self.rotations.transpose(0, 2, 1) @ predicted)
 
     def are_sound(self, least: float = SOUND) -> BoolArray:
         """Return which pairs to believe, (k,): W ln n >= least, and W >= 0.4."""

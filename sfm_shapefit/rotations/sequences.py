@@ -24,7 +24,6 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
@@ -213,8 +212,7 @@ def _compare(
 ) -> tuple[FloatArray, FloatArray]:
     """Return by how many degrees loops are off the chain, NaN where it ends, and by how many they may be."""
     i, j = loops.pairs.T
-    predicted = averaged.rotations[j] @ averaged.rotations[i].transpose(0, 2, 1)
-    angles = rotation_angles_deg(loops.rotations.transpose(0, 2, 1) @ predicted)
+    angles = loops.residuals_deg(averaged.rotations)
     variances = averaged.sigmas_deg[i] ** 2 + averaged.sigmas_deg[j] ** 2
     _, lags = _lags(videos, loops.pairs)
     tolerances = np.maximum(AGREEMENT_DEG, _MOST_SIGMAS * np.sqrt(variances)) + _DRIFT_DEG * lags

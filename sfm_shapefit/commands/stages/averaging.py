@@ -27,7 +27,6 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.rotation_averaging import Loss, average_rotations
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.locate_options import LEAST_MATCHES
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
@@ -113,8 +112,7 @@ def _judge(relative: RelativeRotations, found: tuple[FloatArray, BoolArray], num
     sound = relative.are_sound()
     pairs = relative.subset(sound) if sound.any() else relative
     i, j = pairs.pairs.T
-    predicted = rotations[j] @ rotations[i].transpose(0, 2, 1)
-    residuals = rotation_angles_deg(pairs.rotations.transpose(0, 2, 1) @ predicted)
+    residuals = pairs.residuals_deg(rotations)
     both = registered[i] & registered[j]
     weights = np.sqrt(pairs.num_matches)
     agreeing = weights * (both & (residuals <= AGREEMENT_DEG))

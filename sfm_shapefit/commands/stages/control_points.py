@@ -1,6 +1,5 @@
 """Ground control points: read before the work, fitted at its end, when poses and intrinsics are final."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from sfm_shapefit.colmap.control_points import read_control_points, triangulate_control_points
@@ -44,8 +43,4 @@ def bring_to_control_points(
     if isinstance(fit, str):
         return seeded, rows, warnings
     turned = transform_model(seeded.reconstruction, fit.motion)
-    adjusted = seeded.adjusted
-    if adjusted is not None:
-        adjusted = replace(adjusted, reconstruction=turned)
-    gauge = control_gauge(seeded.gauge, known, fit)
-    return seeded._replace(reconstruction=turned, gauge=gauge, adjusted=adjusted), rows, warnings
+    return seeded.moved(turned, control_gauge(seeded.gauge, known, fit)), rows, warnings

@@ -76,7 +76,4 @@ def turn_model_upright(
         return seeded, tuple(warnings)
     statement = f"{seeded.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
     gauge = replace(seeded.gauge, axes=turn, statement=statement)
-    upright, adjusted = turn_model(seeded.reconstruction, turn), seeded.adjusted
-    if adjusted is not None:
-        adjusted = replace(adjusted, reconstruction=upright)
-    return seeded._replace(reconstruction=upright, gauge=gauge, adjusted=adjusted), tuple(warnings)
+    return seeded.moved(turn_model(seeded.reconstruction, turn), gauge), tuple(warnings)

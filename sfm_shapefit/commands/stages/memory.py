@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.colmap.database import KEPT_MATCHES
+from sfm_shapefit.colmap.database import BATCH, KEPT_MATCHES
 from sfm_shapefit.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.laplacian.cholesky import analyze
@@ -43,8 +43,6 @@ _OBSERVATION_BYTES = 620.0
 # Unknowns of an adjusted camera, and up to how many of them their system is dense.
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
 
-BATCH = 250_000
-"""Matches that are read at a time where memory is no concern."""
 RAYS_BYTES = 1_000_000_000
 """Of the rays of keypoints that are kept for the next pair, where memory is no concern."""
 _SMALL_BATCH, _FEW_RAYS_BYTES = 50_000, 50_000_000

@@ -79,6 +79,11 @@ class Seeded(NamedTuple):
     observations: ObservationShares
     """What of the keypoints matched in two other images sees a point, and what contradicts the cameras."""
 
+    def moved(self, reconstruction: "pycolmap.Reconstruction", gauge: Gauge) -> "Seeded":
+        """Return the same model in another gauge."""
+        adjusted = self.adjusted and replace(self.adjusted, reconstruction=reconstruction)
+        return self._replace(reconstruction=reconstruction, gauge=gauge, adjusted=adjusted)
+
 
 def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
