@@ -25,8 +25,8 @@ from sfm_shapefit.jit import inner_kernel, kernel
 
 
 @inner_kernel
-def _world_residual(measured: Any, at_i: Any, at_j: Any, out: Any) -> float:
-    """Fill out[:3] with log(R_j^T R_ij R_i) and return its squared length."""
+def relative_in_world(measured: Any, at_i: Any, at_j: Any) -> tuple[float, float, float, float]:
+    """Return R_j^T R_ij R_i of unit quaternions, (x, y, z, w): the identity if all three agree."""
     ax, ay, az, aw = measured[0], measured[1], measured[2], measured[3]
     bx, by, bz, bw = at_i[0], at_i[1], at_i[2], at_i[3]
     # p = R_ij R_i
@@ -40,6 +40,13 @@ def _world_residual(measured: Any, at_i: Any, at_j: Any, out: Any) -> float:
     y = cw * py - cx * pz + cy * pw + cz * px
     z = cw * pz + cx * py - cy * px + cz * pw
     w = cw * pw - cx * px - cy * py - cz * pz
+    return x, y, z, w
+
+
+@inner_kernel
+def _world_residual(measured: Any, at_i: Any, at_j: Any, out: Any) -> float:
+    """Fill out[:3] with log(R_j^T R_ij R_i) and return its squared length."""
+    x, y, z, w = relative_in_world(measured, at_i, at_j)
     sine = np.sqrt(x * x + y * y + z * z)
     if w < 0.0:
         x, y, z, w = -x, -y, -z, -w

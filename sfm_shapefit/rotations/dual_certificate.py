@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
-from sfm_shapefit.rotations.averaging_kernels import turn_cameras
+from sfm_shapefit.rotations.averaging_kernels import relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
 _TOLERANCE = 1e-6
@@ -201,17 +201,7 @@ def apply_certificate(pairs: Any, blocks: Any, diagonal: Any, x: Any, out: Any) 
 @inner_kernel
 def _around(measured: Any, at_i: Any, at_j: Any, e: Any) -> None:
     """Fill the matrix E = R_j^T R_ij R_i of unit quaternions."""
-    ax, ay, az, aw = measured[0], measured[1], measured[2], measured[3]
-    bx, by, bz, bw = at_i[0], at_i[1], at_i[2], at_i[3]
-    px = aw * bx + ax * bw + ay * bz - az * by
-    py = aw * by - ax * bz + ay * bw + az * bx
-    pz = aw * bz + ax * by - ay * bx + az * bw
-    pw = aw * bw - ax * bx - ay * by - az * bz
-    cx, cy, cz, cw = -at_j[0], -at_j[1], -at_j[2], at_j[3]
-    x = cw * px + cx * pw + cy * pz - cz * py
-    y = cw * py - cx * pz + cy * pw + cz * px
-    z = cw * pz + cx * py - cy * px + cz * pw
-    w = cw * pw - cx * px - cy * py - cz * pz
+    x, y, z, w = relative_in_world(measured, at_i, at_j)
     e[0, 0], e[0, 1], e[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
     e[1, 0], e[1, 1], e[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
     e[2, 0], e[2, 1], e[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
