@@ -14,7 +14,7 @@ nothing else of the user's. Pairs whose matches fit a homography say nothing, so
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from enum import Enum
 from pathlib import Path
@@ -28,6 +28,7 @@ from sfm_shapefit.colmap.adjustment import is_adjusted, lens_of
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
 from sfm_shapefit.colmap.quiet import quiet_stderr
+from sfm_shapefit.formats.pair_list import PairNames
 
 
 class Origin(Enum):
@@ -146,12 +147,15 @@ def differ_in_rays(one: PosedModel, other: PosedModel) -> bool:
     return False
 
 
-def calibrate_view_graph(database: Path, cameras: Collection[int]) -> dict[int, float]:
+def calibrate_view_graph(
+    database: Path, cameras: Collection[int], left_out: PairNames = frozenset()
+) -> dict[int, float]:
     """Return by which factors the fundamental matrices of a database want other focal lengths, by camera.
 
     Args:
         database: which is not changed.
         cameras: that are asked, by their id there; all others are held.
+        left_out: pairs of images that say nothing.
 
     Returns:
         Of the cameras whose pairs can tell.
@@ -159,7 +163,7 @@ def calibrate_view_graph(database: Path, cameras: Collection[int]) -> dict[int, 
     Raises:
         InputError: if the database cannot be read.
     """
-    tables = _read_tables(database)
+    tables = _read_tables(database, left_out)
     asked = _with_enough_pairs(tables, set(cameras))
     if not asked:
         return {}
@@ -184,23 +188,35 @@ def calibrate_view_graph(database: Path, cameras: Collection[int]) -> dict[int, 
 Rows = list[tuple[Any, ...]]
 
 
-def _read_tables(database: Path) -> dict[str, Rows]:
+def _read_tables(database: Path, left_out: PairNames) -> dict[str, Rows]:
     """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
     cameras = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
     images = ("image_id", "name", "camera_id")
     pairs = ("pair_id", "rows", "config", "F")
     where = "WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id"
+    most = _MOST_PAIRS + len(left_out)
     queries = {
         "cameras": (cameras, f"SELECT {', '.join(cameras)} FROM cameras"),
         "images": (images, f"SELECT {', '.join(images)} FROM images"),
         "two_view_geometries": (
             pairs,
-            f"SELECT pair_id, rows, config, F FROM two_view_geometries {where} LIMIT {_MOST_PAIRS}",
+            f"SELECT {', '.join(pairs)} FROM two_view_geometries {where} LIMIT {most}",
         ),
     }
-    return {
+    found = {
         table: readonly_rows(database, table, {needed: query}) for table, (needed, query) in queries.items()
     }
+    ids = {name: image_id for image_id, name, _ in found["images"]}
+    unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in _ends_of(left_out, ids)}
+    kept = [row for row in found["two_view_geometries"] if row[0] not in unwanted]
+    return found | {"two_view_geometries": kept[:_MOST_PAIRS]}
+
+
+def _ends_of(pairs: PairNames, ids: Mapping[str, int]) -> Iterator[tuple[int, int]]:
+    """Yield the ids of the images of pairs that the database has."""
+    for first, second in pairs:
+        if first in ids and second in ids:
+            yield ids[first], ids[second]
 
 
 def _with_enough_pairs(tables: Mapping[str, Rows], asked: set[int]) -> set[int]:

@@ -122,7 +122,7 @@ def locate(
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
         inputs = read_left_out(inputs, model.names, options)
-        model, intrinsics = settle_intrinsics(model, inputs.database, options)
+        model, intrinsics = settle_intrinsics(model, inputs, options)
         priors_known = read_priors(model, inputs, options, priors)
         control = read_control(model, options)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)

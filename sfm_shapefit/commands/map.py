@@ -161,9 +161,10 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         images = read_images(path)
         if options.refine_rigs and not images.rigs.rigs:
             raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
-        unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
+        unposed = read_model(images.reconstruction)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         inputs = read_left_out(inputs, unposed.names, options)
+        unposed, intrinsics = settle_intrinsics(unposed, inputs, options)
         for name in (name for one in options.known_distance for name in one[:2]):
             if name not in unposed.names:
                 raise InputError(f"known_distance: the database has no image {name}")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.intrinsics import (
     Origin,
@@ -87,3 +88,19 @@ def test_pairs_without_depth_say_nothing_of_focal_lengths(tmp_path):
     assert calibrate_view_graph(path, [1]) == {}
     edit_database(path, "UPDATE two_view_geometries SET config = 3, F = NULL")
     assert calibrate_view_graph(path, [1]) == {}
+
+
+def test_pairs_that_are_left_out_say_nothing_of_focal_lengths(tmp_path):
+    path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
+    right = calibrate_view_graph(path, [1])
+    ids = {k: image.name for k, image in read_images(path).reconstruction.images.items()}
+    query = "SELECT pair_id, F FROM two_view_geometries ORDER BY pair_id LIMIT 8"
+    pairs = readonly_rows(path, "two_view_geometries", {("pair_id", "F"): query})
+    # As a lens of twice the focal length would have it, about the same principal point.
+    wider = np.array([[0.5, 0.0, 300.0], [0.0, 0.5, 225.0], [0.0, 0.0, 1.0]])
+    for pair, blob in pairs:
+        wrong = (wider.T @ np.frombuffer(blob).reshape(3, 3) @ wider).tobytes().hex()
+        edit_database(path, f"UPDATE two_view_geometries SET F = x'{wrong}' WHERE pair_id = {pair}")
+    names = [[ids[k] for k in divmod(pair, MAX_NUM_IMAGES)] for pair, _ in pairs]
+    left_out = frozenset((min(ends), max(ends)) for ends in names)
+    assert calibrate_view_graph(path, [1], left_out) == right != calibrate_view_graph(path, [1])

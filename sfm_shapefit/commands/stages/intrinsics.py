@@ -1,7 +1,5 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
-from pathlib import Path
-
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.colmap.intrinsics import (
     Origin,
@@ -13,25 +11,27 @@ from sfm_shapefit.colmap.intrinsics import (
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.results.intrinsics import Intrinsics
+from sfm_shapefit.results.result import Inputs
 
 # A view graph that wants a focal length further off says more about the graph than about the lens.
 _MOST_OFF = 4.0
 
 
 def settle_intrinsics(
-    model: PosedModel, database: Path | None, options: LocateOptions
+    model: PosedModel, inputs: Inputs, options: LocateOptions
 ) -> tuple[PosedModel, Intrinsics]:
     """Return the model to start from, and which intrinsics the adjustments may change.
 
     Args:
         model: as given, of which nothing changes.
-        database: that says which intrinsics are guesses; None if there is none.
+        inputs: whose database, if there is one, says which intrinsics are guesses; pairs that are left out
+            say nothing of focal lengths.
         options: `refine_intrinsics`.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    wanted = options.refine_intrinsics
+    wanted, database = options.refine_intrinsics, inputs.database
     guessed = {} if database is None else find_uncalibrated(database, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
@@ -39,7 +39,8 @@ def settle_intrinsics(
     doubts = {} if wanted == "none" else doubt_lenses(cameras, origins)
     factors = {}
     if database is not None and guessed and wanted != "none":
-        by_database = calibrate_view_graph(database, [found.database_id for found in guessed.values()])
+        asked = [found.database_id for found in guessed.values()]
+        by_database = calibrate_view_graph(database, asked, inputs.left_out)
         factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}
         factors = {i: factor for i, factor in factors.items() if 1.0 / _MOST_OFF <= factor <= _MOST_OFF}
     intrinsics = Intrinsics(
