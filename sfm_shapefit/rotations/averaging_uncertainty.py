@@ -27,12 +27,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_kernels import sum_blocks
-from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
+from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
 from sfm_shapefit.viewgraph import connected_components
 
 _LOSS_FACTOR = 0.823
@@ -49,7 +49,7 @@ def estimate_sigmas(given: AveragingPairs, system: AveragingSystem, last: Linear
 
     Infinite for cameras that the pairs of the last system do not tie to the largest part of the others.
     """
-    n, inside = given.num_cameras, ~np.isnan(last.distances)
+    n, inside = given.num_cameras, _ties(given.num_cameras, last)
     sigmas = np.full(n, np.inf)
     labels = connected_components(n, given.pairs[inside])
     main = labels == np.argmax(np.bincount(labels))
@@ -65,6 +65,17 @@ def estimate_sigmas(given: AveragingPairs, system: AveragingSystem, last: Linear
     variances, leverages = _factored(system, last) if system.factors_blocks else _sampled(system, last)
     sigmas[main] = np.sqrt(_LOSS_FACTOR * residual_variance(last.distances, leverages) * variances)
     return sigmas
+
+
+def _ties(num_cameras: int, last: Linearized) -> BoolArray:
+    """Return which pairs (k,) hold their cameras.
+
+    The loss leaves pairs that fit badly a share of their weight, next to nothing where the others fit to
+    rounding. What is below the ridge of the rounds holds no camera: there the ridge did.
+    """
+    traces = np.trace(last.blocks, axis1=1, axis2=2)
+    mean_diagonal = 2.0 * float(traces.sum()) / num_cameras
+    return np.asarray(~np.isnan(last.distances) & (traces > RIDGE * mean_diagonal))
 
 
 def residual_variance(distances: FloatArray, leverages: FloatArray) -> float:

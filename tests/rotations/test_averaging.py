@@ -10,9 +10,10 @@ import sfm_shapefit
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.rotations import annealing, averaging_system, averaging_uncertainty, dual_certificate
+from sfm_shapefit.rotations.annealing import Linearized
 from sfm_shapefit.rotations.average import average_relative_rotations, average_rotations, check_pairs
 from sfm_shapefit.rotations.averaging_system import plan_system
-from sfm_shapefit.rotations.averaging_uncertainty import residual_variance
+from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas, residual_variance
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, ring_graph_problem
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
@@ -326,3 +327,14 @@ def test_the_answer_shows_itself_in_one_line_and_in_plain_values():
     assert facts["median_sigma_deg"] == pytest.approx(np.median(answer.sigmas_deg))
     assert "proved to be the best for the pairs that are kept" in facts["statement"]
     assert dual_certificate.__doc__ is not None
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-18])
+def test_images_that_hang_on_pairs_of_no_weight_have_no_sigma(weight):
+    pairs = np.array([(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4), (2, 5), (4, 5)])
+    given, n = check_pairs(pairs, np.tile(np.eye(3), (8, 1, 1)), None, None, None)
+    is_loose = (given.pairs >= 4).sum(axis=1) == 1
+    blocks = np.where(is_loose, weight, 1.0)[:, None, None] * np.eye(3)
+    system = plan_system(n, given.pairs, np.ones(8), 1)
+    sigmas = estimate_sigmas(given, system, Linearized(blocks, np.ones(8)))
+    assert np.isfinite(sigmas).tolist() == [True] * 4 + [False] * 2
