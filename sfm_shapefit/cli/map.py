@@ -100,6 +100,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         figures=[
             *figures,
             *[("joined" if join.join else "not joined", join.statement) for join in found.joins],
+            *[(one.folder, one.facts["verdict"]["statement"]) for one in found.joined],
             *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
             *[("warning", warning) for warning in found.warnings],
             *picture_rows(flags, [name for model in found.models for name in model.located.model.names]),

@@ -32,11 +32,16 @@ _GEODETIC_NAMES = {"lat", "latitude"}
 _LARGEST = 1e30
 
 
+class MissingPriorsError(InputError):
+    """A database that has no position prior of a model's images."""
+
+
 def database_priors(path: Path, model: PosedModel) -> PositionPriors:
     """Read the pose priors of the model's images, matched by name, from a database, which is not changed.
 
     Raises:
-        InputError: if the database has no prior of these images, mixes coordinate systems, or is damaged.
+        MissingPriorsError: if the database has no prior of these images.
+        InputError: if it mixes coordinate systems, or is damaged.
     """
     found: dict[int, tuple[FloatArray, FloatArray]] = {}
     systems: set[int] = set()
@@ -57,7 +62,9 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
         found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3)
         systems.add(system)
     if not found:
-        raise InputError(f"{path} has no position prior of the model's images; give a table with --priors")
+        raise MissingPriorsError(
+            f"{path} has no position prior of the model's images; give a table with --priors"
+        )
     if len(systems) > 1:
         raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind with --priors")
     return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})

@@ -33,7 +33,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.image_quality import ImageQuality, image_quality
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import measure_directions
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
@@ -55,6 +55,17 @@ _LARGE_SHARE, _SHARE_OF_USUAL = 1.0 / 3.0, 2.0
 _LEAST_AGREEING = 0.25
 
 
+class Examined(NamedTuple):
+    """A model that was looked at."""
+
+    cameras: list[CameraRow]
+    """Those with a pose first."""
+    pairs: list[PairRow]
+    facts: dict[str, Any]
+    """In the form of locate.json."""
+    quality: ImageQuality
+
+
 def examine(
     folder: Path, database: Path | None = None, *, progress: Progress | None = None
 ) -> tuple[Drawing, dict[str, Any]]:
@@ -72,20 +83,39 @@ def examine(
     with clock("read"):
         model = read_model(folder)
         inputs = choose_inputs(folder, database, options.directions)
+    with open_source(model, inputs) as matches:
+        found = examine_source(matches, inputs, options, clock)
+    poses = poses_of(model, [row.name for row in found.cameras])
+    # The input is what is shown; there is nothing to be compared with it.
+    poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
+    drawing = build_drawing(found.cameras, found.pairs, poses=poses, points=model.reconstruction)
+    quality = found.quality
+    further = _columns(quality, len(found.cameras))
+    points = replace(
+        drawing.points, errors_px=quality.point_errors_px, track_lengths=quality.point_track_lengths
+    )
+    return replace(drawing, further=further, points=points), found.facts
+
+
+def examine_source(matches: MatchSource, inputs: Inputs, options: LocateOptions, clock: Clock) -> Examined:
+    """Return what can be said of a model whose matches are open.
+
+    Args:
+        matches: of the model, which is not changed.
+        inputs: where they come from.
+        options: how directions are measured.
+        clock: what it takes is added to its seconds.
+    """
+    model = matches.model
     with clock("points"):
         quality = image_quality(model)
-    with open_source(model, inputs) as matches, clock("directions"):
+    with clock("directions"):
         try:
             directions = measure_directions(matches, options, clock)
         except UnsolvableError:  # no pair shares anything
             directions = None
     pairs, level_deg = _pair_rows(model, directions)
     cameras = _camera_rows(model, quality, pairs)
-    poses = poses_of(model, [row.name for row in cameras])
-    # The input is what is shown; there is nothing to be compared with it.
-    poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
-    drawing = build_drawing(cameras, pairs, poses=poses, points=model.reconstruction)
-    further = _columns(quality, len(cameras))
     focal_length_px = float(np.median(model.focal_lengths_px))
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
     facts = _facts(inputs, cameras, pairs, level_deg) | {
@@ -95,10 +125,7 @@ def examine(
         "median_track_length": _median(quality.point_track_lengths.tolist()),
         "timings_s": clock.seconds,
     }
-    points = replace(
-        drawing.points, errors_px=quality.point_errors_px, track_lengths=quality.point_track_lengths
-    )
-    return replace(drawing, further=further, points=points), facts
+    return Examined(cameras, pairs, facts, quality)
 
 
 def _median(values: list[float]) -> float:

@@ -31,11 +31,11 @@ from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.gravity import read_gravity, refine_with_gravity
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
-from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
+from sfm_shapefit.commands.stages.joins import JoinedModels, Told, join_models
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
-from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.locate_options import LEAST_MATCHES, KnownDistance, LocateOptions, MapOptions
 from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
@@ -120,7 +120,8 @@ def _map_opened(run: "_Run") -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            found = join_models(models, run.unposed, path, run.priors, run.without)
+            told = Told(run.priors, options.known_distance, run.without)
+            found = join_models(models, run.unposed, path, told, clock)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(run.unposed.names, run.frame_of_image.tolist(), strict=True)
@@ -137,7 +138,11 @@ def _map_opened(run: "_Run") -> MapResult:
         num_video_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
-        warnings=tuple(_warnings(run.images, models, left_out)),
+        warnings=(
+            *_warnings(run.images, models, left_out),
+            *found.warnings,
+            *_lost_distances(options.known_distance, models, found),
+        ),
     )
     return tell_joins(result)
 
@@ -483,6 +488,28 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
+
+
+def _lost_distances(
+    known: Iterable[KnownDistance], models: Sequence[MappedModel], found: JoinedModels
+) -> Iterator[str]:
+    """Yield what became of known distances that are in no model."""
+    model_of = {
+        image.name: number
+        for number, model in enumerate(models)
+        for image in model.located.reconstruction.images.values()
+        if image.has_pose
+    }
+    for first, second, _ in known:
+        ends = [model_of.get(name) for name in (first, second)]
+        if None in ends:
+            name = (first, second)[ends.index(None)]
+            yield f"the known distance of {first} and {second} is of no use: {name} is in no model"
+        elif ends[0] != ends[1] and not any({*ends} <= {*one.models} for one in found.joined):
+            yield (
+                f"the known distance of {first} and {second} is of no use: they are in models {ends[0]} and "
+                f"{ends[1]}, which are not joined"
+            )
 
 
 def _pairs_among(

@@ -12,6 +12,7 @@ from typing import Any
 
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.colmap.seed import write_model
+from sfm_shapefit.results.joins import JoinedModel
 from sfm_shapefit.results.map_result import MapResult
 from sfm_shapefit.results.result import FurtherPiece, GraphResult, LocateResult
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
@@ -65,7 +66,7 @@ def write_result(
                 _write_files(model.located, folder / str(number), options)
             for joined in found.joined:
                 (folder / joined.folder).mkdir()
-                write_model(joined.reconstruction, folder / joined.folder)
+                _write_joined(joined, folder / joined.folder, options)
             write_json(found.summary(), folder / MAP_MARKER)
         else:
             _write_files(found, folder, options)
@@ -105,16 +106,29 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
         _draw(found, folder, options)
 
 
-def _draw(found: LocateResult | GraphResult, folder: Path, options: WriteOptions) -> None:
+def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
+    """Write the files of models that were joined."""
+    write_model(found.reconstruction, folder)
+    write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
+    write_json(found.summary(), folder / MARKER)
+    if options.report or options.scene:
+        _draw(found, folder, options)
+
+
+def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
     """Write the report and the scenes that are wanted."""
     from sfm_shapefit.report.mesh import write_meshes
     from sfm_shapefit.report.page import write_report
-    from sfm_shapefit.report.read_back import draw_result
+    from sfm_shapefit.report.read_back import draw_result, read_output
     from sfm_shapefit.report.thumbnails import thumbnails_of
 
-    drawing = draw_result(found)
+    if isinstance(found, JoinedModel):
+        drawing, facts = read_output(folder)
+    else:
+        drawing, facts = draw_result(found), found.summary()
     if options.report:
         pictures = thumbnails_of(drawing, options.images)
-        write_report(drawing, found.summary(), folder / "report.html", pictures)
+        write_report(drawing, facts, folder / "report.html", pictures)
     if options.scene:
         write_meshes(drawing, folder)

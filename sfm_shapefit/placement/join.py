@@ -167,22 +167,42 @@ def join_by_matches(
     return join
 
 
-def join_by_priors(
-    first: tuple[FloatArray, PositionPriors], second: tuple[FloatArray, PositionPriors]
-) -> ModelJoin:
-    """Return the join of two models by position priors of cameras of each.
+class PlacedByPriors(NamedTuple):
+    """A model on the position priors of its cameras, and how well it stands there."""
+
+    centers: FloatArray
+    """(n, 3) of its cameras, in its world."""
+    priors_from_model: Similarity
+    parts: tuple[Similarity, ...]
+    """The same without some of the priors in turn."""
+    num_priors: int
+
+
+def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPriors:
+    """Return a model on its position priors, for `join_by_priors`.
 
     Args:
-        first, second: centers (n, 3) of the cameras of each model in its world, and priors of these cameras.
+        centers: (n, 3) of its cameras, in its world.
+        priors: of these cameras.
+
+    Raises:
+        UnsolvableError: if they are few, lie on a line, or do not fit; the message is the reason, a clause.
+    """
+    best, parts = _fit_priors(centers, priors)
+    return PlacedByPriors(centers, best, tuple(parts), len(priors))
+
+
+def join_by_priors(first: PlacedByPriors, second: PlacedByPriors) -> ModelJoin:
+    """Return the join of two models by position priors of cameras of each.
 
     Raises:
         UnsolvableError: if it is not safe; the message is the reason, a clause.
     """
-    (one, parts_of_one), (other, parts_of_other) = (_fit_priors(*model) for model in (first, second))
-    errors = [[_chain(part, other) for part in parts_of_one], [_chain(one, part) for part in parts_of_other]]
-    evidence = f"position priors of {len(first[1])} and {len(second[1])} cameras"
-    join = _with_errors(_chain(one, other), errors, second[0], evidence)
-    refuse_uncertain(join, second[0])
+    one, other = first.priors_from_model, second.priors_from_model
+    errors = [[_chain(part, other) for part in first.parts], [_chain(one, part) for part in second.parts]]
+    evidence = f"position priors of {first.num_priors} and {second.num_priors} cameras"
+    join = _with_errors(_chain(one, other), errors, second.centers, evidence)
+    refuse_uncertain(join, second.centers)
     return join
 
 

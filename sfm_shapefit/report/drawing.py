@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.results.rows import covariance_of
 from sfm_shapefit.results.tables import CameraRow, PairRow
 
 if TYPE_CHECKING:
@@ -328,7 +329,7 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
         if row.center:
             centers[k] = [*row.center, 0.0, 0.0][:3]
         if row.sigma:
-            covariances[k] = _covariance(row)
+            covariances[k] = covariance_of(row)
     return Cameras(
         names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
@@ -340,19 +341,6 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
         covariances=covariances,
         poses=poses,
     )
-
-
-def _covariance(row: CameraRow) -> FloatArray:
-    """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
-    d = len(row.sigma)
-    correlations = np.eye(d)
-    if row.correlation:  # which earlier outputs lack
-        i, j = np.triu_indices(d, k=1)
-        correlations[i, j] = correlations[j, i] = row.correlation
-    sigmas = np.array(row.sigma)
-    found = np.zeros((max(d, 3), max(d, 3)))
-    found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
-    return found[:3, :3]
 
 
 def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:

@@ -75,7 +75,7 @@ def next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
             "Next: the positions are in cameras.csv; look at them from all sides.",
             "sfm-shapefit view {out}",
         )
-    if facts.get("examined"):
+    if facts.get("examined") and "joins" not in facts:
         return _next_of_model(grade, shlex.quote(input_of(facts)))
     if grade == "do not use":
         path = shlex.quote(input_of(facts))

@@ -1,10 +1,12 @@
 """What `map` says of models beside the largest: joined to another, how and how surely, or why not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.placement.join import ModelJoin
-from sfm_shapefit.results.json_types import Join
+from sfm_shapefit.results.json_types import Join, JoinedSummary
+from sfm_shapefit.results.tables import CameraRow, PairRow
 
 if TYPE_CHECKING:
     import pycolmap
@@ -59,11 +61,21 @@ class Joined:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JoinedModel:
-    """Models in one world."""
+    """Models in one world, and what can be said of them together."""
 
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
-    """Their numbers; the world is that of the first."""
+    """Their numbers; the world is that of the first, scaled if known distances between them tell."""
+    cameras: Sequence[CameraRow]
+    """One row per image of these models."""
+    pairs: Sequence[PairRow]
+    """One row per pair of these that was looked at."""
+    facts: JoinedSummary
+    """What stands in its locate.json."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in its locate.json."""
+        return dict(self.facts)
 
     @property
     def folder(self) -> str:

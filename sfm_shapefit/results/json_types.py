@@ -370,6 +370,38 @@ class LocateSummary(PlacementSummary):
     join: Annotated[Join | None, "Of a model of `map` beside the largest; else null."]
 
 
+class JoinedSummary(TypedDict):
+    """joined_0/locate.json, of models of `map` that were joined: looked at, not placed anew."""
+
+    schema_version: Version
+    examined: Annotated[Literal[True], "Its positions were looked at as they stand."]
+    inputs: Annotated[ModelInputs, "What the models were made of."]
+    options: Options
+    verdict: Annotated[JudgedModel, "No better than those of the models in it."]
+    models: Annotated[list[str], "The folders of the models in it."]
+    joins: Annotated[list[Join], "How they were joined."]
+    num_images: Annotated[int, "Images of these models, placed or not."]
+    num_placed: Annotated[int, "Cameras in it."]
+    num_pairs: Annotated[int, "Pairs of these that were looked at, between the models too."]
+    num_points: Annotated[int, "3D points."]
+    figures: Annotated[KeyFigures, "What terminal and report begin with."]
+    sigma_of: Annotated[str, "What the standard deviations of the cameras know of, and are relative to."]
+    residual_level_deg: Annotated[
+        float | None, "Level of the angles between directions and baselines; null where no pair says any."
+    ]
+    mean_reprojection_error_px: Annotated[float | None, "Of the 3D points; null if there are none."]
+    median_track_length: Annotated[float | None, "Of the same."]
+    scale: Annotated[str, "Scale, origin and axes, in words."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]
+    known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
+    datum: Annotated[EarthDatum | None, "Where the origin is on Earth; null if that is not known."]
+    pieces: Annotated[list[Piece], "None: it is one model."]
+    loose_groups: Annotated[list[LooseGroup], "None: the models know theirs."]
+    timings_s: Timings
+    warnings: Warnings
+    versions: Versions
+
+
 class GraphInputs(TypedDict):
     """What `place` worked from."""
 

@@ -1,7 +1,7 @@
 """What `map` returns, and its files: COLMAP's layout of several models, each with the files of `locate`.
 
 OUT/0, OUT/1, ...   models, largest first: each a folder as `locate` writes it
-OUT/joined_0        models that were joined, in the world of the first, where that was safe
+OUT/joined_0        models that were joined, in the world of the first, where that was safe; the same files
 OUT/map.json        the averaging behind each, and the images in no model with the reason
 """
 

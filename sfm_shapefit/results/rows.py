@@ -78,7 +78,7 @@ def own_camera_rows(
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
     covariances = placement.covariances if axes is None else _turned(placement.covariances, axes)
-    sigmas, correlations = scale * standard_deviations(covariances), _correlations(covariances)
+    sigmas, correlations = scale * standard_deviations(covariances), correlations_of(covariances)
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -107,7 +107,20 @@ def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
     return turned
 
 
-def _correlations(covariances: FloatArray) -> FloatArray:
+def covariance_of(row: CameraRow) -> FloatArray:
+    """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
+    d = len(row.sigma)
+    correlations = np.eye(d)
+    if row.correlation:  # which earlier outputs lack
+        i, j = np.triu_indices(d, k=1)
+        correlations[i, j] = correlations[j, i] = row.correlation
+    sigmas = np.array(row.sigma)
+    found = np.zeros((max(d, 3), max(d, 3)))
+    found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
+    return found[:3, :3]
+
+
+def correlations_of(covariances: FloatArray) -> FloatArray:
     """Return the correlations of each two axes, (n, d (d - 1) / 2): 0 if exact, NaN if nothing holds it."""
     sigmas = standard_deviations(covariances)
     i, j = np.triu_indices(covariances.shape[1], k=1)

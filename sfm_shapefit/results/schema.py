@@ -13,6 +13,7 @@ from sfm_shapefit.results.json_types import (
     EvaluateSummary,
     GraphSummary,
     InspectSummary,
+    JoinedSummary,
     LocateSummary,
     MapSummary,
     PositionsSummary,
@@ -27,6 +28,7 @@ _COMMANDS = {
     "evaluate": EvaluateSummary,
     "evaluate_table": PositionsSummary,
     "map": MapSummary,
+    "joined": JoinedSummary,
 }
 _SIMPLE = {int: "integer", float: "number", str: "string", bool: "boolean", type(None): "null"}
 
@@ -41,7 +43,8 @@ def output_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Output of sfm-shapefit",
         "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
-        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), map.",
+        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), map. "
+        "joined is the locate.json of models that map has joined.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
         "$defs": definitions,
     }

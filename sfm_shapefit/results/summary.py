@@ -1,7 +1,7 @@
 """locate.json: the answer in plain values, schema version first."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, cast
@@ -31,6 +31,9 @@ from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.results.warnings import graph_warnings
 
 if TYPE_CHECKING:
+    import pycolmap
+
+    from sfm_shapefit.locate_options import KnownDistance as ToldDistance
     from sfm_shapefit.results.result import GraphResult, LocateResult, Loop
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
@@ -74,7 +77,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
         "scale_sigma": found.gauge.scale_sigma,
-        "known_distances": _known_distances(found),
+        "known_distances": told_distances(found.options.known_distance, found.reconstruction),
         "control_points": list(found.control_points),
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
@@ -90,11 +93,10 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
     }
 
 
-def _known_distances(found: "LocateResult") -> list[KnownDistance]:
-    """Return the distances that were told, each with what the output has."""
-    known = found.options.known_distance
+def told_distances(known: Sequence["ToldDistance"], model: "pycolmap.Reconstruction") -> list[KnownDistance]:
+    """Return the distances that were told, each with what a model has."""
     named = {name for one in known for name in one[:2]}
-    images = found.reconstruction.images.values() if named else ()
+    images = model.images.values() if named else ()
     centers = {i.name: i.projection_center() for i in images if i.name in named and i.has_pose}
     return [
         {

@@ -19,12 +19,16 @@ from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.first_screen import banner
+from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.results.intrinsics import describe_intrinsics
 from sfm_shapefit.results.scene_words import describe_line, describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run, run_python
+from tests.results.test_schema import problems
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
 PAIR = 2147483647
@@ -508,9 +512,13 @@ def keep_few_matches(wrong):
 @pytest.mark.parametrize("wrong", [False, True])
 def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tmp_path, wrong):
     database = changed(RING, tmp_path, keep_few_matches(wrong))
-    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST))
+    taped = ("0001.jpg", "0008.jpg", 3.0)  # from one model to the other
+    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST), known_distance=(taped,))
     (told,) = found.joins
     assert [len(model.names) for model in found.models] == [4, 4]
+    assert [warning for warning in found.warnings if "0001.jpg and 0008.jpg is of no use" in warning] == (
+        [f"the known distance of 0001.jpg and 0008.jpg is of no use: {APART}"] if wrong else []
+    )
     sfm_shapefit.write_map_result(found, tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     facts = json.loads((tmp_path / "out" / "1" / "locate.json").read_text())
@@ -532,6 +540,33 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     merged, renamed, new = merge_models(*models, told.join.first_from_second, same)
     assert merged.num_points3D() == whole.reconstruction.num_points3D() - 1
     assert renamed[same[0][0]] == new[same[0][1]]
+    check_joined_folder(tmp_path / "out" / "joined_0", found)
+
+
+APART = "they are in models 0 and 1, which are not joined"
+
+
+def check_joined_folder(folder, found):
+    """A joined model says of itself what others do, and its commands work."""
+    drawing, facts = read_output(folder)
+    assert problems(facts, "joined") == []
+    assert facts["known_distances"][0]["found"] == pytest.approx(3.0)
+    assert "0001.jpg and 0008.jpg are 3 apart" in facts["scale"]
+    assert facts["joins"][0]["statement"] == found.joins[0].statement
+    rows = [row for model in found.models for row in model.located.cameras]
+    assert dict(zip(drawing.cameras.names, drawing.cameras.trust.tolist(), strict=True)) == {
+        row.name: row.trust for row in rows
+    }
+    # The errors of the join come on top of what the models know, in the units of the known distance.
+    own = {row.name: max(row.sigma) for row in rows}
+    scale = facts["figures"]["sigma"] / np.median(list(own.values()))
+    assert 1.0 < scale < 10.0
+    assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
+    assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
+    before = (folder / "report.html").read_text("utf-8")
+    run("report", folder)
+    assert (folder / "report.html").read_text("utf-8") == before
+    assert "bundle_adjuster" in banner(drawing, facts)["command"]
 
 
 def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
@@ -549,6 +584,15 @@ def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path
     errors = sfm_shapefit.evaluate(out / "joined_0", RING / "sparse" / "0")
     assert errors.position.max < 1e-3 * errors.extent
     assert "not joined" in run(*arguments, "--overwrite").output
+    told = json.loads((out / "map.json").read_text())
+    assert not any("priors" in warning for warning in told["warnings"])  # it has none
+    edit_database(
+        database,
+        "INSERT INTO pose_priors (pose_prior_id, corr_data_id, corr_sensor_id, corr_sensor_type, position, "
+        "coordinate_system) VALUES (1, 1, 1, 0, x'00', 1)",
+    )
+    run(*arguments, "--overwrite")
+    assert "join no models: " in json.loads((out / "map.json").read_text())["warnings"][-1]
     facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
     assert facts["joins"] == []
     assert not (out / "joined_0").exists()

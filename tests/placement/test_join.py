@@ -8,7 +8,7 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import Similarity, compose, invert, median_spread, normalized, rotation_angles_deg
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors
-from sfm_shapefit.placement.join import Ties, join_by_matches, join_by_priors
+from sfm_shapefit.placement.join import Ties, join_by_matches, join_by_priors, place_by_priors
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 TRUTH = Similarity(scale=2.5, rotation=TURN, translation=np.array([3.0, -1.0, 4.0]))
@@ -113,9 +113,8 @@ def priors_for(centers, world_from, sigma, seed):
     positions = world_from.apply(centers)
     positions = positions + sigma * np.random.default_rng(seed).standard_normal(positions.shape)
     information = np.tile(sigma**-2 * np.eye(3), (len(centers), 1, 1))
-    return centers, PositionPriors(
-        known=KnownPositions(np.arange(len(centers)), positions, information), statement="made"
-    )
+    known = KnownPositions(np.arange(len(centers)), positions, information)
+    return place_by_priors(centers, PositionPriors(known=known, statement="made"))
 
 
 def test_priors_join_two_models_and_say_how_surely():

@@ -87,7 +87,11 @@ class GaugeRule(NamedTuple):
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
         if options.known_distance:
-            gauge = _gauge_of_distances(model, cameras.tolist(), locations, options.known_distance)
+            for name in (name for one in options.known_distance for name in one[:2]):
+                if name not in model.names:
+                    raise InputError(f"known_distance: the model has no posed image {name}")
+            names = [model.names[camera] for camera in cameras.tolist()]
+            gauge = gauge_of_distances(names, locations, options.known_distance)
         elif self.priors is not None:
             gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
         else:
@@ -113,23 +117,18 @@ def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) ->
     return mean_rotation_l1(model.rotations[cameras].transpose(0, 2, 1) @ rotations)
 
 
-def _gauge_of_distances(
-    model: PosedModel, cameras: list[int], locations: FloatArray, known: Sequence[KnownDistance]
-) -> Gauge:
+def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Sequence[KnownDistance]) -> Gauge:
     """Return the gauge of known distances of cameras, by their names; those that are not there say nothing.
 
     Raises:
-        InputError: if the model has no such image.
+        InputError: if the cameras of a distance coincide.
         UnsolvableError: if of each distance an image is not among the cameras.
     """
-    place_of = {model.names[camera]: place for place, camera in enumerate(cameras)}
-    for name in (name for one in known for name in one[:2]):
-        if name not in model.names:
-            raise InputError(f"known_distance: the model has no posed image {name}")
+    place_of = {name: place for place, name in enumerate(names)}
     there = [one for one in known if {*one[:2]} <= place_of.keys()]
     if not there:
         missing = next(name for name in known[0][:2] if name not in place_of)
         raise UnsolvableError(f"known_distance: the image {missing} could not be placed; choose another")
     places = np.array([[place_of[first], place_of[second]] for first, second, _ in there])
-    names = [f"{first} and {second}" for first, second, _ in there]
-    return distance_gauge(locations, places, np.array([float(distance) for *_, distance in there]), names)
+    said = [f"{first} and {second}" for first, second, _ in there]
+    return distance_gauge(locations, places, np.array([float(distance) for *_, distance in there]), said)

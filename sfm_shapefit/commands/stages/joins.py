@@ -1,7 +1,7 @@
 """The models of one database joined where that is safe: by position priors, or by matches between them."""
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,18 +13,23 @@ from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.intrinsics import with_parameters
 from sfm_shapefit.colmap.merge import merge_models
 from sfm_shapefit.colmap.model import PosedModel, observed_points
-from sfm_shapefit.colmap.priors import database_priors
+from sfm_shapefit.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
+from sfm_shapefit.commands.stages.clock import Clock
+from sfm_shapefit.commands.stages.joined import Group, tell_group
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.geometry import METRIC_SIGMA, Similarity, compose
+from sfm_shapefit.locate_options import KnownDistance
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import (
     ModelJoin,
+    PlacedByPriors,
     Ties,
     join_by_matches,
     join_by_priors,
+    place_by_priors,
 )
 from sfm_shapefit.results.joins import Joined, JoinedModel
 from sfm_shapefit.results.map_result import MappedModel
@@ -44,14 +49,22 @@ class JoinedModels(NamedTuple):
     """One for each model but the largest."""
     joined: tuple[JoinedModel, ...]
     """Models in one world, larger ones first; none where nothing was joined."""
+    warnings: tuple[str, ...] = ()
+    """What was told and could not be used for it, a sentence each."""
+
+
+class Told(NamedTuple):
+    """What the user told of images of several models."""
+
+    priors: PositionPriors | None = None
+    """Of the images; None: those of the database, if it has any."""
+    distances: Sequence[KnownDistance] = ()
+    left_out: PairNames = frozenset()
+    """Pairs of images whose matches say nothing."""
 
 
 def join_models(
-    models: Sequence[MappedModel],
-    unposed: PosedModel,
-    database: Path,
-    priors: PositionPriors | None,
-    left_out: PairNames = frozenset(),
+    models: Sequence[MappedModel], unposed: PosedModel, database: Path, told: Told, clock: Clock
 ) -> JoinedModels:
     """Join each model to the first larger one that it can be joined to safely.
 
@@ -59,17 +72,27 @@ def join_models(
         models: largest first.
         unposed: all images of the database, by index.
         database: with the matches between the models.
-        priors: of the images; None: those of the database, if it has any.
-        left_out: pairs of images whose matches say nothing.
+        told: what is known of the images beside.
+        clock: whose progress is told.
     """
     if len(models) < 2:
         return JoinedModels((), ())
+    priors, warnings = told.priors, []
     if priors is None:
-        with suppress(InputError):
+        try:
             priors = database_priors(database, unposed)
-    evidence = _Evidence(models, unposed, priors, partial(open_database, database, left_out=left_out))
+        except MissingPriorsError:
+            pass
+        except InputError as error:
+            warnings.append(f"the position priors of the database join no models: {error}")
+    open_matches = partial(open_database, database, left_out=told.left_out)
+    evidence = _Evidence(models, unposed, priors, open_matches)
     joins = [evidence.join(number) for number in range(1, len(models))]
-    return JoinedModels(tuple(joins), tuple(_merge(models, joins, evidence)))
+    joined = [
+        tell_group(group, models, told.distances, told.left_out, clock)
+        for group in _merge(models, joins, evidence)
+    ]
+    return JoinedModels(tuple(joins), tuple(joined), tuple(warnings))
 
 
 class _Between(NamedTuple):
@@ -117,6 +140,8 @@ class _Evidence:
         """Of each image, the id of the point that each keypoint observes; -1 for none."""
         for image, number in enumerate(self.model_of_image.tolist()):
             self.ids.append(self._observed(image, number) if number >= 0 else np.zeros(0, dtype=np.int64))
+        self.by_priors: dict[int, PlacedByPriors | str | None] = {}
+        """Of each model that was asked; fitted once, whatever the number of models it is compared with."""
         with open_matches(model=self.unposed) as source:
             self.matches = self._read_matches(source)
 
@@ -178,11 +203,11 @@ class _Evidence:
             UnsolvableError: if neither is safe.
         """
         metric_sigma = self._metric_sigma(first, second)
-        known = [self._priors_of(k) for k in (first, second)]
+        known = [self._by_priors(k) for k in (first, second)]
         reasons = []
-        if metric_sigma is None and known[0] is not None and known[1] is not None:
+        if metric_sigma is None and None not in known:
             try:
-                return join_by_priors(known[0], known[1])
+                return join_by_priors(*(_unless_refused(one) for one in known))
             except UnsolvableError as error:
                 reasons.append(str(error))
         between = self.matches.get((first, second))
@@ -212,11 +237,19 @@ class _Evidence:
             raise UnsolvableError("their rigs do not tell the scale of both")
         return float(np.linalg.norm(np.array(sigmas, dtype=np.float64)))
 
-    def _priors_of(self, number: int) -> tuple[FloatArray, PositionPriors] | None:
-        """Return the centers of a model's cameras, and their priors, if there are any."""
-        own = np.flatnonzero(self.model_of_image == number)
-        priors = None if self.priors is None else self.priors.of(own)
-        return None if priors is None or not len(priors) else (self.centers[own], priors)
+    def _by_priors(self, number: int) -> PlacedByPriors | str | None:
+        """Return a model on its position priors, or why that is refused; None if it has none."""
+        if number not in self.by_priors:
+            own = np.flatnonzero(self.model_of_image == number)
+            priors = None if self.priors is None else self.priors.of(own)
+            found: PlacedByPriors | str | None = None
+            if priors is not None and len(priors):
+                try:
+                    found = place_by_priors(self.centers[own], priors)
+                except UnsolvableError as error:
+                    found = str(error)
+            self.by_priors[number] = found
+        return self.by_priors[number]
 
     def _centers_of(self, number: int) -> FloatArray:
         return np.asarray(self.centers[self.model_of_image == number])
@@ -258,19 +291,24 @@ class _Evidence:
         return found
 
 
-def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence) -> list[JoinedModel]:
-    """Return the models that were joined, each group in the world of its largest."""
+def _unless_refused(found: PlacedByPriors | str | None) -> PlacedByPriors:
+    """Return a model on its priors, or raise UnsolvableError with the reason why it is not."""
+    if isinstance(found, PlacedByPriors):
+        return found
+    raise UnsolvableError(found or _NOTHING_IN_COMMON)
+
+
+def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence) -> Iterator[Group]:
+    """Yield the models that were joined, each group in the world of its largest."""
     groups = [_Group.of(number, model) for number, model in enumerate(models)]
     root = list(range(len(models)))
     for done in joins:
         if done.join is not None:
             root[done.model] = root[done.to]
             groups[root[done.to]].add(done, models[done.model], evidence.same_points(done))
-    return [
-        JoinedModel(reconstruction=group.reconstruction, models=tuple(group.world_from))
-        for group in groups
-        if len(group.world_from) > 1
-    ]
+    for group in groups:
+        if len(group.world_from) > 1:
+            yield Group(group.reconstruction, group.world_from, group.joins)
 
 
 class _Group:
@@ -279,6 +317,7 @@ class _Group:
     def __init__(self, reconstruction: "pycolmap.Reconstruction", number: int) -> None:
         self.reconstruction = reconstruction
         self.world_from = {number: Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))}
+        self.joins: list[Joined] = []
         # Of each model, the ids of its points here, by those in the model where they are others.
         self.ids: dict[int, dict[int, int]] = {number: {}}
 
@@ -290,6 +329,7 @@ class _Group:
     def add(self, done: Joined, model: MappedModel, same_points: list[tuple[int, int]]) -> None:
         """Take in a model that was joined to one of the group."""
         assert done.join is not None
+        self.joins.append(done)
         own = self.ids[done.to]
         same_points = [(own.get(one, one), other) for one, other in same_points]
         world_from = compose(self.world_from[done.to], done.join.first_from_second)
