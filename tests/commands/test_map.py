@@ -557,10 +557,23 @@ def check_joined_folder(folder, found):
     assert dict(zip(drawing.cameras.names, drawing.cameras.trust.tolist(), strict=True)) == {
         row.name: row.trust for row in rows
     }
-    # The errors of the join come on top of what the models know, in the units of the known distance.
-    own = {row.name: max(row.sigma) for row in rows}
-    scale = facts["figures"]["sigma"] / np.median(list(own.values()))
-    assert 1.0 < scale < 10.0
+    # The errors of the join come on top of what its models know, all in the units of the known distance.
+    together = {row.name: row for row in found.joined[0].cameras}
+    scales, own = [], []
+    for model in found.models:
+        (first, *_, last) = ours = model.located.cameras
+        apart = [
+            np.subtract(two.center, one.center)
+            for one, two in ((first, last), (together[first.name], together[last.name]))
+        ]
+        scales.append(np.linalg.norm(apart[1]) / np.linalg.norm(apart[0]))
+        own.append({row.name: np.sum(np.square(row.sigma)) * scales[-1] ** 2 for row in ours})
+    of_join = (scales[0] * found.joins[0].join.center_sigma) ** 2
+    for variances, more in zip(own, (0.0, of_join), strict=True):
+        for name, variance in variances.items():
+            assert np.sum(np.square(together[name].sigma)) == pytest.approx(
+                variance + more, rel=1e-4, abs=0.0
+            )
     assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     before = (folder / "report.html").read_text("utf-8")
