@@ -8,6 +8,8 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
+from sfm_shapefit.commands.stages import doubts as doubts_stage
 from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.turns import Doubt
 from tests.scenes import BUNDLED, COURTYARD, real_scene
@@ -66,6 +68,25 @@ def test_turned_cameras_are_left_out_and_no_others(chosen, angle_deg):
         for row in found.cameras
         if row.name in wrong
     )
+
+
+@pytest.mark.parametrize(("chosen", "angle_deg"), [((), 0.0), ((9, 10, 11, 12, 13), 2.0)])
+def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, chosen, angle_deg):
+    """As a model of 5,000 images is: 25 images may ask 150 pairs, so each one only its six strongest."""
+    asked = []
+
+    def estimate(rays, threads):
+        asked.extend(rays.pairs.tolist())
+        return estimate_relative_rotations(rays, threads)
+
+    monkeypatch.setattr(doubts_stage, "_MOST_ASKED", 6 * 25)
+    monkeypatch.setattr(doubts_stage, "estimate_relative_rotations", estimate)
+    model, wrong = turned(COURTYARD, chosen, angle_deg)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust=False)
+    assert 0 < len(asked) <= 6 * 25
+    assert {row.name for row in found.cameras if not row.placed} == wrong
+    kinds = dict(zip(found.model.names, found.placement.assessment.doubts.kinds, strict=True))
+    assert {name for name, kind in kinds.items() if kind is not Doubt.RIGHT} == wrong
 
 
 def test_a_camera_that_is_turned_a_little_is_put_right():

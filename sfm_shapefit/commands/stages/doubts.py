@@ -28,6 +28,8 @@ _POOR = 0.9
 _DOUBTFUL_SHARE = 0.1
 # Pairs of each camera that are asked at most, those of most matches, and matches of a pair. Beyond 750 images
 # they are fewer, so that about so many are asked in all: a thousand take more than a second.
+# Measured on a made facade and a made ring of 900 images, 60 of them turned: 33 pairs of each camera leave
+# out the same cameras as all pairs; 15 and 6 do so on the facade, and on the ring one more, which is wrong.
 _MOST_PAIRS = 40
 _MOST_ASKED = 30_000
 _FEWEST_PAIRS = 6
