@@ -5,6 +5,10 @@ are held by few, coarse features. A track is taken if two of its images, or half
 observations, or if one has less than a third of what it wants. Each image wants 200, in small scenes its
 share of 20,000, or some times that.
 
+A track far longer than the others is none of them. It is one that wrong matches have joined of many, and it
+joins every two of its images in the reduced system: on a facade of 2,500 images three such tracks of 17,730,
+of 480 to 966 images, made 835,000 of the 954,000 pairs, and 14 times the work of the factor.
+
 What is random is a hash of the pixels, so the choice depends neither on the order of the tracks nor on the
 order of the images.
 """
@@ -18,6 +22,9 @@ from sfm_shapefit.jit import kernel
 
 _LONG = 6
 _WANTED, _WANTED_IN_ALL = 200, 20_000
+# Observations beyond which a track may be far longer than the others, and how many times as long as nine
+# tenths of them it is then.
+_MAYBE_JOINED, _FAR_LONGER = 100, 4.0
 # The finalizer of splitmix64 (Steele, Lea and Flood 2014).
 _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _TURN = np.uint64(0x9E3779B97F4A7C15)
@@ -35,12 +42,20 @@ def choose_thin_tracks(
         num_images: n.
         times: as many as each image usually wants.
     """
-    lengths = np.minimum(np.diff(offsets), _LONG)
-    order = np.lexsort((_draw(offsets, pixels), -lengths))
+    lengths = np.diff(offsets)
+    order = np.lexsort((_draw(offsets, pixels), -np.minimum(lengths, _LONG)))
+    order = order[lengths[order] <= _longest(lengths)]
     wanted = times * max(_WANTED, _WANTED_IN_ALL // max(num_images, 1))
     taken = np.zeros(len(lengths), dtype=np.bool_)
     _choose(order, offsets, images, wanted, np.zeros(num_images, dtype=np.int64), taken)
     return np.flatnonzero(taken)
+
+
+def _longest(lengths: IntArray) -> float:
+    """Return the length beyond which a track is far longer than the others."""
+    if lengths.max(initial=0) <= _MAYBE_JOINED:
+        return np.inf
+    return max(_MAYBE_JOINED, _FAR_LONGER * float(np.quantile(lengths, 0.9)))
 
 
 def _draw(offsets: IntArray, pixels: FloatArray) -> np.ndarray[Any, np.dtype[np.uint64]]:

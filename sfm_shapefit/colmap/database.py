@@ -485,29 +485,49 @@ class MatchDatabase:
         They are read from the file only if they were not before, or there is no room to keep them.
         """
         if self._sorted is not None and (self._places[chosen] >= 0).all():
-            return self._sorted.read(self._places[chosen], lambda k: self._read_matches(int(chosen[k])))
-        parts = [self._read_matches(pair) for pair in chosen.tolist()]
-        counts = np.array([len(matches) for matches in parts], dtype=np.int64)
-        return counts, np.concatenate([np.empty((0, 2), dtype=np.uint32), *parts])
+            return self._sorted.read(self._places[chosen], lambda new: self._read_matches(chosen[new]))
+        return self._read_matches(chosen)
 
-    def _read_matches(self, pair: int) -> UInt32Array:
-        """Return the matches (M, 2) of a pair, image i first, ascending and each once.
+    def _read_matches(self, chosen: IntArray) -> tuple[IntArray, UInt32Array]:
+        """Return the matches of pairs from the file, image i first, of each pair ascending and each once.
 
-        Sums over matches then do not depend on the order in which the database lists them.
+        Sums over matches then do not depend on the order in which the database lists them. Many pairs are
+        read together, since a pair has few matches, and a call of numpy takes as long as a hundred of them.
         """
-        cols, data = self._stored(pair, "cols, data")
-        if cols != 2 or not _is_blob(data, int(self._pairs.num_inliers[pair]), 2, itemsize=4):
-            raise self._damaged_pair(pair, "matches of wrong length")
-        stored = np.frombuffer(data, dtype="<u4").reshape(-1, 2).astype(np.uint64)
-        first, second = stored.T[::-1] if self._pairs.swapped[pair] else stored.T
+        counts = self._pairs.num_inliers[chosen]
+        stored = np.frombuffer(self._stored_matches(chosen), dtype="<u4").reshape(-1, 2).astype(np.uint64)
+        swapped = np.repeat(self._pairs.swapped[chosen], counts)
+        first, second = np.where(swapped, stored.T[::-1], stored.T)
         # Of two keypoints one number is made, for numbers are sorted several times faster than rows.
-        both = np.sort(first << _KEYPOINT_BITS | second)
-        both = both[np.append(True, both[1:] != both[:-1])[: len(both)]]
+        both = first << _KEYPOINT_BITS | second
+        ends = np.cumsum(counts)
+        for begin, end in zip((ends - counts).tolist(), ends.tolist(), strict=True):
+            both[begin:end].sort()
+        new = np.append(True, both[1:] != both[:-1])[: len(both)]
+        new[(ends - counts)[counts > 0]] = True
+        of_pair = np.repeat(np.arange(len(chosen)), counts)[new]
+        both = both[new]
         matches = np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.uint32)
-        for image, keypoints in zip(self._pairs.pairs[pair].tolist(), matches.T, strict=True):
-            if len(keypoints) and int(keypoints.max()) >= self._look_at(image).number:
-                raise self._damaged_pair(pair, "matches of keypoints that do not exist")
-        return matches
+        ends_of = self._pairs.pairs[chosen]
+        numbers = {image: self._look_at(image).number for image in np.unique(ends_of).tolist()}
+        limits = np.array([[numbers[i], numbers[j]] for i, j in ends_of.tolist()]).reshape(-1, 2)
+        missing = np.flatnonzero((matches >= limits[of_pair]).any(axis=1))
+        if len(missing):
+            pair = int(chosen[of_pair[missing[0]]])
+            raise self._damaged_pair(pair, "matches of keypoints that do not exist")
+        return np.bincount(of_pair, minlength=len(chosen)), matches
+
+    def _stored_matches(self, chosen: IntArray) -> bytes:
+        """Return the matches of pairs as the file lists them, one pair after the other."""
+        query, parts = "SELECT cols, data FROM two_view_geometries WHERE rowid = ?", []
+        rowids, counts = self._pairs.rowids[chosen].tolist(), self._pairs.num_inliers[chosen].tolist()
+        with _sqlite_errors(self.path):
+            for pair, rowid, count in zip(chosen.tolist(), rowids, counts, strict=True):
+                cols, data = self._connection.execute(query, (rowid,)).fetchone()
+                if cols != 2 or not _is_blob(data, count, 2, itemsize=4):
+                    raise self._damaged_pair(pair, "matches of wrong length")
+                parts.append(data)
+        return b"".join(parts)
 
     def world_rays(self, image: int) -> FloatArray:
         """Return the rays (k, 3) of all keypoints of an image in world axes, from memory if there lately.

@@ -46,18 +46,21 @@ class SortedMatches:
         same = (self._rowids[found] == rowids) & (self._swapped[found] == swapped)
         return np.where(same, found, -1)
 
-    def read(self, places: IntArray, read: Callable[[int], UInt32Array]) -> tuple[IntArray, UInt32Array]:
+    def read(
+        self, places: IntArray, read: Callable[[IntArray], tuple[IntArray, UInt32Array]]
+    ) -> tuple[IntArray, UInt32Array]:
         """Return the matches of pairs by their places: how many of each, (m,), and all of them, (M, 2).
 
         Args:
             places: (m,) of the pairs, none of them -1.
-            read: returns the sorted matches of the pair with this position in `places`, if they are new.
+            read: returns the same of the pairs at these positions in `places`, which are new.
         """
-        for position in np.flatnonzero(self._lengths[places] < 0).tolist():
-            place, matches = int(places[position]), read(position)
-            start = int(self._starts[place])
-            self._keypoints[start : start + len(matches)] = matches
-            self._lengths[place] = len(matches)
+        new = np.flatnonzero(self._lengths[places] < 0)
+        if len(new):
+            lengths, matches = read(new)
+            shifts = self._starts[places[new]] - (np.cumsum(lengths) - lengths)
+            self._keypoints[np.repeat(shifts, lengths) + np.arange(len(matches))] = matches
+            self._lengths[places[new]] = lengths
         lengths, starts = self._lengths[places], self._starts[places]
         if len(places) and (starts[1:] == starts[:-1] + lengths[:-1]).all():
             return lengths, self._keypoints[starts[0] : starts[-1] + lengths[-1]]

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -113,7 +114,7 @@ def measure_rotations(
         parts = _estimate_here(database, min_matches, sharing)
     else:
         work = PairWork(
-            estimate=estimate_relative_rotations,
+            estimate=partial(estimate_relative_rotations, num_pairs=database.num_pairs),
             min_matches=min_matches,
             matches_per_task=_MATCHES_PER_TASK,
         )
@@ -129,7 +130,7 @@ def _estimate_here(database: MatchDatabase, min_matches: int, sharing: Sharing) 
         def advance(done: int, before: int = before) -> None:
             sharing.advance(before + done, total)
 
-        parts.append(estimate_relative_rotations(batch, sharing.threads, advance))
+        parts.append(estimate_relative_rotations(batch, sharing.threads, advance, num_pairs=total))
         before += len(batch.pairs)
     sharing.advance(total, total)
     return parts

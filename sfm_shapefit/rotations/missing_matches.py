@@ -31,7 +31,9 @@ CVPR 2008; Wilson, Snavely, "Network principles for SfM: disambiguating repeated
 context", ICCV 2013.
 """
 
+import itertools
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +42,8 @@ from sfm_shapefit.directions.matches import KeypointMatches
 
 # Of squared singular values: where matches are on a line to a thousandth, nothing is known across it.
 _RANK = 1e-6
+# Keypoints on the border of an image are in it, whatever is rounded.
+_SLACK_PX = 1e-6
 # A pair in no triangle is as likely as not to be right.
 _NO_TRIANGLE = 0.5
 # A pair is doubtful whose score is a smaller share of the median score.
@@ -75,55 +79,82 @@ def matched_shares(
         partners: (k,) in how many pairs each of them is matched, see `count_partners`.
         batch: some pairs.
     """
-    shares = np.empty(len(batch.pairs))
-    for k, (i, j) in enumerate(batch.pairs.tolist()):
-        in_i, in_j = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]].T
-        sides = np.array(
-            [
-                _share(pixels[i], partners[i], in_i, pixels[j][in_j], sizes[j]),
-                _share(pixels[j], partners[j], in_j, pixels[i][in_i], sizes[i]),
-            ]
-        )
-        known = np.isfinite(sides)  # a side that says nothing leaves it to the other
-        shares[k] = sides[known].mean() if known.any() else np.nan
-    return shares
+    if len(batch.pairs) == 0:
+        return np.zeros(0)
+    images = {k: _Image.of(pixels[k], sizes[k], partners[k]) for k in np.unique(batch.pairs).tolist()}
+    own, pairs = np.empty((2, len(batch.keypoints), 2)), batch.pairs.tolist()
+    rows = [slice(*ends) for ends in itertools.pairwise(batch.offsets.tolist())]
+    for part, ends in zip(rows, pairs, strict=True):
+        for side, k in enumerate(ends):
+            own[side, part] = pixels[k][batch.keypoints[part, side]]
+    sides = np.empty((2, len(pairs)))
+    for side, other in ((0, 1), (1, 0)):
+        maps = _affine_maps(own[side], own[other], batch.offsets[:-1])
+        for k, (part, ends, affine) in enumerate(zip(rows, pairs, maps, strict=True)):
+            image, there = images[ends[side]], images[ends[other]]
+            sides[side, k] = _share(image, batch.keypoints[part, side], affine, there.size)
+    known = np.isfinite(sides)  # a side that says nothing leaves it to the other
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, sides, 0.0).sum(axis=0) / known.sum(axis=0))
 
 
-def _share(
-    pixels: FloatArray, partners: IntArray, matched: IntArray, found: FloatArray, size: FloatArray
-) -> float:
+class _Image(NamedTuple):
+    """The keypoints of an image that are matched at all, as other images do not tell of the rest."""
+
+    pixels: FloatArray
+    """(2, k)"""
+    partners: IntArray
+    """(k,) in how many pairs they are matched."""
+    place_of: IntArray
+    """Of each keypoint of the image, its place among them."""
+    size: FloatArray
+    """(2,) of the image."""
+
+    @classmethod
+    def of(cls, pixels: FloatArray, size: FloatArray, partners: IntArray) -> "_Image":
+        """Return the keypoints of an image that are matched."""
+        matched = partners > 0
+        return cls(np.ascontiguousarray(pixels[matched].T), partners[matched], np.cumsum(matched) - 1, size)
+
+
+def _share(image: _Image, matched: IntArray, affine: FloatArray, size: FloatArray) -> float:
     """Return the share of one image's overlap with another that is matched.
 
     Args:
-        pixels, partners: of the keypoints of the image.
-        matched: (m,) which of them are matched.
-        found: (m, 2) where in the other image.
+        image: the one.
+        matched: (m,) which of its keypoints are matched with the other.
+        affine: (4, 2) see `_affine_maps`.
         size: (2,) of the other image.
     """
-    own = _marked(partners, matched)
-    others = partners > own
-    there = _affine_images(pixels[others], pixels[matched], found)
-    inside = np.all((there >= 0.0) & (there <= size), axis=1)
-    total = int(inside.sum())
-    return float((inside & own[others]).sum() / total) if total else np.nan
+    own = np.zeros(len(image.partners), dtype=np.bool_)
+    own[image.place_of[matched]] = True
+    inside = image.partners > own
+    centered = image.pixels - affine[2][:, None]
+    for column, middle, end in zip(affine[:2].T, affine[3], size, strict=True):
+        there = column[0] * centered[0] + column[1] * centered[1] + middle
+        inside &= (there >= -_SLACK_PX) & (there <= end + _SLACK_PX)
+    total = np.count_nonzero(inside)
+    return np.count_nonzero(inside & own) / total if total else np.nan
 
 
-def _affine_images(points: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return where the affine map takes points, (p, 2), that takes source to target (m, 2) best.
+def _affine_maps(source: FloatArray, target: FloatArray, starts: IntArray) -> FloatArray:
+    """Return the affine map of each pair that takes source to target (m, 2) best, (b, 4, 2).
 
-    The one of least norm, if the sources lie on one line.
+    Of a map the rows are its linear part, two, the middle of the source, and that of the target: it takes x
+    to (x - middle) @ linear + target's middle. Where the sources lie on one line, it is the one of least
+    norm.
+
+    Args:
+        source, target: the matches of all pairs, one pair after the other.
+        starts: (b,) the first match of each pair; each has one or more.
     """
-    middle, aim = source.mean(axis=0), target.mean(axis=0)
-    centered = source - middle
-    linear = np.linalg.lstsq(centered.T @ centered, centered.T @ (target - aim), rcond=_RANK)[0]
-    return np.asarray((points - middle) @ linear + aim)
-
-
-def _marked(keypoints: IntArray, matched: IntArray) -> BoolArray:
-    """Return which keypoints of an image are among the matched ones."""
-    own = np.zeros(len(keypoints), dtype=np.bool_)
-    own[matched] = True
-    return own
+    counts = np.diff(np.append(starts, len(source)))
+    both = np.concatenate([source, target], axis=1)
+    middles = np.add.reduceat(both, starts, axis=0) / counts[:, None]
+    centered = both - np.repeat(middles, counts, axis=0)
+    moments = np.add.reduceat(centered[:, :2, None] * centered[:, None, :], starts, axis=0)
+    linear = np.linalg.pinv(moments[:, :, :2], rcond=_RANK, hermitian=True) @ moments[:, :, 2:]
+    return np.concatenate([linear, middles.reshape(-1, 2, 2)], axis=1)
 
 
 def score_pairs(triplet_scores: FloatArray, shares: FloatArray) -> FloatArray:

@@ -204,6 +204,23 @@ def test_thin_tracks_are_all_where_there_are_few():
     assert chosen.tolist() == np.flatnonzero(tracks.lengths() > 0).tolist()
 
 
+def test_a_track_that_wrong_matches_joined_of_many_is_no_thin_track():
+    def choose(longest):
+        lengths = [longest, 101, *[20] * 20]  # 100 may always be, and 101 is more than four times 20
+        offsets = np.cumsum([0, *lengths])
+        images = np.concatenate([np.arange(length) for length in lengths])
+        pixels = np.random.default_rng(0).uniform(0.0, 1000.0, (len(images), 2))
+        return choose_thin_tracks(offsets, images, pixels, 600).tolist()
+
+    assert choose(600) == list(range(2, 22))
+    assert choose(100) == [0, *range(2, 22)]
+    # Where a fifth of all are as long, none is far longer than the others.
+    offsets = np.array([0, 600, 1200, *range(1203, 1224, 3)])
+    images = np.concatenate([np.tile(np.arange(600), 2), np.tile(np.arange(3), 7)])
+    pixels = np.random.default_rng(0).uniform(0.0, 1000.0, (len(images), 2))
+    assert {0, 1} <= set(choose_thin_tracks(offsets, images, pixels, 600).tolist())
+
+
 @pytest.mark.parametrize(("heavy", "scale_px"), [(False, 1.0), (True, 0.25)])
 def test_normal_errors_call_for_a_wide_loss_and_sharp_ones_with_a_tail_for_a_narrow_one(heavy, scale_px):
     rng = np.random.default_rng(0)

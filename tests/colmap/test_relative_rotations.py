@@ -85,6 +85,20 @@ def test_neither_threads_nor_batches_change_a_bit():
     assert_same_bits(concatenate([estimate_relative_rotations(part) for part in parts]), found)
 
 
+def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():
+    truth = read_model(COURTYARD / "sparse" / "0")
+    _, (batch,) = batches(COURTYARD / "database.db")
+    rng = np.random.default_rng(0)
+    wrong = np.flatnonzero(rng.random(len(batch.rays_j)) < 0.3)  # 0.7^5: a trial in six is without
+    batch.rays_j[wrong] = batch.rays_j[rng.permutation(wrong)]
+    usual = estimate_relative_rotations(batch)
+    assert_same_bits(estimate_relative_rotations(batch, num_pairs=20_000), usual)
+    found = estimate_relative_rotations(batch, num_pairs=20_001)
+    right, before = (errors_deg(one, truth.rotations) < 5.0 for one in (found, usual))
+    assert right.sum() > 0.97 * before.sum()
+    assert (found.rotations != usual.rotations).any()  # else no trial was saved
+
+
 def test_stored_rotations_count_by_their_matches(tmp_path):
     write_workspace(
         make_scene(SceneOptions(num_images=8, num_points=300)),

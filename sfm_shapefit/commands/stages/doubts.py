@@ -58,7 +58,8 @@ def ask_pairs(
     for batch in source.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
-        parts.append(estimate_relative_rotations(rays, options.num_threads()))
+        num_pairs = len(directions.pairs)
+        parts.append(estimate_relative_rotations(rays, options.num_threads(), num_pairs=num_pairs))
     return concatenate(parts)
 
 
