@@ -468,28 +468,37 @@ class _Run:
         is_checked = np.bincount(problem.points_seen, minlength=problem.num_points) >= self.checked_length
         return problem.of_points(is_checked) if is_checked.any() else problem
 
-    def adjust_thinly(
-        self, tracks: ObservedTracks, found: TriangulatedPoints, *, finely: bool = False
+    def thin_problem(
+        self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
-        """Move the frames to where few of the points found want them, and return the problem of these.
-
-        Finely: by more of them, with the loss that their errors call for.
-        """
+        """Return the problem of few of the points found, or of some times as many."""
         refuse_without_points(len(found.points))
         thin = tracks.of_points(found.points_seen)
         images = self.frames.images[thin.cameras]
-        times = _FINE_TIMES if finely else 1
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, len(self.frames.image_ids), times)
         seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
-        problem = self.frames.problem(thin.subset(chosen), points)
-        return self.solve(problem, self.choose_scale(problem) if finely else _THIN_SCALE, _THIN_FALL)
+        return self.frames.problem(thin.subset(chosen), points)
+
+    def adjust_coarsely_by_few(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+        """Move coarse frames to the optimum of a thin problem, and return it."""
+        return self.solve(problem, _THIN_SCALE, _THIN_FALL)
 
     def adjust_twice_thinly(self) -> AdjustmentProblem:
-        """Move coarse frames: at the wide limit, then finely at the threshold; return the last problem."""
-        adjusted = self.adjust_thinly(*self.triangulate(_THIN_LIMIT, checked=True))
+        """Move coarse frames: at the wide limit, then finely at the threshold; return the last problem.
+
+        Finely: by more points, with the loss that their errors call for. All tracks are given back before
+        either is solved.
+        """
+        adjusted = self.adjust_coarsely_by_few(
+            self.thin_problem(*self.triangulate(_THIN_LIMIT, checked=True))
+        )
         joined, found = self.triangulate(1.0)
-        return self.adjust_thinly(joined, found, finely=True) if len(found.points) else adjusted
+        if len(found.points) == 0:
+            return adjusted
+        problem = self.thin_problem(joined, found, times=_FINE_TIMES)
+        del joined, found
+        return self.solve(problem, self.choose_scale(problem), _THIN_FALL)
 
     def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
         """Solve, and where focal lengths are left open, hold what was given of them and solve again.
@@ -628,7 +637,7 @@ class _Run:
         refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
-            self.adjust_thinly(loosely, loose)
+            self.adjust_coarsely_by_few(self.thin_problem(loosely, loose))
         joined, found, adjusted = self.adjust_by_all_points()
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points).of_length(self.checked_length)

@@ -65,6 +65,8 @@ def adjust_first_placement(
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
     seed, tracks = seed_and_tracks(source, located, clock.advance)
+    if source.database is not None:
+        source.database.forget_rays()  # the adjustment is where most memory is needed
     given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
     adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())

@@ -116,17 +116,22 @@ def sample_errors(
     if not samples_errors(source, directions):
         return None
     row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
-    errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
+    usable = directions.usable()
+    place = np.full(len(directions.pairs), -1)
+    place[usable] = np.arange(len(usable))
+    errors = np.zeros((len(usable), NUM_SAMPLES, 2))
     for batch in source.batches():
         rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
-        errors[rows] = sample_direction_errors(
+        found = sample_direction_errors(
             batch,
             directions.directions[rows],
             directions.covariance[rows],
             SIGMA_PER_MEDIAN * directions.median_residual_px[rows],
             options.inlier_threshold_px,
         )
-    return errors[directions.usable()]
+        kept = place[rows] >= 0
+        errors[place[rows[kept]]] = found[kept]
+    return errors
 
 
 def collect_evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
@@ -154,7 +159,9 @@ def add_evidence(
     support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
     errors = evidence.errors
     if errors is not None:
-        draws = np.random.default_rng(0).standard_normal((len(own), *errors.shape[1:]))
-        sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
-        errors = np.concatenate([errors, sigmas[:, None, :] * draws])
+        sampled, errors = errors, np.empty((len(errors) + len(own), *errors.shape[1:]))
+        errors[: len(sampled)] = sampled
+        drawn = errors[len(sampled) :]  # in place: these are the largest arrays of a placement
+        np.random.default_rng(0).standard_normal(out=drawn)
+        drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
     return replace(measured, evidence=replace(evidence, support=support, errors=errors))
