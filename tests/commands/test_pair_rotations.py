@@ -103,7 +103,7 @@ def test_an_interrupt_ends_the_work_after_the_slices_at_hand(monkeypatch, thread
     monkeypatch.setattr(door, "_PAIRS_PER_SLICE", 8)
     begun, estimate = [], door._estimate_slice
     monkeypatch.setattr(
-        door, "_estimate_slice", lambda batch, first: (begun.append(first), estimate(batch, first))[1]
+        door, "_estimate_slice", lambda *given: (begun.append(given[-1]), estimate(*given))[1]
     )
 
     def interrupt(_stage, done, _total):
