@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.jit import kernel
@@ -108,6 +108,20 @@ class MatchedKeypoints:
     """(K, 2) see `ObservedTracks`."""
     matches: npt.NDArray[np.integer]
     """(m, 2) rows of the above, of any type of integer."""
+
+    def count_partners(self) -> IntArray:
+        """Return how many matches each keypoint has, (K,)."""
+        counts = np.zeros(len(self.cameras), dtype=np.int64)
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            ends = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
+            counts += np.bincount(ends.ravel(), minlength=len(counts))
+        return counts
+
+    def among(self, chosen: BoolArray) -> "MatchedKeypoints":
+        """Return the same keypoints with the matches between chosen ones (K,) only."""
+        if chosen.all():
+            return self
+        return replace(self, matches=self.matches[chosen[self.matches].all(axis=1)])
 
     def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
         """Return the connected components under the matches that agree with the poses.

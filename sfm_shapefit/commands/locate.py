@@ -190,7 +190,14 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options, judge)
-    seeded = build_seeded_model(source, located, options, clock, known.executor)
+    seeded = build_seeded_model(
+        source,
+        located,
+        options,
+        clock,
+        known.executor,
+        is_adjusted=adjustment is not None or known.centers is not None,
+    )
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
     seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:

@@ -38,8 +38,7 @@ from sfm_shapefit.results.result import FurtherPiece
 if TYPE_CHECKING:
     import pycolmap
 
-# COLMAP's triangulator takes seconds and 40 MB for a million matches. But it finds up to 1.6 %
-# more observations on real sets, see `triangulate_in_blocks`.
+# COLMAP's triangulator takes seconds and 40 MB for a million matches.
 _MOST_MATCHES_OF_A_GRAPH = 2_000_000
 # Fewer trusted cameras are no result.
 _FEWEST_KEPT = 3
@@ -97,11 +96,14 @@ def build_seeded_model(
     options: LocateOptions,
     clock: Clock,
     executor: Executor | None = None,
+    *,
+    is_adjusted: bool = False,
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
-    executor shares out the model's own tracks.
+    executor shares out the model's own tracks. Where an adjustment had the cameras before, `is_adjusted`,
+    its own triangulation makes the points too: it has longer tracks that fit better, in half the time.
     """
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
@@ -111,7 +113,7 @@ def build_seeded_model(
             source.database.forget_rays()  # triangulation is where most memory is needed
     if not options.bundle_adjust:
         with clock("triangulation"):
-            seeded = _triangulate(seed, tracks, options, clock.advance, executor)
+            seeded = _triangulate(seed, tracks, options, clock.advance, executor, is_adjusted)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
             adjusted = bundle_adjust(
@@ -149,9 +151,10 @@ def _triangulate(
     options: LocateOptions,
     advance: Callable[[int, int], None],
     executor: Executor | None,
+    is_adjusted: bool,
 ) -> "pycolmap.Reconstruction":
     """Return the seed itself with the points of the tracks."""
-    if isinstance(tracks, ImageMatches) and len(tracks.keypoints) > _MOST_MATCHES_OF_A_GRAPH:
+    if isinstance(tracks, ImageMatches) and (is_adjusted or len(tracks.keypoints) > _MOST_MATCHES_OF_A_GRAPH):
         return triangulate_in_blocks(seed, tracks, options, advance)
     return triangulate(seed, tracks, options, advance, executor, in_place=True)
 
