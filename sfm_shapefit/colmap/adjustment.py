@@ -366,12 +366,14 @@ def add_points(
     used = used[np.argsort(found.points_seen[used], kind="stable")]
     ends = np.cumsum(np.bincount(found.points_seen[used], minlength=len(found.points))).tolist()
     image_ids = np.array(frames.image_ids)[frames.images[tracks.cameras[used]]].tolist()
-    elements = list(map(pycolmap.TrackElement, image_ids, tracks.keypoints[used].tolist()))
+    keypoints = tracks.keypoints[used].tolist()
     first = 1 + reconstruction.num_points3D()
     ids = range(first, first + len(ends)) if tracks.may_split else tracks.ids[found.tracks].tolist()
     begin = 0
     for point_id, end, xyz in zip(ids, ends, found.points, strict=True):
-        track = pycolmap.Track(elements[begin:end])
+        track = pycolmap.Track()
+        for image_id, keypoint in zip(image_ids[begin:end], keypoints[begin:end], strict=True):
+            track.add_element(image_id, keypoint)  # a TrackElement for each takes four times as long
         point = pycolmap.Point3D(xyz=xyz, track=track)
         if colors is not None:
             point.color = colors.point3D(point_id).color

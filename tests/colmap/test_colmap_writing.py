@@ -319,6 +319,25 @@ def test_blocks_leave_out_what_only_two_images_share_as_colmaps_triangulator_doe
     assert nothing.num_points3D() == 0
 
 
+def test_blocks_keep_a_match_of_two_images_with_another_partner_as_colmaps_triangulator_does():
+    original, _ = ring_model()
+    further = batch_of(np.array([[1, 2]]), 60)
+    further.keypoints[:, 1] = 119 - further.keypoints[:, 1]  # of other points
+
+    def seeing(triangulator):
+        structure = triangulator(*seeded(original, batches=[batch_of(np.array([[0, 1]]), 120), further]))
+        first = min(structure.images)
+        return {
+            e.point2D_idx
+            for p in structure.points3D.values()
+            for e in p.track.elements
+            if e.image_id == first
+        }
+
+    assert seeing(lambda *given: triangulate_in_blocks(*given, StructureOptions())) == set(range(60))
+    assert seeing(triangulate) == set(range(60))
+
+
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
     # baselines of at most 0.12 units at 60 units: 0.11 degrees
     original, _ = ring_model(centers=0.01 * ring_centers() + [60.0, 0.0, 0.0])

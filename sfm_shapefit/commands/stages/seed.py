@@ -103,7 +103,7 @@ def build_seeded_model(
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
     executor shares out the model's own tracks. Where an adjustment had the cameras before, `is_adjusted`,
-    its own triangulation makes the points too: it has longer tracks that fit better, in half the time.
+    its own triangulation makes the points too: they fit better, in half the time (`triangulate_in_blocks`).
     """
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
