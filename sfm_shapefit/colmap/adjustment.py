@@ -223,7 +223,7 @@ def triangulate_in_blocks(
         seed: the placed images, without points; changed in place.
         matches: of their keypoints.
         options: what a point must satisfy.
-        advance: called with the tracks that are done and their number, of a joining.
+        advance: called with the tracks of the first joining that are done, and their number.
     """
     frames = read_frames(seed)
     limits = PointLimits(
@@ -250,7 +250,8 @@ def triangulate_in_blocks(
             add_points(seed, frames, block, found)
             seeing = _number_keypoints(frames, block)[found.points_seen >= 0]
             is_left[np.searchsorted(numbers, seeing)] = False
-            advance(min(first + _TRACKS_A_BLOCK, len(chosen)), len(chosen))
+            if share == _JOINING_SHARES[0]:  # nearly all tracks
+                advance(min(first + _TRACKS_A_BLOCK, len(chosen)), len(chosen))
     filter_in_place(seed, options)
     return seed
 

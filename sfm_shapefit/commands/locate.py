@@ -65,6 +65,7 @@ from sfm_shapefit.results.warnings import (
     match_warnings,
     prior_warnings,
     quality_warnings,
+    support_warnings,
     trust_warnings,
 )
 from sfm_shapefit.rotations.gravity import Gravity
@@ -220,6 +221,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
         *of_control,
         *of_gravity,
+        *support_warnings(_without_support(source.model, seeded.poor, options)),
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -248,6 +250,12 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         ),
         control_points=tuple(control_points),
     )
+
+
+def _without_support(model: PosedModel, poor: Mapping[int, int], options: LocateOptions) -> list[str]:
+    """Return the names of the images that were left out though they see as many points as is asked for."""
+    lost = {image_id for image_id, count in poor.items() if count >= options.min_points_per_image}
+    return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(lost))).tolist()]
 
 
 def _at_known_centers(

@@ -331,7 +331,9 @@ class LocateSummary(PlacementSummary):
     inputs: Annotated[ModelInputs, "What was read."]
     not_trusted: Annotated[dict[str, str], "Images that are left out because they are not trusted, and why."]
     few_points: Annotated[
-        dict[str, int], "Images that are left out because they see too few points, and how many."
+        dict[str, int],
+        "Images that are left out because they see too few points, or hardly any of those that their matches "
+        "could make, and how many they see.",
     ]
     pairs: Annotated[
         dict[str, int],

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
 CARRIED_FIXED = "fixed; no pair of it takes part"
 CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
 
@@ -126,7 +127,8 @@ class LocateResult(Displayed):
     """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
     that set the axes."""
     poor: dict[int, int] = field(default_factory=dict)
-    """By the id of each image that was left out because it sees too few points, their number."""
+    """By the id of each image that was left out because it sees too few points, or hardly any of those that
+    its matches could make: how many it sees."""
     agreeing_observations: float = math.nan
     """Of the keypoints of images in the output that are matched in two or more of the others, the share that
     sees a 3D point; NaN where there is no database."""
@@ -210,7 +212,8 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
+            least = self.options.min_points_per_image
+            reason = f"it sees {counted(count, 'point')}, fewer than {least}" if count < least else NO_SUPPORT
             rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
@@ -233,7 +236,7 @@ class LocateResult(Displayed):
 
     @property
     def few_points(self) -> dict[int, int]:
-        """By the images that were left out because they see too few points, how many these are."""
+        """By the images that were left out for what they see of points, how many these are."""
         images = enumerate(self.model.image_ids.tolist())
         return {camera: self.poor[image_id] for camera, image_id in images if image_id in self.poor}
 

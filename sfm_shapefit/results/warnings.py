@@ -129,6 +129,23 @@ def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
             )
 
 
+def support_warnings(names: Sequence[str]) -> Iterator[str]:
+    """Yield which cameras are left out because their matches make no points, if any are."""
+    if names:
+        shown = ", ".join(names[:_NAMED]) + (
+            f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        )
+        subject, rest = (
+            ("1 camera is", "its pose is")
+            if len(names) == 1
+            else (f"{len(names)} cameras are", "their poses are")
+        )
+        yield (
+            f"{subject} left out because hardly any match makes a point with a third image: {shown}; "
+            f"{rest} wrong, or the scene repeats itself; --min-trust 0 keeps what is left out"
+        )
+
+
 def ambiguity_warnings(placement: Placement) -> Iterator[str]:
     """Yield which cameras stand as well turned as they do as placed."""
     doubts = placement.assessment.doubts

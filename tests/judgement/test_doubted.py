@@ -75,9 +75,9 @@ def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, 
     """As a model of 5,000 images is: 25 images may ask 150 pairs, so each one only its six strongest."""
     asked = []
 
-    def estimate(rays, threads):
+    def estimate(rays, threads, **known):
         asked.extend(rays.pairs.tolist())
-        return estimate_relative_rotations(rays, threads)
+        return estimate_relative_rotations(rays, threads, **known)
 
     monkeypatch.setattr(doubts_stage, "_MOST_ASKED", 6 * 25)
     monkeypatch.setattr(doubts_stage, "estimate_relative_rotations", estimate)

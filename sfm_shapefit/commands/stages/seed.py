@@ -14,8 +14,9 @@ from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenPoses, bundle_a
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     ObservationShares,
+    count_observations,
     deregister_of_few_points,
-    judge_observations,
+    deregister_without_support,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
 from sfm_shapefit.colmap.structure import (
@@ -74,7 +75,8 @@ class Seeded(NamedTuple):
     adjusted: Adjusted | None
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
-    """By the id of each image that was left out because it sees too few points, their number."""
+    """By the id of each image that was left out because it sees too few points, or hardly any of those that
+    its matches could make, their number."""
     observations: ObservationShares
     """What of the keypoints matched in two other images sees a point, and what contradicts the cameras."""
 
@@ -129,7 +131,10 @@ def build_seeded_model(
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares = ObservationShares(math.nan, math.nan)
     if source.database is not None:  # points of the model's own tracks have their colors already
-        shares = judge_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+        counts = count_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+        if options.min_trust > 0.0:
+            poor |= deregister_without_support(seeded, counts, frames)
+        shares = counts.subset(np.isin(counts.image_ids, list(seeded.reg_image_ids()))).shares()
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
     if poor:
