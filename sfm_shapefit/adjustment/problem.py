@@ -55,6 +55,8 @@ class Lens:
     """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
     fixed: bool = False
     """Whether it stays what it is even where focal lengths or distortion are free."""
+    focal_fixed: bool = False
+    """Whether its focal lengths stay even where they are free."""
 
     def __post_init__(self) -> None:
         """Refuse unknown models and impossible parameters."""
@@ -92,6 +94,7 @@ class Lens:
         slots = np.full(NUM_VALUES, -1)
         if self.fixed:
             return slots
+        focal_lengths = focal_lengths and not self.focal_fixed
         unknown = 0
         for place in _PLACES[self.model]:
             if place in (_CX, _CY) or not (focal_lengths if place <= _FY else distortion):

@@ -103,7 +103,9 @@ class RefinedLenses(NamedTuple):
     sigmas: Mapping[int, float]
     """Standard deviation of the focal length, as a share of it; NaN where it is not known, as with Ceres."""
     undetermined: tuple[int, ...]
-    """Those whose focal length the points leave open: they have what was given."""
+    """Those whose focal length the points leave open: it is what was given."""
+    free: FreeLenses = ALL_HELD
+    """What later adjustments may change."""
 
 
 class SensorSigma(NamedTuple):
@@ -252,7 +254,7 @@ def bundle_adjust(
             start, tracks, structure_options, fixed_frames, given.lenses, free_rigs=given.free_rigs
         )
         uncertainty, sensors = Uncertainty(), _ask_sensors(unfiltered, fixed_frames, given)
-        refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
+        refined = RefinedLenses(dict.fromkeys(given.lenses.with_free_focal(), math.nan), (), given.lenses)
     else:
         run = _Run(seed, tracks, structure_options, fixed_frames, given)
         run.weight = given.weight_of(run.frames.frame_ids)
@@ -419,7 +421,7 @@ class _Run:
         fixed_frames: Collection[int],
         given: GivenPoses,
     ) -> None:
-        self.lenses, self.refined = given.lenses, UNREFINED
+        self.lenses, self.refined = given.lenses, RefinedLenses({}, (), given.lenses)
         self.start = self.frames = read_frames(seed, fixed_frames, given.centers, free_rigs=given.free_rigs)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
@@ -531,21 +533,24 @@ class _Run:
             found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
         except UnsolvableError:
             found = dict.fromkeys(ids, math.inf)
-        sigmas = {camera: found[camera] for camera in ids if camera in self.lenses.doubts}
-        self.refined = self.refined._replace(sigmas=sigmas)
-        lenses = dict(zip(ids, self.frames.lenses, strict=True))
-        doubts = self.lenses.doubts
-        return [i for i in sigmas if not doubts[i].accepts(lenses[i], sigmas[i])]
+        told = self.lenses.with_free_focal()
+        self.refined = self.refined._replace(sigmas={i: found[i] for i in ids if i in told})
+        lenses, doubts = dict(zip(ids, self.frames.lenses, strict=True)), self.lenses.doubts
+        return [i for i in ids if i in doubts and not doubts[i].accepts(lenses[i], found[i])]
 
     def hold_lenses(self, camera_ids: Sequence[int]) -> None:
-        """Give lenses back what was given of them, and hold it from now on."""
+        """Give lenses back what was given of them, and hold their focal lengths from now on.
+
+        A lens that is not to be believed even so is held as a whole.
+        """
         given = {camera: self.lenses.doubts[camera].given for camera in camera_ids}
         ids = self.frames.colmap_camera_of_lens
         lenses = tuple(given.get(i, lens) for i, lens in zip(ids, self.frames.lenses, strict=True))
         self.frames = replace(self.frames, lenses=lenses)
         self.source = with_rays_of(self.frames, self.source)
-        self.lenses = self.lenses.without(camera_ids)
-        self.refined = self.refined._replace(undetermined=(*self.refined.undetermined, *camera_ids))
+        self.lenses = self.lenses.holding(camera_ids)
+        undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *camera_ids)))
+        self.refined = self.refined._replace(undetermined=undetermined, free=self.lenses)
 
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""

@@ -109,7 +109,8 @@ def _solve(
     settings.refine_sensor_from_rig = free_rigs
     if lenses is not None and lenses.doubts:
         settings.refine_focal_length, settings.refine_extra_params = True, lenses.distortion
-        for camera_id in sorted(set(reconstruction.cameras) - set(lenses.doubts)):
+        # Ceres, by pycolmap, frees the focal lengths of all cameras or of none.
+        for camera_id in sorted(set(reconstruction.cameras) - set(lenses.with_free_focal())):
             config.set_constant_cam_intrinsics(camera_id)
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     settings.ceres.loss_function_scale = loss_scale_px

@@ -39,9 +39,9 @@ class Intrinsics:
 
     def after(self, refined: RefinedLenses) -> "Intrinsics":
         """Return the same after one more adjustment; what it left open is held from then on."""
-        undetermined = (*self.refined.undetermined, *refined.undetermined)
-        together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined)
-        return replace(self, refined=together, free=self.free.without(undetermined))
+        undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *refined.undetermined)))
+        together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined, refined.free)
+        return replace(self, refined=together, free=refined.free)
 
     def how(self, camera: int) -> How:
         """Return what decided about the focal length of a camera at last."""
@@ -109,7 +109,7 @@ def _describe(row: CameraIntrinsics) -> str:
     given, found = row["given_focal_px"], row["focal_px"]
     head = f"camera {row['camera']}: focal length {given:,.1f} px ({row['origin']})"
     if row["decided_by"] == "undetermined":
-        return f"{head} kept, the matches do not tell it"
+        return f"{head} kept, the matches do not tell it{_describe_distortion(row)}"
     if row["decided_by"] == "held":
         return f"{head} kept"
     by = "by the view graph" if row["decided_by"] == "view graph" else "by adjustment"

@@ -171,8 +171,9 @@ class CameraIntrinsics(TypedDict):
     origin: Annotated[str, "Where what was given comes from: a guess, EXIF data, or given."]
     decided_by: Annotated[
         Literal["adjusted", "view graph", "undetermined", "held"],
-        "What decided: the adjustments; the fundamental matrices alone; the matches do not tell it, so that "
-        "it stays as given; it was not to be changed.",
+        "What decided about its focal length: the adjustments; the fundamental matrices alone; the matches "
+        "do not tell it, so that it stays as given, and only the distortion may change; it was not to be "
+        "changed.",
     ]
     given_focal_px: Annotated[float, "Mean focal length as given."]
     focal_px: Annotated[float, "Mean focal length of the output."]

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment import AdjustmentOptions, Lens, adjust
+from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, LensDoubt, focal_sigmas
 from tests.adjustment.made import disturb, look_at, ring_problem
 
@@ -90,4 +91,47 @@ def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
         assert (found[0].parameters[3] != 0.0) == distortion
         assert abs(found[0].parameters[0] - TRUE_PX) < 2.0
     assert ALL_HELD.apply(start, [3, 5]) is start
-    assert free.without([3]).overrides() == {"free_focal_lengths": False, "free_distortion": False}
+    assert free.holding([3]).focal_held == {3}
+    none = {"free_focal_lengths": False, "free_distortion": False}
+    assert free.holding([3]).holding([3]).overrides() == none
+    assert free._replace(distortion=False).holding([3]).overrides() == none
+    flat = FreeLenses(
+        {3: LensDoubt(Lens("SIMPLE_PINHOLE", (520.0, 320.0, 240.0)), 0.3, 0.1)}, distortion=True
+    )
+    assert flat.holding([3]).overrides() == none
+
+
+def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
+    # A focal length and a street a times as long, and k1 a^2 times as large, make the same pixels.
+    rng, true_k1 = np.random.default_rng(0), -0.1
+    centers = np.column_stack([np.zeros(10), np.zeros(10), 1.5 * np.arange(10)])
+    points = rng.uniform([-6.0, -3.0, 4.0], [6.0, 2.0, 40.0], (500, 3))
+    cameras, seen = (index.ravel() for index in np.indices((10, 500)))
+    x = points[seen] - centers[cameras]
+    u = x[:, :2] / x[:, 2:]
+    kept = (x[:, 2] > 1.0) & (np.abs(u) < [0.64, 0.48]).all(axis=1)
+    bent = u * (1.0 + true_k1 * np.sum(u**2, axis=1, keepdims=True))
+    pixels = TRUE_PX * bent + [320.0, 240.0] + 0.3 * rng.standard_normal(u.shape)
+    problem = AdjustmentProblem(
+        rotations=np.tile(np.eye(3), (10, 1, 1)),
+        centers=centers,
+        points=points,
+        cameras_seeing=cameras[kept],
+        points_seen=seen[kept],
+        pixels=pixels[kept],
+        lenses=[Lens("SIMPLE_RADIAL", (TRUE_PX, 320.0, 240.0, 0.0))],
+        lens_of_camera=np.zeros(10, np.int64),
+    )
+    given_px = 510.0
+    free, start = doubted(problem, given_px, 0.3, distortion=True)
+    lens, sigma = solve(free, start)
+    assert not free.doubts[7].accepts(lens, sigma)
+    held = free.holding([7])
+    options = replace(OPTIONS, **held.overrides())
+    found = adjust(held.apply(start, [7]), options).problem
+    focal_px, _, _, k1 = found.lenses[0].parameters
+    assert focal_px == given_px
+    assert focal_sigmas(found, options)[0] == 0.0
+    sigma_k1 = estimate_covariances(found, options).lens_sigmas[0, 4]
+    assert 0.0 < sigma_k1 < 0.1 * abs(true_k1)
+    assert k1 == pytest.approx(true_k1 * (given_px / TRUE_PX) ** 2, abs=4.0 * sigma_k1)

@@ -279,7 +279,16 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
     held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
-    assert held.reconstruction.camera(1).params.tolist() == start.camera(1).params.tolist()
+    assert 1 not in held.lenses.sigmas
+    given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
+    assert kept[:3] == given[:3]
+    assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
+    again = adjust_thinly(start, tracks, given=GivenPoses(lenses=held.lenses.free))
+    assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
+    monkeypatch.setattr(free_lenses, "_MOST_DISTORTION", 0.0)
+    held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
+    assert held.lenses.undetermined == (1,)
+    assert held.reconstruction.camera(1).params.tolist() == given
 
 
 def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():

@@ -41,6 +41,12 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
             row(decided_by="undetermined", found=1000.0, sigma=None),
             "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it",
         ),
+        (
+            row(decided_by="undetermined", found=1000.0, sigma=None)
+            | {"parameters": [1000.0, 600.0, 450.0, -0.05]},
+            "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it, "
+            "distortion -0.0500",
+        ),
         (row(decided_by="held", found=1000.0), "camera 1: focal length 1,000.0 px (a guess) kept"),
     ],
 )
@@ -68,8 +74,12 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
         view_graph={1: 1.1},
     )
     assert [known.how(camera) for camera in (1, 2)] == ["view graph", "held"]
-    after = known.after(RefinedLenses({1: 0.01}, (2, 3))).after(RefinedLenses({1: 0.005}, ()))
-    assert set(after.free.doubts) == {1}
+    held = known.free.holding([2, 3])
+    after = known.after(RefinedLenses({1: 0.01}, (2, 3), held))
+    after = after.after(RefinedLenses({1: 0.005}, (3,), held.holding([3])))
+    assert set(after.free.doubts) == {1, 2}
+    assert after.free.with_free_focal() == [1]
+    assert after.refined.undetermined == (2, 3)
     assert [after.how(camera) for camera in (1, 2, 3)] == ["adjusted", "undetermined", "undetermined"]
     assert after.refined.sigmas == {1: 0.005}
     rows = [row(1), row(2, "undetermined"), row(3, "undetermined")]
