@@ -1,4 +1,14 @@
-"""How numbers are said: counts with their noun, and figures in which rounding is zero."""
+"""How names and numbers are said: the first of many, counts with their noun, figures."""
+
+from collections.abc import Sequence
+
+_NAMED = 3
+
+
+def first_of(names: Sequence[str]) -> str:
+    """Return the first three names and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return f"{', '.join(names[:_NAMED])}{more}"
 
 
 def counted(number: int, noun: str) -> str:

@@ -10,6 +10,7 @@ from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.colmap.bundle_adjustment import UNREFINED, RefinedLenses
 from sfm_shapefit.colmap.intrinsics import Origin
 from sfm_shapefit.results.json_types import CameraIntrinsics
+from sfm_shapefit.wording import first_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -142,9 +143,8 @@ def intrinsics_warnings(intrinsics: Intrinsics, rows: list[CameraIntrinsics]) ->
     ):
         cameras = [str(row["camera"]) for row in guessed if row["decided_by"] == how]
         if cameras:
-            more = f" and {len(cameras) - _NAMED} more" if len(cameras) > _NAMED else ""
             noun = "cameras" if len(cameras) > 1 else "camera"
             yield (
-                f"{noun} {', '.join(cameras[:_NAMED])}{more} kept a focal length that was never measured, "
+                f"{noun} {first_of(cameras)} kept a focal length that was never measured, "
                 f"{what}; calibrate if the result is poor"
             )

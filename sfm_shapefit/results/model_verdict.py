@@ -31,6 +31,7 @@ import numpy as np
 
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.results.warnings import match_warnings, uncertain_cameras
+from sfm_shapefit.wording import first_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.result import GraphResult, LocateResult
@@ -40,7 +41,6 @@ _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_PAIRS = 0.25
 _LEAST_KEPT = 0.5
 _LOW_TRUST = 0.75
-_NAMED = 3
 
 
 class Grade(enum.Enum):
@@ -73,9 +73,8 @@ class ModelVerdict:
             return "good"
         what = self.grade.value
         if self.grade is Grade.LOOK and self.cameras:
-            more = f" and {len(self.cameras) - _NAMED} more" if len(self.cameras) > _NAMED else ""
             noun = "camera" if len(self.cameras) == 1 else "cameras"
-            what = f"look at {len(self.cameras)} {noun} ({', '.join(self.cameras[:_NAMED])}{more})"
+            what = f"look at {len(self.cameras)} {noun} ({first_of(self.cameras)})"
         return "; ".join([what, *self.reasons]) if self.cameras else f"{what}: {'; '.join(self.reasons)}"
 
 

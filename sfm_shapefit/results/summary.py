@@ -15,6 +15,7 @@ from sfm_shapefit.results.json_types import (
     BundleAdjustment,
     EarthDatum,
     GraphSummary,
+    JudgedModel,
     KnownDistance,
     LocateSummary,
     LoopOfVideo,
@@ -26,6 +27,7 @@ from sfm_shapefit.results.json_types import (
     Solve,
 )
 from sfm_shapefit.results.key_figures import NOISE_ONLY, SOLVER_UNITS, UNITS, key_figures
+from sfm_shapefit.results.model_verdict import ModelVerdict
 from sfm_shapefit.results.rows import piece_rows
 from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.results.warnings import graph_warnings
@@ -93,6 +95,16 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
     }
 
 
+def told_verdict(verdict: ModelVerdict) -> JudgedModel:
+    """Return a verdict as JSON has it."""
+    return {
+        "grade": verdict.grade.value,
+        "statement": verdict.statement,
+        "cameras": list(verdict.cameras),
+        "reasons": list(verdict.reasons),
+    }
+
+
 def told_distances(known: Sequence["ToldDistance"], model: "pycolmap.Reconstruction") -> list[KnownDistance]:
     """Return the distances that were told, each with what a model has."""
     named = {name for one in known for name in one[:2]}
@@ -137,12 +149,7 @@ def _summarize(
     others = ("pycolmap", "numpy", "scipy", "clarabel")
     return {
         "schema_version": SCHEMA_VERSION,
-        "verdict": {
-            "grade": found.verdict.grade.value,
-            "statement": found.verdict.statement,
-            "cameras": list(found.verdict.cameras),
-            "reasons": list(found.verdict.reasons),
-        },
+        "verdict": told_verdict(found.verdict),
         "options": asdict(found.options),
         "num_images": placement.graph.num_nodes,
         "num_placed": len(placement.cameras),

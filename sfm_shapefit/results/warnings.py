@@ -15,7 +15,7 @@ from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
-from sfm_shapefit.wording import counted
+from sfm_shapefit.wording import counted, first_of
 
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
 _ALARMING_SHARE = 0.5
@@ -32,7 +32,6 @@ drawn courtyards, which are placed well, and 0.31 before drawn facades of one ho
 half of the cameras were shifted by a house without a contradiction."""
 # Fewer pairs on two directions prove nothing.
 _FEWEST_TWOFOLD = 3
-_NAMED = 3
 
 
 def quality_warnings(placement: Placement) -> Iterator[str]:
@@ -132,17 +131,15 @@ def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
 def support_warnings(names: Sequence[str]) -> Iterator[str]:
     """Yield which cameras are left out because their matches make no points, if any are."""
     if names:
-        shown = ", ".join(names[:_NAMED]) + (
-            f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        )
         subject, rest = (
             ("1 camera is", "its pose is")
             if len(names) == 1
             else (f"{len(names)} cameras are", "their poses are")
         )
         yield (
-            f"{subject} left out because hardly any match makes a point with a third image: {shown}; "
-            f"{rest} wrong, or the scene repeats itself; --min-trust 0 keeps what is left out"
+            f"{subject} left out because hardly any match makes a point with a third image: "
+            f"{first_of(names)}; {rest} wrong, or the scene repeats itself; "
+            "--min-trust 0 keeps what is left out"
         )
 
 
@@ -154,10 +151,9 @@ def ambiguity_warnings(placement: Placement) -> Iterator[str]:
     ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
     for body in np.unique(doubts.bodies[ambiguous]).tolist():
         members = np.flatnonzero(doubts.bodies == body)
-        names = [placement.graph.name_of(int(placement.cameras[k])) for k in members[:_NAMED].tolist()]
-        more = f" and {len(members) - _NAMED} more" if len(members) > _NAMED else ""
+        names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
         yield (
-            f"the scene seems to repeat itself: as many matches speak for turning {', '.join(names)}{more} "
+            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} "
             f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
         )
 

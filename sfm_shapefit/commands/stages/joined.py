@@ -32,7 +32,7 @@ from sfm_shapefit.results.key_figures import UNITS, key_figures
 from sfm_shapefit.results.map_result import MappedModel
 from sfm_shapefit.results.model_verdict import Grade, ModelVerdict
 from sfm_shapefit.results.rows import correlations_of, covariance_of
-from sfm_shapefit.results.summary import told_distances
+from sfm_shapefit.results.summary import told_distances, told_verdict
 from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION, CameraRow
 
 if TYPE_CHECKING:
@@ -210,9 +210,4 @@ def _judge(
     cameras = dict.fromkeys([*(name for verdict in verdicts.values() for name in verdict.cameras), *weak])
     said = tuple(f"model {k}: {reason}" for k, verdict in verdicts.items() for reason in verdict.reasons)
     verdict = ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*reasons, *said))
-    return {
-        "grade": verdict.grade.value,
-        "statement": verdict.statement,
-        "cameras": list(verdict.cameras),
-        "reasons": list(verdict.reasons),
-    }
+    return told_verdict(verdict)
