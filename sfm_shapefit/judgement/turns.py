@@ -26,6 +26,10 @@ Bodies are found by contraction (`bodies`) from pairs that agree and pairs that 
 relative: of all bodies the one whose turn mends most is turned first, the smallest of equals, and none that
 has more than half of all cameras; its pairs then agree, and bodies are found anew.
 
+Turns that are smaller than a pair can tell are looked for at last, in all pairs together (`small_turns`). Of
+a camera whose correction is larger than a degree, and than five of its standard deviations, `turned` are the
+pairs that fit better with it, `placed` those that fit only without.
+
 How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
 and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
 degrees are added for the given rotations, and where the quarter of pairs that agrees best has larger errors
@@ -42,10 +46,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import PairDirections, is_usable
 from sfm_shapefit.judgement.bodies import find_bodies
+from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.two_view_poses import LAST_WIDTH_PX
 
@@ -75,6 +81,10 @@ RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
 _MOST_VOTES = 300
 _MOST_TURNED = 50
 _AVERAGING_STEPS = 4
+# Standard deviations from which a correction is no chance, however few and inexact the pairs are.
+_CERTAIN_SIGMAS = 5.0
+# For all pairs together, standard deviations are what the pairs that agree best show, and this at least.
+_LEAST_LEVEL = 0.2
 
 
 class Doubt(enum.Enum):
@@ -207,7 +217,8 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     ends = group[pairs.pairs]
     kept = ends[:, 0] != ends[:, 1]
     case = pairs.subset(kept)._replace(pairs=ends[kept])
-    inflation = _inflation(case)
+    level = _level(case)
+    inflation = max(1.0, level)
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
     touching = _Touching.of(case.pairs, count)
@@ -239,6 +250,9 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
             for member in members.tolist():
                 judged[member] = found
             body_of[members] = members[0]
+    for member, found in _judge_by_all_pairs(case, count, level, least_rad).items():
+        if judged[member].kind is not Doubt.TURNED:
+            judged[member], body_of[member] = found, member
     return Doubts(
         kinds=tuple(judged[g].kind for g in group.tolist()),
         placed=np.array([judged[g].placed for g in group.tolist()]),
@@ -303,14 +317,14 @@ def _angles(rotations: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.arcsin(np.minimum(half, 1.0)))
 
 
-def _inflation(pairs: PairTurns) -> float:
-    """Return by what the turns near 0 are larger than their standard deviations say, at least 1."""
+def _level(pairs: PairTurns) -> float:
+    """Return by what the turns near 0 are larger than their standard deviations say; 1 without any."""
     angles = _angles(pairs.turns)
     near = np.isfinite(pairs.sigmas_rad) & (angles < _NEAR_RAD)
     if not near.any():
         return 1.0
     quantile = float(np.quantile(angles[near] / pairs.sigmas_rad[near], _LEVEL_QUANTILE))
-    return max(1.0, quantile / _NORMAL_QUANTILE)
+    return quantile / _NORMAL_QUANTILE
 
 
 def _contradicts(pairs: PairTurns) -> BoolArray:
@@ -378,6 +392,41 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
         num_turned=int(turned.sum()),
         turn=turn,
     )
+
+
+def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: float) -> dict[int, _Judged]:
+    """Return the groups that all pairs together say are turned, by more than `least_rad`.
+
+    Turns near 0 are `level` times as large as the standard deviations say.
+    """
+    case, level = pairs.subset(np.isfinite(pairs.sigmas_rad)), float(np.clip(level, _LEAST_LEVEL, 1.0))
+    if len(case.pairs) == 0:
+        return {}
+    turns = Rotation.from_matrix(case.turns).as_rotvec()
+    corrections = solve_corrections(
+        case.pairs, turns, case.sigmas_rad, count, level=level, larger_than_rad=least_rad
+    )
+    i, j = case.pairs.T
+    left, sigmas = turns - corrections.vectors[i] + corrections.vectors[j], level * case.sigmas_rad
+    found = {}
+    for camera, sigma in zip(corrections.cameras.tolist(), corrections.sigmas_rad.tolist(), strict=True):
+        own = corrections.vectors[camera]
+        rows = np.flatnonzero((i == camera) | (j == camera))
+        sides = np.where(i[rows] == camera, 1.0, -1.0)[:, None]
+        off_turned = np.linalg.norm(left[rows], axis=1) / sigmas[rows]
+        off_placed = np.linalg.norm(left[rows] + sides * own, axis=1) / sigmas[rows]
+        turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned < off_placed)
+        placed = (off_placed <= _AGREEING_SIGMAS) & (off_turned > _AGREEING_SIGMAS)
+        judged = _Judged(
+            placed=float(case.weights[rows] @ (placed * case.placed[rows])),
+            turned=float(case.weights[rows] @ turned),
+            num_turned=int(turned.sum()),
+            num_pairs=len(rows),
+            turn=np.asarray(Rotation.from_rotvec(own).as_matrix()),
+        )
+        if judged.kind is Doubt.TURNED and np.linalg.norm(own) > _CERTAIN_SIGMAS * sigma:
+            found[camera] = judged
+    return found
 
 
 def _common_turn(

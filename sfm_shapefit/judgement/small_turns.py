@@ -1,0 +1,94 @@
+"""Turns that no pair can tell alone: one correction of each camera's rotation, from all pairs at once.
+
+Where scenes are dense, or baselines short, the matches of a pair tell its relative rotation to two degrees or
+so. A camera that is turned by less contradicts none of its pairs. All of them together tell it: with
+corrections x in world axes, one of each camera, the turn E of a pair (see `turns`) is to first order
+
+    log E_ij = x_i - x_j + noise,
+
+and the x that fit best are found jointly, so that the cameras of a turned group do not speak for one another:
+
+    min_x  sum_ij w_ij |log E_ij - x_i + x_j|^2 / sigma_ij^2  +  sum_i u_i |x_i|^2 / tau^2
+
+The weights are those of Geman and McClure, w = 1 / (1 + (r / 3.5 sigma)^2)^2, anew in every round: a pair of
+repeated structure soon has none. The prior says that rotations are right to tau = 0.2 degrees. As it is of
+Cauchy's form, u = 1 / (1 + (x / 0.6 deg)^2), it says little against a camera whose rotation is not. The same
+matrix, inverted, says how well each x is known. It is no test of large turns: from x = 0 a pair that
+contradicts has little weight. These are found, and mended, before.
+
+How exact pairs are is seen from those that agree best, and may be several times better than each can be sure
+of. Rounds begin with the larger standard deviations, so that no turn falls between the two tests, and come
+down to the smaller ones.
+
+Measured on made rings of 200 and 900 images and a made facade of 400, with cameras turned by 2 degrees, alone
+and five together: their corrections are 1.7 to 3.3 degrees and 15 standard deviations or more. Those of right
+cameras are 0.6 degrees at most, 0.4 on lego100, castle-P19, castle-P30, and 8 standard deviations at most:
+what matches have in common, this does not know.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+
+_ROBUST_SIGMAS = 3.5
+_PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)
+_MOST_ROUNDS = 30
+_COOLING = 0.8
+# Weights change no more once no correction moves by so much.
+_SETTLED_RAD = np.radians(0.002)
+
+
+class Corrections(NamedTuple):
+    """What n cameras are turned by, from all their pairs together."""
+
+    vectors: FloatArray
+    """(n, 3) rotation vectors in world axes, radians."""
+    cameras: IntArray
+    """The cameras whose correction is larger than was asked for."""
+    sigmas_rad: FloatArray
+    """Standard deviation of each axis of the corrections of these."""
+
+
+def solve_corrections(
+    pairs: IntArray,
+    turns: FloatArray,
+    sigmas_rad: FloatArray,
+    count: int,
+    *,
+    level: float = 1.0,
+    larger_than_rad: float = 0.0,
+) -> Corrections:
+    """Return the corrections of cameras that fit the turns of their pairs best.
+
+    Args:
+        pairs: (k, 2) cameras.
+        turns: (k, 3) rotation vectors of the turns of pairs, in world axes, radians.
+        sigmas_rad: (k,) their standard deviations, finite.
+        count: the number of cameras, n.
+        level: what the standard deviations are to be multiplied by, at most 1.
+        larger_than_rad: standard deviations are returned of the corrections larger than that.
+    """
+    x, k = np.zeros((count, 3)), len(pairs)
+    rows, signs = np.tile(np.arange(k), 2), np.repeat([1.0, -1.0], k)
+    differences = coo_array((signs, (rows, pairs.T.ravel())), shape=(k, count)).tocsr()
+    for round_ in range(_MOST_ROUNDS):
+        scale = max(level, _COOLING**round_)
+        sigmas = scale * sigmas_rad
+        off = np.linalg.norm(turns - differences @ x, axis=1) / sigmas
+        weights = 1.0 / (sigmas * (1.0 + (off / _ROBUST_SIGMAS) ** 2)) ** 2
+        prior = (level / scale) ** 2 / (
+            _PRIOR_RAD**2 * (1.0 + (np.linalg.norm(x, axis=1) / _PRIOR_WIDTH_RAD) ** 2)
+        )
+        weighted = differences.T * weights
+        information = csc_array(weighted @ differences + diags_array(prior))
+        factor = splu(information)
+        previous, x = x, factor.solve(np.asarray(weighted @ turns))
+        if scale == level and np.abs(x - previous).max(initial=0.0) < _SETTLED_RAD:
+            break
+    large = np.flatnonzero(np.linalg.norm(x, axis=1) > larger_than_rad)
+    variances = factor.solve(np.eye(count)[:, large])[large, np.arange(len(large))]
+    return Corrections(x, large, np.sqrt(variances))
