@@ -145,21 +145,21 @@ def count_observations(
     )
 
 
-def deregister_without_support(
+def images_without_support(
     structure: pycolmap.Reconstruction, counts: ObservationCounts, fixed_frames: Collection[int] = ()
 ) -> dict[int, int]:
-    """Deregister frames whose matches could make points with those of others, and hardly make any.
+    """Return the images of frames whose matches could make points with those of others, and hardly make any.
 
     Directions can agree with a wrong pose, of an image on a repeated structure for one: points, which need
-    three images, do not. Three frames stay.
+    three images, do not. If fewer than three frames have points, none is returned.
 
     Args:
-        structure: ours, which is changed.
+        structure: the model.
         counts: of it.
-        fixed_frames: ids of frames that stay whatever they see.
+        fixed_frames: ids of frames that are not asked.
 
     Returns:
-        By the id of each image that went, the number of points it saw.
+        By the id of each such image, the number of points it sees.
     """
     could = counts.checked >= _FEWEST_CHECKED
     does = could & (counts.agreeing >= _LEAST_AGREEING * counts.checked)
@@ -168,10 +168,7 @@ def deregister_without_support(
     if len(set(frames.tolist())) - len(lost) < _FEWEST_FRAMES:
         return {}
     images = [structure.image(i) for i in sorted(structure.reg_image_ids())]
-    gone = {image.image_id: image.num_points3D for image in images if image.frame_id in lost}
-    for frame in sorted(lost):
-        structure.deregister_frame(frame)
-    return gone
+    return {image.image_id: image.num_points3D for image in images if image.frame_id in lost}
 
 
 @kernel

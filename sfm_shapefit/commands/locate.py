@@ -3,7 +3,7 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
@@ -221,7 +221,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         *prior_warnings(prior_angles, directions.pairs, source.model.names),
         *of_control,
         *of_gravity,
-        *support_warnings(_without_support(source.model, seeded.poor, options)),
+        *support_warnings(_names_of(source.model, seeded.unsupported), is_kept=options.min_trust == 0.0),
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -232,6 +232,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement=placement,
         kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
+        unsupported=seeded.unsupported,
         agreeing_observations=seeded.observations.agreeing,
         contradicting_observations=seeded.observations.contradicting,
         gauge=gauge,
@@ -252,10 +253,9 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     )
 
 
-def _without_support(model: PosedModel, poor: Mapping[int, int], options: LocateOptions) -> list[str]:
-    """Return the names of the images that were left out though they see as many points as is asked for."""
-    lost = {image_id for image_id, count in poor.items() if count >= options.min_points_per_image}
-    return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(lost))).tolist()]
+def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:
+    """Return the names of some images, in the order of the model."""
+    return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(image_ids))).tolist()]
 
 
 def _at_known_centers(

@@ -8,8 +8,9 @@ Do not use, if any of these holds:
     of the pairs that say anything of a direction, fewer than a quarter agree
     of the cameras that were placed, fewer than half are in the output
 
-Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, and that were
-placed but are not in the output. Look also, though no camera can be named, if
+Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
+placed but are not in the output, and that are kept though their matches make no points. Look also, though no
+camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -93,12 +94,13 @@ def judge_model(found: "LocateResult") -> ModelVerdict:
     shares = _Shares(
         found.agreeing_observations, found.contradicting_observations, found.agreeing_pairs, kept
     )
-    outside = [found.model.names[c] for c in found.placement.cameras[~found.kept].tolist()]
+    outside = [*found.placement.cameras[~found.kept].tolist(), *found.cameras_without_support]
     repeats = tuple(match_warnings(found.directions))[:1]
     lenses = tuple(
         f"the matches of camera {d.camera} prefer another focal length" for d in found.focal_doubts
     )
-    return _judge(found.placement, shares, outside, lenses + repeats + found.suspicions)
+    names = [found.model.names[camera] for camera in outside]
+    return _judge(found.placement, shares, names, lenses + repeats + found.suspicions)
 
 
 def judge_graph(found: "GraphResult") -> ModelVerdict:

@@ -129,6 +129,9 @@ class LocateResult(Displayed):
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, or hardly any of those that
     its matches could make: how many it sees."""
+    unsupported: frozenset[int] = frozenset()
+    """The ids of images hardly any of whose matches makes a point with a third image; left out too, unless
+    the least trust is 0."""
     agreeing_observations: float = math.nan
     """Of the keypoints of images in the output that are matched in two or more of the others, the share that
     sees a 3D point; NaN where there is no database."""
@@ -212,9 +215,10 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            least = self.options.min_points_per_image
-            reason = f"it sees {counted(count, 'point')}, fewer than {least}" if count < least else NO_SUPPORT
+            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
             rows[camera] = replace(rows[camera], reason=reason)
+        for camera in self.cameras_without_support:
+            rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
@@ -239,6 +243,11 @@ class LocateResult(Displayed):
         """By the images that were left out for what they see of points, how many these are."""
         images = enumerate(self.model.image_ids.tolist())
         return {camera: self.poor[image_id] for camera, image_id in images if image_id in self.poor}
+
+    @property
+    def cameras_without_support(self) -> list[int]:
+        """The images hardly any of whose matches makes a point with a third image, in the output or not."""
+        return np.flatnonzero(np.isin(self.model.image_ids, list(self.unsupported))).tolist()
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""

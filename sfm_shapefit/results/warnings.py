@@ -128,18 +128,19 @@ def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
             )
 
 
-def support_warnings(names: Sequence[str]) -> Iterator[str]:
-    """Yield which cameras are left out because their matches make no points, if any are."""
+def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
+    """Yield which cameras are left out, or kept as was asked, though their matches make no points, if any."""
     if names:
         subject, rest = (
             ("1 camera is", "its pose is")
             if len(names) == 1
             else (f"{len(names)} cameras are", "their poses are")
         )
+        what = "kept, though" if is_kept else "left out because"
+        remedy = "take away --min-trust 0 to leave out" if is_kept else "--min-trust 0 keeps what is left out"
         yield (
-            f"{subject} left out because hardly any match makes a point with a third image: "
-            f"{first_of(names)}; {rest} wrong, or the scene repeats itself; "
-            "--min-trust 0 keeps what is left out"
+            f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
+            f"{rest} wrong, or the scene repeats itself; {remedy}"
         )
 
 

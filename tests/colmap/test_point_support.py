@@ -12,7 +12,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.point_support import (
     ObservationCounts,
     count_observations,
-    deregister_without_support,
+    images_without_support,
 )
 from sfm_shapefit.commands.stages import seed
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
@@ -73,18 +73,15 @@ def test_a_camera_whose_matches_make_no_points_goes_and_others_stay(found):
     names = [structure.image(i).name for i in sorted(structure.reg_image_ids())]
     # Of 100 that could, 4 is chance and 5 is not; of 29, none says nothing.
     counts = counts_of(structure, [100, 100, 29, *[100] * 5], [4, 5, 0, *[90] * 5])
-    gone = deregister_without_support(structure, counts)
-    assert [found.reconstruction.image(i).name for i in gone] == names[:1]
-    assert structure.num_reg_images() == 7
+    without = images_without_support(structure, counts)
+    assert [structure.image(i).name for i in without] == names[:1]
 
 
 def test_frames_that_are_fixed_stay_and_so_do_all_where_hardly_any_is_left(found):
     structure = pycolmap.Reconstruction(found.reconstruction)
     first = structure.image(min(structure.reg_image_ids())).frame_id
-    assert (
-        deregister_without_support(structure, counts_of(structure, [100] * 8, [0, *[90] * 7]), [first]) == {}
-    )
-    assert deregister_without_support(structure, counts_of(structure, [100] * 8, [0] * 6 + [90] * 2)) == {}
+    assert images_without_support(structure, counts_of(structure, [100] * 8, [0, *[90] * 7]), [first]) == {}
+    assert images_without_support(structure, counts_of(structure, [100] * 8, [0] * 6 + [90] * 2)) == {}
     assert structure.num_reg_images() == 8
 
 
@@ -107,3 +104,6 @@ def test_it_is_named_and_can_be_kept(monkeypatch):
 
     kept = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db", min_trust=0.0)
     assert all(row.placed for row in kept.cameras)
+    assert [row.name for row in kept.cameras if row.reason] == [name]
+    assert name in kept.verdict.cameras
+    assert any(name in warning and "kept, though" in warning for warning in kept.warnings)

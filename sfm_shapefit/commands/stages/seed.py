@@ -16,7 +16,7 @@ from sfm_shapefit.colmap.point_support import (
     ObservationShares,
     count_observations,
     deregister_of_few_points,
-    deregister_without_support,
+    images_without_support,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
 from sfm_shapefit.colmap.structure import (
@@ -77,6 +77,8 @@ class Seeded(NamedTuple):
     poor: dict[int, int]
     """By the id of each image that was left out because it sees too few points, or hardly any of those that
     its matches could make, their number."""
+    unsupported: frozenset[int]
+    """The ids of the latter; of least trust 0 they are not left out."""
     observations: ObservationShares
     """What of the keypoints matched in two other images sees a point, and what contradicts the cameras."""
 
@@ -129,11 +131,14 @@ def build_seeded_model(
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
-    shares = ObservationShares(math.nan, math.nan)
+    shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
     if source.database is not None:  # points of the model's own tracks have their colors already
         counts = count_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+        unsupported = images_without_support(seeded, counts, frames)
         if options.min_trust > 0.0:
-            poor |= deregister_without_support(seeded, counts, frames)
+            poor |= unsupported
+            for frame in {seeded.image(image_id).frame_id for image_id in unsupported}:
+                seeded.deregister_frame(frame)
         shares = counts.subset(np.isin(counts.image_ids, list(seeded.reg_image_ids()))).shares()
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
@@ -147,7 +152,7 @@ def build_seeded_model(
         seeded = turn_model(seeded, gauge.axes)
     if adjusted is not None:
         adjusted = replace(adjusted, reconstruction=seeded)
-    return Seeded(seeded, gauge, adjusted, poor, shares)
+    return Seeded(seeded, gauge, adjusted, poor, frozenset(unsupported), shares)
 
 
 def _triangulate(
