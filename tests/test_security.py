@@ -9,7 +9,7 @@ import tomllib
 
 import pytest
 
-from sfm_shapefit.colmap import database as database_module
+from sfm_shapefit.colmap import sqlite_file
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
@@ -92,7 +92,7 @@ def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
         connection = database._connection
         assert connection.execute("PRAGMA trusted_schema").fetchone() == (0,)
         assert connection.execute("PRAGMA query_only").fetchone() == (1,)
-        for limit, value in database_module._LIMITS.items():
+        for limit, value in sqlite_file._LIMITS.items():
             assert connection.getlimit(limit) == value
         with pytest.raises(sqlite3.OperationalError, match="readonly"):
             connection.execute("DELETE FROM images")
@@ -128,7 +128,7 @@ def test_private_copies_of_a_database_are_private(tmp_path, monkeypatch):
     writer.execute("UPDATE images SET name = name")
     writer.commit()
     (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(database_module.tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(sqlite_file.tempfile, "tempdir", str(tmp_path / "tmp"))
     with open_database(scene / "database.db", read_model(scene / "sparse" / "0")):
         (folder,) = (tmp_path / "tmp").iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700

@@ -1,52 +1,36 @@
 """Inlier matches and relative poses of a COLMAP database, read by sqlite3 without touching the file.
 
-Opening the database with pycolmap would migrate it in place, and a mere read by sqlite3 creates -shm and
--wal files beside a database in WAL mode. So a database is read
-
-    where it is, as immutable   if it is in WAL mode and has no -wal file: nobody has it open,
-    where it is, with mode=ro   if it is in another mode and has no -journal file,
-    from a private copy         if it has a -wal or a -journal: the copy is recovered, the original kept.
-
-Images of the database and of the model are matched by name, since their ids may differ. A pair of
-database images (a, b), a < b, has pair_id = 2147483647 a + b; `cam2_from_cam1` maps camera a to camera b.
-
-Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc`; facts on versions 3.6
-to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
+How the file is opened stands in `sqlite_file`, which pairs it has in `database_pairs`.
 """
 
 import copy
 import itertools
 import os
-import secrets
-import shutil
 import sqlite3
-import struct
-import tempfile
 from collections import OrderedDict
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
+from sfm_shapefit.colmap.database_pairs import (
+    PairRows,
+    check_schema,
+    indices_of_names,
+    match_names,
+    read_pairs,
+)
 from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, same_intrinsics, world_rays
 from sfm_shapefit.colmap.sorted_matches import MOST_MATCHES, SortedMatches, UInt32Array
+from sfm_shapefit.colmap.sqlite_file import columns_of, is_blob, readonly_connection, sqlite_errors
 from sfm_shapefit.directions.matches import KeypointMatches, MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.geometry import normalized
-
-MAX_NUM_IMAGES = 2147483647
-"""COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
-
-NO_ID = 2**32 - 1
-"""COLMAP's ids are 32-bit, and this one is none."""
 
 KEPT_MATCHES = 1_000_000
 """So many are kept with their rays, in 80 MB."""
@@ -58,41 +42,13 @@ back to it each time, and its zeros cost as much as what is written over them.""
 _KEYPOINT_BITS = np.uint64(32)
 _KEYPOINT_MASK = np.uint64(2**32 - 1)
 
-# COLMAP's TwoViewGeometryConfiguration; what these list is not verified: undefined, degenerate, watermark.
-_CONFIGS_WITHOUT_MATCHES = (0, 1, 7)
-# Besides, 5 (panoramic) is a pure rotation, and 8 stands for several motions, none of them stored.
+# Of COLMAP's configurations these are not verified (0, 1, 7), a pure rotation (5), or several motions (8).
 _CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
 
 # Limit of the memory for rays of keypoints that may be needed again, unless another is set.
 _CACHE_BYTES = 1_000_000_000
-_SIDECARS = ("-wal", "-journal")
-# Bytes 18 and 19 of the header say so.
-_WAL_VERSION = 2
-_LOCK_TIMEOUT_S = 2.0
-_COPY_ATTEMPTS = 3
 # Stored translations are 1, or of the scene's size; shorter ones mean "none".
 _MIN_TRANSLATION = 1e-12
-
-# A database may come from anywhere: what no query of this module needs is not allowed.
-_LIMITS = {
-    sqlite3.SQLITE_LIMIT_LENGTH: 2**29,  # bytes of a value or a row; 20 million keypoints, 67 million matches
-    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,  # of the schema's statements too
-    sqlite3.SQLITE_LIMIT_COLUMN: 100,
-    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 20,
-    sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 3,
-    sqlite3.SQLITE_LIMIT_VDBE_OP: 10_000,
-    sqlite3.SQLITE_LIMIT_FUNCTION_ARG: 10,
-    sqlite3.SQLITE_LIMIT_ATTACHED: 0,
-    sqlite3.SQLITE_LIMIT_LIKE_PATTERN_LENGTH: 100,
-    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
-    sqlite3.SQLITE_LIMIT_WORKER_THREADS: 0,
-}
-
-_REQUIRED_COLUMNS = {
-    "images": ("image_id", "name"),
-    "keypoints": ("image_id", "rows", "cols", "data"),
-    "two_view_geometries": ("pair_id", "rows", "cols", "data", "config"),
-}
 
 
 def find_database(model_folder: Path) -> Path | None:
@@ -123,38 +79,11 @@ def open_database(
     """
     file = Path(path)
     with ExitStack() as stack:
-        with _sqlite_errors(file):
-            connection = stack.enter_context(_readonly_connection(file))
-            _check_schema(file, connection)
+        with sqlite_errors(file):
+            connection = stack.enter_context(readonly_connection(file))
+            check_schema(file, connection)
             database = MatchDatabase(file, connection, model, left_out, rows)
         yield database
-
-
-def is_between(value: object, least: int, bound: int) -> bool:
-    """Return whether a value of a row is an integer from `least` to below `bound`."""
-    return isinstance(value, int) and least <= value < bound
-
-
-def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
-    """Return the rows of the first query whose columns `table` has; none if it fits none of them.
-
-    Args:
-        path: the database; it is not changed.
-        table: whose columns decide, for schemas differ from version to version.
-        queries: what to select, by the columns of `table` that it needs.
-
-    Raises:
-        InputError: if the file is missing, is no sqlite database, is locked or damaged, or if the rows of
-            the table, or of images, which queries join, are computed.
-    """
-    with _sqlite_errors(path), _readonly_connection(path) as connection:
-        for stored in (table, "images"):
-            _refuse_computed(path, connection, stored)
-        columns = _columns(connection, table)
-        for needed, query in queries.items():
-            if columns.issuperset(needed):
-                return connection.execute(query).fetchall()
-    return []
 
 
 class MatchDatabase:
@@ -175,10 +104,10 @@ class MatchDatabase:
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._cached_bytes = 0
         self._kept: dict[tuple[int, int], list[MatchBatch]] = {}
-        index_of_id = _match_names(path, connection, model)
+        index_of_id = match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
-        pairs = _read_pairs(path, connection, index_of_id) if rows is None else rows
-        self._pairs = pairs.without(_indices_of_names(model, left_out))
+        pairs = read_pairs(path, connection, index_of_id) if rows is None else rows
+        self._pairs = pairs.without(indices_of_names(model, left_out))
         self._looked_at: dict[int, _Keypoints] = {}
         self._sorted: SortedMatches | None = None
         if float(self._pairs.num_inliers.sum(dtype=np.float64)) <= MOST_MATCHES:
@@ -210,7 +139,7 @@ class MatchDatabase:
         Raises:
             InputError: as `open_database`.
         """
-        with _sqlite_errors(self.path):
+        with sqlite_errors(self.path):
             other = MatchDatabase(self.path, self._connection, model, left_out)
         if self._sorted is not None:
             other._share(self._sorted)
@@ -252,7 +181,7 @@ class MatchDatabase:
 
     def _query(self, query: str, *values: int) -> list[tuple[Any, ...]]:
         """Return the rows of a query."""
-        with _sqlite_errors(self.path):
+        with sqlite_errors(self.path):
             return self._connection.execute(query, values).fetchall()
 
     def keypoints(self, image: int) -> FloatArray:
@@ -268,7 +197,7 @@ class MatchDatabase:
         if not found or not found[0][0]:
             return np.zeros((0, 2))
         rows, cols, data = found[0]
-        if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
+        if cols not in (2, 4, 6) or not is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
         with np.errstate(invalid="ignore"):  # a signaling NaN
             xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
@@ -404,7 +333,7 @@ class MatchDatabase:
         """
         keep = np.flatnonzero(~np.isin(self._pairs.configs, _CONFIGS_WITHOUT_POSE))
         poses = np.full((len(keep), 7), np.nan)
-        if {"qvec", "tvec"} <= _columns(self._connection, "two_view_geometries"):
+        if {"qvec", "tvec"} <= columns_of(self._connection, "two_view_geometries"):
             for k, pair in enumerate(keep.tolist()):
                 poses[k] = self._stored_pose(pair)
         with np.errstate(over="ignore", invalid="ignore"):  # neither NaN nor infinity passes
@@ -433,7 +362,7 @@ class MatchDatabase:
         qvec, tvec = self._stored(pair, "qvec, tvec")
         if qvec is None or tvec is None:
             return np.full(7, np.nan)
-        if not (_is_blob(qvec, 4, 1, itemsize=8) and _is_blob(tvec, 3, 1, itemsize=8)):
+        if not (is_blob(qvec, 4, 1, itemsize=8) and is_blob(tvec, 3, 1, itemsize=8)):
             raise self._damaged_pair(pair, "a relative pose of wrong length")
         return np.frombuffer(qvec + tvec, dtype="<f8")
 
@@ -521,10 +450,10 @@ class MatchDatabase:
         """Return the matches of pairs as the file lists them, one pair after the other."""
         query, parts = "SELECT cols, data FROM two_view_geometries WHERE rowid = ?", []
         rowids, counts = self._pairs.rowids[chosen].tolist(), self._pairs.num_inliers[chosen].tolist()
-        with _sqlite_errors(self.path):
+        with sqlite_errors(self.path):
             for pair, rowid, count in zip(chosen.tolist(), rowids, counts, strict=True):
                 cols, data = self._connection.execute(query, (rowid,)).fetchone()
-                if cols != 2 or not _is_blob(data, count, 2, itemsize=4):
+                if cols != 2 or not is_blob(data, count, 2, itemsize=4):
                     raise self._damaged_pair(pair, "matches of wrong length")
                 parts.append(data)
         return b"".join(parts)
@@ -561,275 +490,12 @@ class MatchDatabase:
         return InputError(f"{self.path}: the pair {names} has {what}; match the images again")
 
 
-# --- opening ---------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _sqlite_errors(path: Path) -> Iterator[None]:
-    """Turn sqlite's errors into one sentence that names the database."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        if "locked" in str(error) or "busy" in str(error):
-            raise InputError(f"the database {path} is locked by another program; close it first") from error
-        raise InputError(f"the database {path} cannot be read: {error}") from error
-
-
-@contextmanager
-def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
-    """Connect to a database so that no file of it changes and none appears; see the module's header."""
-    header = _read_header(path)
-    with ExitStack() as stack:
-        if any(_fingerprint(sidecar)[0] for sidecar in _sidecars(path)):
-            target, mode = _private_copy(path, stack), "mode=rw"
-        else:
-            _refuse_truncated(path, header)
-            in_wal_mode = _WAL_VERSION in header[18:20]
-            target, mode = path, "mode=ro&immutable=1" if in_wal_mode else "mode=ro"
-        uri = f"file://{quote(os.fsencode(target.absolute()))}?{mode}"
-        connection = stack.enter_context(
-            closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None))
-        )
-        connection.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
-        for limit, value in _LIMITS.items():
-            connection.setlimit(limit, value)
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA cell_size_check = ON")
-        connection.execute("PRAGMA query_only = ON")
-        yield connection
-
-
-def _read_header(path: Path) -> bytes:
-    """Return the first 100 bytes of a database, or refuse a file that is none."""
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give the database file itself")
-    refuse_irregular_file(path)
-    try:
-        with path.open("rb") as stream:
-            header = stream.read(100)
-    except FileNotFoundError:
-        raise InputError(f"the database {path} does not exist") from None
-    except OSError as error:
-        raise InputError(f"the database {path} cannot be read: {error.strerror}") from None
-    if not header:
-        raise InputError(f"the database {path} is empty; run COLMAP's feature extraction and matching first")
-    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
-        raise InputError(f"{path} is not a COLMAP database; give the database.db that COLMAP wrote")
-    return header
-
-
-def _refuse_truncated(path: Path, header: bytes) -> None:
-    """Refuse a file that is shorter than its header says; sqlite notices only when it reads a lost page.
-
-    Header (https://sqlite.org/fileformat.html): page size at 16, where 1 means 65536, change counter at
-    24, size in pages at 28, and at 92 the change counter for which that size holds.
-    """
-    page_size, change_counter, num_pages = struct.unpack_from(">H6xII", header, 16)
-    (size_valid_for,) = struct.unpack_from(">I", header, 92)
-    size = num_pages * (65536 if page_size == 1 else page_size)
-    there, _ = _fingerprint(path)
-    if change_counter == size_valid_for and there < size:
-        raise InputError(f"the database {path} is truncated: it has {there} of {size} bytes; copy it again")
-
-
-def _sidecars(path: Path) -> list[Path]:
-    """Return the paths of a database's -wal and -journal files."""
-    return [path.with_name(path.name + suffix) for suffix in _SIDECARS]
-
-
-def _fingerprint(path: Path) -> tuple[int, int]:
-    """Return size and modification time of a file, zeros if it does not exist."""
-    try:
-        stat = path.stat()
-    except FileNotFoundError:
-        return 0, 0
-    return stat.st_size, stat.st_mtime_ns
-
-
-def _private_copy(path: Path, stack: ExitStack) -> Path:
-    """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
-    files = [path, *_sidecars(path)]
-    parent = Path(tempfile.gettempdir())
-    remove_abandoned(parent, ".shapefit-*.copy")
-    for _ in range(_COPY_ATTEMPTS):
-        before = [_fingerprint(file) for file in files]
-        try:
-            name = f".shapefit-{secrets.token_hex(8)}.copy"
-            folder = stack.enter_context(locked_folder(parent / name))
-            for file in filter(Path.exists, files):
-                shutil.copyfile(file, folder / file.name)
-        except OSError as error:
-            raise InputError(
-                f"the database {path} has unfinished changes and cannot be copied to a temporary folder "
-                f"({error.strerror}); close the program that uses it, or make room"
-            ) from None
-        if before == [_fingerprint(file) for file in files]:
-            return folder / path.name
-    raise InputError(f"the database {path} is being written by another program; wait until it is done")
-
-
-# --- tables ----------------------------------------------------------------------------------------
-
-
 class _Keypoints(NamedTuple):
     """Those of an image."""
 
     number: int
     blind: BoolArray | None
     """(number,) which have no ray; None if all have one."""
-
-
-class PairRows(NamedTuple):
-    """The pairs of posed images that have inlier matches, sorted by (i, j)."""
-
-    pairs: IntArray
-    """(k, 2) model indices, i < j; all else is (k,)."""
-    rowids: IntArray
-    """Rows of two_view_geometries."""
-    swapped: BoolArray
-    """Whether the database has image j first."""
-    configs: IntArray
-    num_inliers: IntArray
-
-    def without(self, left_out: set[tuple[int, int]]) -> "PairRows":
-        """Return all pairs but some (i, j), i < j."""
-        if not left_out:
-            return self
-        return self.subset(
-            np.flatnonzero([(i, j) not in left_out for i, j in self.pairs.tolist()]).astype(np.int64)
-        )
-
-    def subset(self, chosen: IntArray) -> "PairRows":
-        """Return the chosen pairs."""
-        return PairRows(
-            pairs=self.pairs[chosen],
-            rowids=self.rowids[chosen],
-            swapped=self.swapped[chosen],
-            configs=self.configs[chosen],
-            num_inliers=self.num_inliers[chosen],
-        )
-
-    @property
-    def has_matches(self) -> BoolArray:
-        """Whether the pair's inlier matches may be used, (k,)."""
-        return np.asarray(~np.isin(self.configs, _CONFIGS_WITHOUT_MATCHES), dtype=np.bool_)
-
-
-def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Return the names of a table's columns, none if there is no such table."""
-    return {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
-
-
-def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a database without the tables and columns that are read, or that computes what they hold.
-
-    A view, a virtual table and a generated column run code of whoever made the database when they are read.
-    """
-    for table, required in _REQUIRED_COLUMNS.items():
-        _refuse_computed(path, connection, table)
-        columns = _columns(connection, table)
-        if missing := [name for name in required if name not in columns]:
-            what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
-            raise InputError(f"{path} is not a COLMAP database: it has {what}")
-
-
-def _refuse_computed(path: Path, connection: sqlite3.Connection, table: str) -> None:
-    """Refuse a table that is none, or whose rows are computed."""
-    kinds = connection.execute(
-        "SELECT type, rootpage FROM sqlite_master WHERE type IN ('table', 'view') AND lower(name) = ?",
-        (table,),
-    )
-    if any(kind != "table" or not page for kind, page in kinds):  # a virtual table has no page of its own
-        raise InputError(
-            f"{path} is not a COLMAP database: its {table} is a view or a virtual table, not a table"
-        )
-    hidden = connection.execute(
-        "SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", (table,)
-    ).fetchone()
-    if hidden is not None:
-        raise InputError(f"{path} is not a COLMAP database: its {table} has a computed column {hidden[0]!r}")
-
-
-def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -> dict[int, int]:
-    """Return for each image id of the database the index of the model's image of that name, or -1."""
-    index_of_name = {name: index for index, name in enumerate(model.names)}
-    index_of_id: dict[int, int] = {}
-    example, matched = None, set()
-    for image_id, name in connection.execute("SELECT image_id, name FROM images ORDER BY image_id"):
-        if not (is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)):
-            raise InputError(
-                f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
-            )
-        index = index_of_name.get(name, -1)
-        if index in matched or image_id in index_of_id:
-            raise InputError(f"{path}: the image {name} stands twice; remove one of them")
-        index_of_id[image_id] = index
-        if index >= 0:
-            matched.add(index)
-        elif example is None:
-            example = name
-    if not index_of_id:
-        raise InputError(f"{path} has no images; run COLMAP's feature extraction and matching first")
-    if len(matched) < 2:
-        unmatched = next(name for index, name in enumerate(model.names) if index not in matched)
-        there = f", and the database's {example} is not in the model" if example is not None else ""
-        raise InputError(
-            f"{path} has {len(matched)} of the model's {model.num_images} images: the model's {unmatched} is "
-            f"not in the database{there}; give the database this model was made from"
-        )
-    return index_of_id
-
-
-def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> PairRows:
-    """Read which pairs of posed images have inlier matches."""
-    damaged = connection.execute(
-        "SELECT pair_id FROM two_view_geometries WHERE typeof(pair_id) != 'integer' "
-        "OR typeof(rows) != 'integer' OR typeof(config) != 'integer' OR pair_id < 0 OR rows < 0 LIMIT 1"
-    ).fetchone()
-    if damaged is not None:
-        raise InputError(f"{path}: the two-view geometry of pair {damaged[0]!r} is damaged")
-    rows = connection.execute(
-        "SELECT rowid, pair_id, config, rows FROM two_view_geometries WHERE rows > 0"
-    ).fetchall()
-    rowids, pair_ids, configs, num_inliers = np.array(rows, dtype=np.int64).reshape(-1, 4).T
-    ends = _indices_of_pairs(path, pair_ids, index_of_id)
-    known = np.logical_and(ends[:, 0] >= 0, ends[:, 1] >= 0)
-    swapped = ends[:, 0] > ends[:, 1]
-    ends = np.sort(ends, axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    order = order[known[order]]
-    pairs = ends[order]
-    repeated = pair_ids[order[:-1]][(pairs[1:] == pairs[:-1]).all(axis=1)]
-    if len(repeated):
-        raise InputError(f"{path}: the two-view geometry of pair {repeated[0]} stands twice")
-    return PairRows(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
-
-
-def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:
-    """Decode pair ids into model indices (k, 2), first image first; -1: it has no pose."""
-    ids = np.stack(np.divmod(pair_ids, MAX_NUM_IMAGES), axis=1)
-    known = np.array(sorted(index_of_id), dtype=np.int64)
-    position = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-    bad = ids[(known[position] != ids).any(axis=1) | (ids[:, 0] >= ids[:, 1])]
-    if len(bad):
-        a, b = bad[0]
-        raise InputError(f"{path}: a two-view geometry joins the images with ids {a} and {b}; it is damaged")
-    indices = np.array([index_of_id[i] for i in known.tolist()], dtype=np.int64)
-    return indices[position]
-
-
-def _indices_of_names(model: PosedModel, pairs: PairNames) -> set[tuple[int, int]]:
-    """Return pairs of names as pairs (i, j) of a model's images, i < j; those of other images are dropped."""
-    index = {name: k for k, name in enumerate(model.names)}
-    ends = [(index[a], index[b]) for a, b in pairs if a in index and b in index]
-    return {(min(pair), max(pair)) for pair in ends}
-
-
-def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
-    """Return whether `data` is a blob of rows x cols items."""
-    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
-        return False
-    return len(data) == rows * cols * itemsize
 
 
 def _turn(batch: MatchBatch, turns: FloatArray) -> MatchBatch:

@@ -14,8 +14,9 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, NO_ID, is_between, readonly_rows
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.colmap.database_rigs import DatabaseRigs, read_rigs
+from sfm_shapefit.colmap.sqlite_file import is_between, readonly_rows
 from sfm_shapefit.errors import InputError
 
 # No image has a side of so many pixels.

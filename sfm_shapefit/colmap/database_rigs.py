@@ -17,8 +17,9 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, NO_ID, is_between, readonly_rows
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.colmap.model import sensors_of
+from sfm_shapefit.colmap.sqlite_file import is_between, readonly_rows
 from sfm_shapefit.errors import InputError
 
 _CAMERA = 0

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.priors import PRIORS_OF_IMAGES
+from sfm_shapefit.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, lines_of_cells
 from sfm_shapefit.rotations.gravity import Gravity

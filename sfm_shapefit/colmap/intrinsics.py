@@ -25,9 +25,10 @@ import pycolmap
 
 from sfm_shapefit.adjustment.free_lenses import LensDoubt
 from sfm_shapefit.colmap.adjustment import is_adjusted, lens_of
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
 from sfm_shapefit.colmap.quiet import quiet_stderr
+from sfm_shapefit.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.formats.pair_list import PairNames
 
 

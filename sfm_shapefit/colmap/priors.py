@@ -14,8 +14,8 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, lines_of_cells
 from sfm_shapefit.known_positions import KnownPositions

@@ -12,9 +12,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit.colmap import database as colmap_database
+from sfm_shapefit.colmap import sqlite_file
 from sfm_shapefit.colmap.check import check_model_files
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
+from sfm_shapefit.colmap.database import find_database, open_database
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.colmap.model import PosedModel, camera_rays, read_model, track_matches, world_rays
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
@@ -778,8 +779,8 @@ def test_a_truncated_database_is_an_input_error_at_any_length(path, model):
 
 
 def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
-    assert 1.0 <= colmap_database._LOCK_TIMEOUT_S <= 5.0
-    monkeypatch.setattr(colmap_database, "_LOCK_TIMEOUT_S", 0.1)
+    assert 1.0 <= sqlite_file._LOCK_TIMEOUT_S <= 5.0
+    monkeypatch.setattr(sqlite_file, "_LOCK_TIMEOUT_S", 0.1)
     writer = begin_writing(path, "BEGIN EXCLUSIVE")
     with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
         pass

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.colmap.database_images import read_images
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.colmap.intrinsics import (
     Origin,
     calibrate_view_graph,
@@ -13,6 +13,7 @@ from sfm_shapefit.colmap.intrinsics import (
     with_focal_lengths,
 )
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.sqlite_file import readonly_rows
 from tests.scenes import RING, copied, edit_database, fingerprint
 
 MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5}

@@ -91,7 +91,7 @@ def test_a_worker_does_not_read_the_table_of_all_pairs(workspace, model, monkeyp
     with open_database(workspace / "database.db", model) as database:
         halves = [(0, database.num_pairs // 2), (database.num_pairs // 2, database.num_pairs)]
         rows = [database.rows(half) for half in halves]
-    monkeypatch.delattr("sfm_shapefit.colmap.database._read_pairs")
+    monkeypatch.delattr("sfm_shapefit.colmap.database.read_pairs")
     tasks = [
         PairTask(database=workspace / "database.db", rows=own, cameras=posed_cameras(model), work=WORK)
         for own in rows

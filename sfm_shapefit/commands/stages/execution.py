@@ -20,7 +20,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
-from sfm_shapefit.colmap.database import MatchDatabase, PairRows, open_database
+from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.database_pairs import PairRows
 from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
