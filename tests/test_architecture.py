@@ -130,9 +130,20 @@ def test_each_heavy_dependency_has_one_door(dependency):
 
 def test_the_command_line_starts_without_the_heavy_dependencies():
     heavy = {name for name in DOORS if name not in {"typer", "rich", "sqlite3"}} | {"scipy", "clarabel"}
-    code = f"import sys, sfm_shapefit.cli; print(*sorted({heavy!r} & set(sys.modules)))"
+    code = f"import sys; from sfm_shapefit.cli import app; print(*sorted({heavy!r} & set(sys.modules)))"
     done = run_python("-c", code)
     assert done.stdout == "\n"
+
+
+def test_only_the_command_that_is_called_is_loaded():
+    code = "import sys; from sfm_shapefit.cli.root import load_commands; load_commands(sys.argv[1:]); "
+    code += "print(*sorted(set(map('sfm_shapefit.cli.{}'.format, sys.argv[-1].split())) & set(sys.modules)))"
+    every = "convert evaluate inspect locate map place report synth warm_up"
+    for words, loaded in (("locate", "locate"), ("--version view", "report"), ("warm-up", "warm_up")):
+        done = run_python("-c", code, *words.split(), every)
+        assert done.stdout.split() == [f"sfm_shapefit.cli.{loaded}"]
+    for words in ("--help", "locat"):
+        assert len(run_python("-c", code, words, every).stdout.split()) == 9
 
 
 def test_what_draws_is_not_loaded_where_nothing_is_drawn():

@@ -5,23 +5,23 @@ progress and messages to stderr.
 """
 
 import os
+from typing import TYPE_CHECKING, Any
 
 # One thread does all that is large in BLAS (`laplacian.dense`): its others would wait, and keep a core busy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from sfm_shapefit.cli import convert, evaluate, inspect, locate, map, place, report, synth, warm_up  # noqa: A004
-from sfm_shapefit.cli.app import app, main
+from sfm_shapefit.cli import root
+from sfm_shapefit.cli.root import main
 
-__all__ = [
-    "app",
-    "convert",
-    "evaluate",
-    "inspect",
-    "locate",
-    "main",
-    "map",
-    "place",
-    "report",
-    "synth",
-    "warm_up",
-]
+if TYPE_CHECKING:
+    from sfm_shapefit.cli.root import app
+
+__all__ = ["app", "main"]
+
+
+def __getattr__(name: str) -> Any:
+    """Return the `app` with all its commands; the program itself loads the one that is called."""
+    if name == "app":
+        root.load_commands()
+        return root.app
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, ModelArgument, OutputPath, Quiet, one_path
+from sfm_shapefit.cli.root import app
 
 _FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
 

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import SEE_JSON, Rows, print_json, print_table, report_errors, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
+from sfm_shapefit.cli.root import app
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.wording import rounded
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import (
     NAMES_SHOWN,
     SEE_JSON,
@@ -20,6 +19,7 @@ from sfm_shapefit.cli.console import (
     show_progress,
 )
 from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
+from sfm_shapefit.cli.root import app
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.wording import counted

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
     GroupedCommand,
@@ -27,6 +26,7 @@ from sfm_shapefit.cli.lines import (
     rig_rows,
     scene_rows,
 )
+from sfm_shapefit.cli.root import app
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.wording import counted
 

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import further_piece_rows, name_pictures, next_steps
+from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.wording import counted
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import (
     catch_termination,
     print_steps,
@@ -17,6 +16,7 @@ from sfm_shapefit.cli.console import (
     show_progress,
 )
 from sfm_shapefit.cli.flags import Database, GroupedCommand, Images, Scene, one_path
+from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing

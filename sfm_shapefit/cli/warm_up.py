@@ -1,8 +1,8 @@
 """`sfm-shapefit warm-up`."""
 
-from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import print_table, report_errors, say_now_and_then, show_progress
 from sfm_shapefit.cli.flags import GroupedCommand, Quiet
+from sfm_shapefit.cli.root import app
 
 
 @app.command(

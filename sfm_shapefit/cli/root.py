@@ -3,6 +3,8 @@
 import atexit
 import gc
 import sys
+from collections.abc import Sequence
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
@@ -23,6 +25,9 @@ _GROUPS = {
     "Set up": ("warm-up",),
 }
 """The commands in the help, the most used first."""
+
+_HOMES = {"view": "report", "warm-up": "warm_up"}
+"""The modules of commands that are not named as they are."""
 
 # New objects after which unused ones are looked for. Modules make a hundred thousand that stay; to go through
 # them as often as the interpreter does by itself takes a twentieth of a short run.
@@ -72,6 +77,17 @@ def root(
     """Place the cameras of a COLMAP model whose rotations are known."""
 
 
+def load_commands(words: Sequence[str] = ()) -> None:
+    """Load the command that such words call, or all where they call none: for the help, or to name the like.
+
+    To load and to describe the others takes longer than the rest of the command line.
+    """
+    known = [name for names in _GROUPS.values() for name in names]
+    called = next((word for word in words if not word.startswith("-")), None)
+    for name in [called] if called in known else known:
+        import_module(f"sfm_shapefit.cli.{_HOMES.get(name, name)}")
+
+
 def main() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
     catch_termination()
@@ -82,6 +98,7 @@ def main() -> None:
     atexit.register(gc.freeze)
     try:
         refuse_little_memory()
+        load_commands(sys.argv[1:])
         app()
     except KeyboardInterrupt:  # outside a command: while modules are loaded
         sys.exit(EXIT_INTERRUPTED)
