@@ -155,7 +155,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
     """The compiled code of one function, for numba's dispatchers."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        self._source = Path(inspect.getfile(function)).resolve()
+        self._source = _resolved(inspect.getfile(function))
         code, name = function.__code__, function.__qualname__.replace("<", "").replace(">", "")
         self._name = f"{self._source.stem}.{name}"
         self._prefix = f"{self._name}-{RUNTIME}-"
@@ -315,7 +315,19 @@ def _read(path: Path) -> tuple[bytes, tuple[Path, ...]]:
         text = path.read_bytes()
     except OSError:
         return b"", ()
-    inside = {PACKAGE.joinpath(*name.decode().split(".")[1:]) for name in _IMPORT.findall(text)}
-    files = {place / "__init__.py" if place.is_dir() else place.with_suffix(".py") for place in inside}
+    files = {_source_of(name.decode()) for name in _IMPORT.findall(text)}
     # This module has no part in the code.
     return hashlib.sha256(text).digest(), tuple(sorted(files - {Path(__file__)}))
+
+
+@cache
+def _source_of(module: str) -> Path:
+    """Return the file of a module of this package, which hundreds of imports name."""
+    place = PACKAGE.joinpath(*module.split(".")[1:])
+    return place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+
+
+@cache
+def _resolved(file: str) -> Path:
+    """Return the path of a source, which several kernels share."""
+    return Path(file).resolve()

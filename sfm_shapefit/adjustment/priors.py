@@ -5,10 +5,11 @@ With d = log(R R_prior^T) and R <- exp(w) R, the derivative of d by w is the inv
     J^-1 = I - [d]/2 + (1/t^2 - (1 + cos t) / (2 t sin t)) [d]^2,      t = |d|
 
 (Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", eq. 146).
+
+What scipy has of rotations takes long to import, so only what turns any does that.
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -20,12 +21,16 @@ _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
 
 def turn(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
     """Return exp(w) R for rotations (n, 3, 3) and rotation vectors (n, 3) in their camera axes."""
+    from scipy.spatial.transform import Rotation
+
     turned: FloatArray = Rotation.from_rotvec(vectors).as_matrix() @ rotations
     return turned
 
 
 def rotation_vectors(rotations: FloatArray) -> FloatArray:
     """Return the vectors (n, 3) in radians whose exponentials are the rotations (n, 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
 
 

@@ -18,7 +18,6 @@ Source: https://opensfm.org/docs/geometry.html and dataset.html.
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
@@ -48,6 +47,9 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
     Raises:
         InputError: naming the key that is missing or wrong.
     """
+    # Here, since it takes long to import, and every command that reads a model loads this module.
+    from scipy.spatial.transform import Rotation
+
     reconstructions = JsonNode(file, "", content).elements()
     chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
     cameras = {key: _camera(node) for key, node in chosen.get("cameras").items()}

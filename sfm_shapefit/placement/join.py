@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
@@ -394,8 +393,9 @@ def _cost(fit: Similarity, ties: Ties) -> float:
 
 def _refine(start: Similarity, ties: Ties, *, metric: bool) -> Similarity:
     """Return the similarity of least robust (Cauchy) angular cost; it keeps a `metric` scale of its start."""
-    # Here, since it takes long to import, and every command that writes results loads this module.
+    # Here, since they take long to import, and every command that writes results loads this module.
     from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
 
     middle = ties.eyes_second.mean(axis=0)
     size = start.scale * (median_spread(ties.eyes_second) or 1.0)
