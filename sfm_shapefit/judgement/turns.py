@@ -46,7 +46,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import PairDirections, is_usable
@@ -399,6 +398,9 @@ def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: f
 
     Turns near 0 are `level` times as large as the standard deviations say.
     """
+    # Here, since it takes long to import, and where no pair is asked it is not used.
+    from scipy.spatial.transform import Rotation
+
     case, level = pairs.subset(np.isfinite(pairs.sigmas_rad)), float(np.clip(level, _LEAST_LEVEL, 1.0))
     if len(case.pairs) == 0:
         return {}
