@@ -52,6 +52,11 @@ class AdjustmentOptions(Settings):
     gradient_tolerance: float = option(
         1e-10, "Stop once no parameter's column of the Jacobian has a larger cosine with the residuals."
     )
+    first_damping: float = option(
+        1e-4,
+        "Levenberg-Marquardt damping of the first step, relative to the diagonal; near the minimum, less of "
+        "it lets a long shape bend that single cameras hardly feel.",
+    )
     max_iterations: int = option(
         100, "Limit of linear systems solved; reaching it is reported, never silent."
     )
@@ -70,5 +75,6 @@ class AdjustmentOptions(Settings):
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         self.check_range("cost_tolerance", 0.0, 1.0)
         self.check_range("gradient_tolerance", 0.0, 1.0)
+        self.check_range("first_damping", 0.0, 1.0)
         self.check_range("max_iterations", 1)
         self.check_range("threads", 1, 256)

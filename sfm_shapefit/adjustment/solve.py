@@ -34,10 +34,7 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.settings import merge_options
 
-# With 1e-8 at first, rows of 2,500 cameras, whose bending has a curvature far below that of a single camera,
-# end 6 % nearer to the truth after as many steps; but from averaged rotations castle-P19 ends in another
-# minimum, four cameras lost.
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
 _LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
@@ -269,7 +266,7 @@ class _Run:
         self.layout = lay_out(problem, options)
         self.factor: ReducedFactor = choose_factor(self.layout, options)
         self.values = values_of(problem)
-        self.damping, self.growth = _FIRST_DAMPING, 2.0
+        self.damping, self.growth = options.first_damping, 2.0
         self.costs = [self.cost(self.values)]
         self.gradient_norm, self.iterations = math.inf, 0
         self.bends, self.near = False, _NEAR

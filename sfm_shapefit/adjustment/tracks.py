@@ -12,7 +12,7 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.jit import kernel
 
 # Between two slices Python can be interrupted: about 50 ms.
-_MATCHES_A_SLICE = 1_000_000
+_MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,7 +133,7 @@ class MatchedKeypoints:
             limit_px: largest Sampson error of a match that joins.
         """
         parents = np.arange(len(self.cameras))
-        given = normalized(self._rays(poses)), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
+        given = self._rays(poses), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
             block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
             _join(block, *given, parents)
@@ -150,9 +150,15 @@ class MatchedKeypoints:
         )
 
     def _rays(self, poses: CameraPoses) -> FloatArray:
-        """Return the rays (K, 3) in axes of the world, of no particular length."""
-        ahead = np.concatenate([self.on_plane, np.ones((len(self.on_plane), 1))], axis=1)
-        return np.asarray(np.einsum("kba,kb->ka", poses.rotations[self.cameras], ahead))
+        """Return the unit rays (K, 3) in axes of the world."""
+        rays = np.empty((len(self.cameras), 3))
+        for first in range(
+            0, len(rays), _KEYPOINTS_A_SLICE
+        ):  # the rotations of all would take five times the rays
+            own = slice(first, first + _KEYPOINTS_A_SLICE)
+            ahead = np.concatenate([self.on_plane[own], np.ones((len(rays[own]), 1))], axis=1)
+            rays[own] = normalized(np.einsum("kba,kb->ka", poses.rotations[self.cameras[own]], ahead))
+        return rays
 
 
 @kernel

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import (
     AdjustmentOptions,
@@ -23,11 +24,12 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
+from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.known_positions import KnownPositions
-from tests.adjustment.made import disturb, look_at, ring_problem
+from tests.adjustment.made import LENSES, disturb, look_at, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)
 
@@ -344,6 +346,48 @@ def test_cancelling_keeps_the_best_values_so_far():
     np.testing.assert_array_equal(limited.problem.centers, found.problem.centers)
 
 
+def make_bent_row(num_cameras, bend):
+    """The truth of cameras in a row along a wall, with noisy pixels, and the same bent to a parabola."""
+    rng = np.random.default_rng(0)
+    half = 0.25 * num_cameras
+    centers = np.linspace([0.0, 0.0, 0.0], [2.0 * half, 0.0, 0.0], num_cameras)
+    points = rng.uniform([0.0, 3.0, -1.0], [2.0 * half, 5.0, 1.0], (6 * num_cameras, 3))
+    cameras, seen = np.nonzero(np.abs(points[:, 0] - centers[:, :1]) < 1.0)
+    truth = AdjustmentProblem(
+        rotations=look_at(centers, centers + np.array([0.0, 1.0, 0.0])),
+        centers=centers,
+        points=points,
+        cameras_seeing=cameras,
+        points_seen=seen,
+        pixels=np.zeros((len(cameras), 2)),
+        lenses=(Lens("SIMPLE_PINHOLE", LENSES["SIMPLE_PINHOLE"]),),
+        lens_of_camera=np.zeros(num_cameras, dtype=np.int64),
+    )
+    exact = reprojection_residuals(lay_out(truth, AdjustmentOptions()), values_of(truth))
+    truth = replace(truth, pixels=exact + 0.5 * rng.standard_normal(exact.shape))
+    along = centers[:, 0] / half - 1.0
+    turns = Rotation.from_euler("z", np.arctan(2.0 * bend / half * along[:, None])).as_matrix()
+    start = replace(
+        truth,
+        rotations=truth.rotations @ turns.transpose(0, 2, 1),
+        centers=centers + bend * along[:, None] ** 2 * [0.0, 1.0, 0.0],
+        points=points + bend * (points[:, :1] / half - 1.0) ** 2 * [0.0, 1.0, 0.0],
+    )
+    return truth, start
+
+
+def test_a_long_row_is_straightened_with_little_damping_that_the_usual_holds_back():
+    _, start = make_bent_row(num_cameras=100, bend=0.1)
+    minimum = adjust(start, TIGHT).problem
+    usual, little = (
+        error(adjust(start, loss_scale_px=2.0, cost_tolerance=1e-4, first_damping=damping).problem, minimum)
+        for damping in (1e-4, 1e-8)
+    )
+    # A row of 100 bends with about 1e-8 of a camera's curvature: held back by one, free with the other.
+    assert usual > 0.1 * error(start, minimum)
+    assert little < 0.01 * error(start, minimum)
+
+
 def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
     truth, _ = make_start()
     start = disturb(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
@@ -411,7 +455,13 @@ def test_wrong_priors_lenses_and_options_are_refused():
         Lens("PINHOLE", (1.0, 2.0, np.nan, 0.0))
     with pytest.raises(InputError, match="not positive"):
         Lens("PINHOLE", (1.0, -2.0, 0.0, 0.0))
-    for wrong in ({"loss_scale_px": 0.0}, {"noise_px": np.inf}, {"threads": 0}, {"linear_solver": "lu"}):
+    for wrong in (
+        {"loss_scale_px": 0.0},
+        {"noise_px": np.inf},
+        {"threads": 0},
+        {"linear_solver": "lu"},
+        {"first_damping": -1e-4},
+    ):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} must"):
             AdjustmentOptions(**wrong)
     with pytest.raises(TypeError, match="did you mean hold_rotations"):

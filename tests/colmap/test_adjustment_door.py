@@ -9,9 +9,10 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.adjustment import free_lenses, reprojection_errors_px
+from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
+from sfm_shapefit.colmap import bundle_adjustment
 from sfm_shapefit.colmap.adjustment import (
     collect_tracks,
     lens_of,
@@ -262,6 +263,19 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
     assert errors[1] < 0.2 * errors[0]
     poses = [m.frame(fixed[0]).rig_from_world.matrix() for m in (found, truth)]
     np.testing.assert_array_equal(*poses)
+
+
+def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch):
+    dampings = []
+
+    def noting(problem, **options):
+        dampings.append(options["first_damping"])
+        return adjust(problem, **options)
+
+    monkeypatch.setattr(bundle_adjustment, "adjust", noting)
+    truth = scene()
+    adjust_thinly(disturbed(truth), matches_of(truth))
+    assert dampings == [1e-4, 1e-8]
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])
