@@ -31,6 +31,7 @@ from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.settings import merge_options
 
@@ -264,6 +265,7 @@ class _Run:
         self.problem, self.options = problem, options
         self.workers = Workers(options.threads)
         self.layout = lay_out(problem, options)
+        hand_back_memory()  # of what the layout was made of, before the largest arrays come
         self.factor: ReducedFactor = choose_factor(self.layout, options)
         self.values = values_of(problem)
         self.damping, self.growth = options.first_damping, 2.0

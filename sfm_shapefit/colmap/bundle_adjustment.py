@@ -505,6 +505,8 @@ class _Run:
             return adjusted
         problem = self.thin_problem(joined, found, times=_FINE_TIMES)
         del joined, found
+        if not self.frees_more_than_poses():
+            del self.source  # all matches, at the peak of the memory; nothing is triangulated any more
         return self.solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)
 
     def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:

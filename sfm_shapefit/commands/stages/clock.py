@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.solver.options import IterationInfo
 
 Progress = Callable[[str, int, int], None]
@@ -23,6 +24,7 @@ class Clock:
     def __call__(self, stage: str) -> Iterator[None]:
         """Time a stage; one that comes again adds to its time."""
         self.stage = stage
+        hand_back_memory()
         self.progress(stage, 0, 1)
         start = time.perf_counter()
         yield

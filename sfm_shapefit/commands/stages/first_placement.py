@@ -67,6 +67,7 @@ def adjust_first_placement(
     seed, tracks = seed_and_tracks(source, located, clock.advance)
     if source.database is not None:
         source.database.forget_rays()  # the adjustment is where most memory is needed
+    del directions, measured  # arrays of all pairs
     given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
     adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())

@@ -17,6 +17,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.lines import text_of
+from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import Placement, place
@@ -114,6 +115,7 @@ def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock)
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
+    hand_back_memory()  # of what the graph was made of
     first = None
     if measured.groups is not None and measured.num_points and options.points != "always":
         with suppress(UnsolvableError):
