@@ -504,7 +504,7 @@ class _Run:
         if len(found.points) == 0:
             return adjusted
         problem = self.thin_problem(joined, found, times=_FINE_TIMES)
-        del joined, found
+        del joined, found, adjusted
         if not self.frees_more_than_poses():
             del self.source  # all matches, at the peak of the memory; nothing is triangulated any more
         return self.solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)

@@ -161,8 +161,9 @@ def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray]
     for part in errors:
         stop = start + len(part)
         forces = pulls[start:stop] @ part.transpose(0, 2, 1)
-        flat = adjoint(forces.reshape(len(part), -1), edges[start:stop], n)
-        total = total + flat.reshape(n, *forces.shape[1:])
+        if start == 0:
+            total = np.zeros((n, *forces.shape[1:]))
+        total += adjoint(forces.reshape(len(part), -1), edges[start:stop], n).reshape(total.shape)
         start = stop
     return total
 

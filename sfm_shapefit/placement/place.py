@@ -15,6 +15,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.judgement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
@@ -289,6 +290,7 @@ def _judge(
     part: MeasuredGraph, nodes: IntArray, refined: RefinedPlacement, options: PlacementOptions
 ) -> tuple[Assessment, SecondConfiguration | None]:
     """Return the verdicts on a refined part, whose nodes these are in the whole graph."""
+    hand_back_memory()  # of the solve, before the samples are propagated
     assessment = assess(
         part,
         refined.locations,
