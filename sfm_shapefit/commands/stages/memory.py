@@ -31,7 +31,7 @@ _MB = 1e6
 # The interpreter with all that `locate` imports.
 _STARTED_BYTES = 195e6
 # Compiled code, thread pools, pages of the database.
-_KERNELS_BYTES = 110e6
+_KERNELS_BYTES = 70e6
 # Samples of each direction error, two numbers each.
 _SAMPLES = 96
 # Entries of a block of the factor.
@@ -234,7 +234,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
         "measuring directions": throughout + batch,
     }
     if work.has_points and economy.points:
-        peaks["building tracks"] = throughout + batch + 160.0 * min(work.num_matches, 10_000_000)
+        peaks["building tracks"] = throughout + batch + 125.0 * work.num_keypoints
     samples = 16.0 * _SAMPLES * (work.num_sampled if economy.samples else 0)
     solving = 900.0 * work.num_edges + 3000.0 * work.num_nodes
     has_factor = economy.factor or work.needs_factor
