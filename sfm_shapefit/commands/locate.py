@@ -34,6 +34,7 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.control_points import bring_to_control_points, read_control
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.commands.stages.gravity import turn_model_upright
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -67,12 +68,11 @@ from sfm_shapefit.results.warnings import (
     support_warnings,
     trust_warnings,
 )
+from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
     import pycolmap
-
-    from sfm_shapefit.rotations.gravity import Gravity
 
 
 def locate(
@@ -152,7 +152,7 @@ class Locating(NamedTuple):
     """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
     control: ControlPoints | None = None
     """Ground control points of the images."""
-    gravity: "Gravity | None" = None
+    gravity: Gravity | None = None
     """Of the images, which turns the model upright."""
 
 
@@ -200,11 +200,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         is_adjusted=adjustment is not None or known.centers is not None,
     )
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
-    of_gravity: tuple[str, ...] = ()
-    if known.gravity is not None:  # what averages rotations takes long to import
-        from sfm_shapefit.commands.stages.gravity import turn_model_upright
-
-        seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
+    seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)

@@ -50,8 +50,12 @@ def refine_with_gravity(
     return with_gravity(averaged, given, gravity)
 
 
-def turn_model_upright(seeded: Seeded, model: PosedModel, gravity: Gravity) -> tuple[Seeded, tuple[str, ...]]:
+def turn_model_upright(
+    seeded: Seeded, model: PosedModel, gravity: Gravity | None
+) -> tuple[Seeded, tuple[str, ...]]:
     """Return a model turned so that z points up, unless something else set its axes, and what to warn of."""
+    if gravity is None:
+        return seeded, ()
     rotations, placed = rotations_of(seeded.reconstruction, model.image_ids.tolist())
     members = np.flatnonzero(placed)
     own = gravity.among(members)
