@@ -80,9 +80,7 @@ def solve_corrections(
         sigmas = scale * sigmas_rad
         off = np.linalg.norm(turns - differences @ x, axis=1) / sigmas
         weights = 1.0 / (sigmas * (1.0 + (off / _ROBUST_SIGMAS) ** 2)) ** 2
-        prior = (level / scale) ** 2 / (
-            _PRIOR_RAD**2 * (1.0 + (np.linalg.norm(x, axis=1) / _PRIOR_WIDTH_RAD) ** 2)
-        )
+        prior = 1.0 / (_PRIOR_RAD**2 * (1.0 + (np.linalg.norm(x, axis=1) / _PRIOR_WIDTH_RAD) ** 2))
         weighted = differences.T * weights
         information = csc_array(weighted @ differences + diags_array(prior))
         factor = splu(information)
@@ -90,5 +88,6 @@ def solve_corrections(
         if scale == level and np.abs(x - previous).max(initial=0.0) < _SETTLED_RAD:
             break
     large = np.flatnonzero(np.linalg.norm(x, axis=1) > larger_than_rad)
-    variances = factor.solve(np.eye(count)[:, large])[large, np.arange(len(large))]
-    return Corrections(x, large, np.sqrt(variances))
+    units = (np.bincount([camera], minlength=count).astype(np.float64) for camera in large.tolist())
+    variances = [factor.solve(unit)[camera] for camera, unit in zip(large.tolist(), units, strict=True)]
+    return Corrections(x, large, np.sqrt(np.array(variances)))
