@@ -136,11 +136,11 @@ def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
             if len(names) == 1
             else (f"{len(names)} cameras are", "their poses are")
         )
-        what = "kept, though" if is_kept else "left out because"
-        remedy = "take away --min-trust 0 to leave out" if is_kept else "--min-trust 0 keeps what is left out"
+        what = "kept, as --min-trust 0 asks, though" if is_kept else "left out because"
+        remedy = "" if is_kept else "; --min-trust 0 keeps what is left out"
         yield (
             f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
-            f"{rest} wrong, or the scene repeats itself; {remedy}"
+            f"{rest} wrong, or the scene repeats itself{remedy}"
         )
 
 
