@@ -11,7 +11,7 @@ from sfm_shapefit.cli.flags import OutputFlags
 from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
-    from sfm_shapefit.colmap.bundle_adjustment import Adjusted
+    from sfm_shapefit.colmap.adjusted import Adjusted
 
 
 def further_piece_rows(facts: dict[str, Any]) -> Rows:

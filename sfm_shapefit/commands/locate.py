@@ -15,13 +15,9 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import (
-    NO_SENSORS,
-    AdjustedPlacement,
-    GivenPoses,
-    SensorSigma,
-    Uncertainty,
-)
+from sfm_shapefit.colmap.adjusted import AdjustedPlacement, Uncertainty
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
+from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma
 from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import NO_SENSORS, Uncertainty
+from sfm_shapefit.colmap.adjusted import Uncertainty
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
+from sfm_shapefit.colmap.free_sensors import NO_SENSORS
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.commands.locate import Locating, locate_source

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
-from sfm_shapefit.colmap.bundle_adjustment import UNREFINED, RefinedLenses
+from sfm_shapefit.colmap.adjusted import UNREFINED, RefinedLenses
 from sfm_shapefit.colmap.intrinsics import Origin
 from sfm_shapefit.results.json_types import CameraIntrinsics
 from sfm_shapefit.wording import first_of

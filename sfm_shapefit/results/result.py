@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Adjusted, AdjustedPlacement
+from sfm_shapefit.colmap.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfm_shapefit.colmap.bundle_adjustment import SensorSigma
+from sfm_shapefit.colmap.free_sensors import SensorSigma
 from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.results.json_types import RefinedSensor
 

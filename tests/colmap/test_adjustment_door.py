@@ -12,7 +12,7 @@ from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
-from sfm_shapefit.colmap import bundle_adjustment
+from sfm_shapefit.colmap import adjustment_run
 from sfm_shapefit.colmap.adjustment import (
     collect_tracks,
     lens_of,
@@ -21,7 +21,8 @@ from sfm_shapefit.colmap.adjustment import (
     with_points,
     with_poses,
 )
-from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, adjust_thinly, bundle_adjust
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
+from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly, bundle_adjust
 from sfm_shapefit.colmap.structure import collect_matches
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import KeypointMatches
@@ -272,7 +273,7 @@ def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch
         dampings.append(options["first_damping"])
         return adjust(problem, **options)
 
-    monkeypatch.setattr(bundle_adjustment, "adjust", noting)
+    monkeypatch.setattr(adjustment_run, "adjust", noting)
     truth = scene()
     adjust_thinly(disturbed(truth), matches_of(truth))
     assert dampings == [1e-4, 1e-8]

@@ -16,7 +16,8 @@ from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.colmap.adjustment import lens_of, triangulate_in_blocks
-from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, bundle_adjust
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
+from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model

@@ -7,7 +7,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.colmap.bundle_adjustment import GivenPoses
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.point_support import (
     ObservationCounts,

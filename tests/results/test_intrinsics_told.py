@@ -4,7 +4,7 @@ import pytest
 
 from sfm_shapefit.adjustment import Lens
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
-from sfm_shapefit.colmap.bundle_adjustment import RefinedLenses
+from sfm_shapefit.colmap.adjusted import RefinedLenses
 from sfm_shapefit.colmap.intrinsics import Origin
 from sfm_shapefit.results.intrinsics import Intrinsics, describe_intrinsics, intrinsics_warnings
 

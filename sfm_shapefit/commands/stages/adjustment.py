@@ -13,11 +13,8 @@ import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import (
-    AdjustedPlacement,
-    Uncertainty,
-    adjust_placement,
-)
+from sfm_shapefit.colmap.adjusted import AdjustedPlacement, Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import adjust_placement
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource

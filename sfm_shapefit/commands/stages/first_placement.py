@@ -11,7 +11,9 @@ import numpy as np
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, adjust_thinly
+from sfm_shapefit.colmap.adjusted import AdjustedPlacement
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
+from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
+from sfm_shapefit.colmap.adjusted import Adjusted
 from sfm_shapefit.colmap.adjustment import triangulate_in_blocks
-from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenPoses, bundle_adjust
+from sfm_shapefit.colmap.adjustment_run import GivenPoses
+from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     ObservationShares,
