@@ -24,26 +24,26 @@ from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
-from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.components import ComponentAveraging, pairs_among
 from sfm_shapefit.commands.stages.control_points import read_control
 from sfm_shapefit.commands.stages.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
-from sfm_shapefit.commands.stages.gravity import read_gravity, refine_with_gravity
+from sfm_shapefit.commands.stages.gravity import read_gravity
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.joins import JoinedModels, Told, join_models
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
-from sfm_shapefit.locate_options import LEAST_MATCHES, KnownDistance, LocateOptions, MapOptions
+from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.control_points import ControlPoints
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
+from sfm_shapefit.results.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
-from sfm_shapefit.results.scene_words import describe_repeated_pairs, describe_rival_pairs
-from sfm_shapefit.rotations.arrangements import agreeing_pairs, choose_arrangement, evidence_of
+from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.gravity import Gravity
@@ -52,13 +52,7 @@ from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
-from sfm_shapefit.viewgraph import connected_components
-from sfm_shapefit.wording import counted
 
-# A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
-# 0.89), an image if a smaller share of its own does.
-_ALARMING_SHARE = 0.7
-_DOUBTFUL_SHARE = 0.25
 # The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
 # again.
 _MOST_SCORED_PAIRS = 20_000
@@ -140,9 +134,9 @@ def _map_opened(run: "_Run") -> MapResult:
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=(
-            *_warnings(run.images, models, left_out),
+            *map_warnings(run.images.rigs.incomplete, models, left_out),
             *found.warnings,
-            *_lost_distances(options.known_distance, models, found),
+            *lost_distances(options.known_distance, models, found.joined),
         ),
     )
     return tell_joins(result)
@@ -300,81 +294,18 @@ class _Run(NamedTuple):
         """Yield the frames of each component, and its images with their rotations."""
         of_image, sensors = self.frame_of_image, self.sensor_rotations
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
-        for frames, averaged in self.average_components(int(of_image.max()) + 1, of_frames, reasons):
+        gravity = None if self.gravity is None else self.gravity.of_frames(of_image, sensors)
+        averaging = ComponentAveraging(self.options, self.clock, gravity, self.shares_of_frames())
+        for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
             members = np.flatnonzero(np.isin(of_image, frames))
             places = np.searchsorted(frames, of_image[members])
             yield frames, members, averaged.turned(places, sensors[members])
 
-    def average_components(
-        self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
-    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
-        """Yield the frames of each component that got rotations, ascending, and those rotations.
-
-        Why a frame belongs to none is written to `reasons`.
-        """
-        waiting, gravity = _group_frames(num_frames, relative.pairs), self.gravity
-        if gravity is not None:
-            gravity = gravity.of_frames(self.frame_of_image, self.sensor_rotations)
-        while waiting:
-            members = waiting.pop(0)
-            least = self.options.min_model_size
-            if len(members) < least:
-                if len(members) > 1:
-                    few = (
-                        f"matched with {counted(len(members) - 1, 'other image')} only; a model needs {least}"
-                    )
-                    reasons |= dict.fromkeys(members.tolist(), few)
-                continue
-            with self.clock("rotation averaging"):
-                inside, local = _pairs_among(relative, members)
-                try:
-                    answer = self.average(len(members), local, self.evidence_of(inside))
-                except UnsolvableError as error:
-                    reasons |= dict.fromkeys(members.tolist(), str(error))
-                    continue
-                if gravity is not None:
-                    answer = refine_with_gravity(answer, local, gravity.among(members))
-            left = members[~answer.registered]
-            reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
-            if len(left) < len(members):
-                rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
-                among = _group_frames(num_frames, rest)
-                waiting = [*waiting, *(group for group in among if len(group) > 1)]
-            kept = answer.registered
-            if kept.sum() >= self.options.min_model_size:
-                yield members[kept], answer.subset(kept)
-
-    def average(
-        self, num_frames: int, relative: RelativeRotations, evidence: FloatArray
-    ) -> AveragedRotations:
-        """Average rotations, by the arrangement of the images that the matches speak for."""
-
-        def average(some: RelativeRotations) -> AveragedRotations:
-            return average_consistently(
-                num_frames,
-                some,
-                self.options.min_matches,
-                averaging=self.options.averaging,
-                threads=self.options.num_threads(),
-            )
-
-        averaged = average(relative)
-        if not evidence.any():
-            return averaged
-        chosen = choose_arrangement(relative, evidence, averaged, average)
-        return replace(
-            chosen.averaged,
-            num_repeated=int(chosen.refused.sum()),
-            num_rivals=int(chosen.rival.sum()),
-        )
-
-    def evidence_of(self, relative: RelativeRotations) -> FloatArray:
-        """Return how much speaks for each pair of frames; nothing for frames of rigs, or without scores."""
+    def shares_of_frames(self) -> dict[tuple[int, int], float]:
+        """Return the matched shares by pairs of frames; none where frames are those of rigs."""
         if not np.array_equal(self.frame_of_image, np.arange(len(self.frame_of_image))):
-            return np.zeros(len(relative.pairs))
-        pairs = map(tuple, relative.pairs.tolist())
-        shares = [self.scores.get(pair, (np.nan, np.nan))[1] for pair in pairs]
-        return evidence_of(relative, np.array(shares))
+            return {}
+        return {pair: share for pair, (_, share) in self.scores.items()}
 
     def locate_components(
         self, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
@@ -411,7 +342,7 @@ class _Run(NamedTuple):
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
         if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
-            _, among = _pairs_among(relative, members)
+            _, among = pairs_among(relative, members)
             false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
             names = {tuple(sorted((model.names[i], model.names[j]))) for i, j in false}
             inputs = replace(inputs, left_out=inputs.left_out | names)
@@ -491,36 +422,6 @@ class _Run(NamedTuple):
         return read_model(pose_at_origin(images, image_ids, rotations))
 
 
-def _lost_distances(
-    known: Iterable[KnownDistance], models: Sequence[MappedModel], found: JoinedModels
-) -> Iterator[str]:
-    """Yield what became of known distances that are in no model."""
-    model_of = {
-        image.name: number
-        for number, model in enumerate(models)
-        for image in model.located.reconstruction.images.values()
-        if image.has_pose
-    }
-    for first, second, _ in known:
-        ends = [model_of.get(name) for name in (first, second)]
-        if None in ends:
-            name = (first, second)[ends.index(None)]
-            yield f"the known distance of {first} and {second} is of no use: {name} is in no model"
-        elif ends[0] != ends[1] and not any({*ends} <= {*one.models} for one in found.joined):
-            yield (
-                f"the known distance of {first} and {second} is of no use: they are in models {ends[0]} and "
-                f"{ends[1]}, which are not joined"
-            )
-
-
-def _pairs_among(
-    relative: RelativeRotations, members: IntArray
-) -> tuple[RelativeRotations, RelativeRotations]:
-    """Return the pairs among some images or frames, ascending, and the same by their place among these."""
-    inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-    return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
-
-
 def _suspicions(averaging: AveragedRotations) -> Iterator[str]:
     """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
     if averaging.num_repeated:
@@ -545,13 +446,6 @@ def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) ->
             )
 
 
-def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
-    """Return the connected components, ascending, the largest first; single frames are components too."""
-    labels = connected_components(num_frames, pairs)
-    groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
-    return sorted(groups, key=lambda group: (-len(group), int(group[0])))
-
-
 def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:
     """Say why no component could be placed."""
     if len(relative.pairs) == 0:
@@ -562,35 +456,3 @@ def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int,
     causes = list(reasons.values())
     most = max(set(causes), key=lambda cause: (causes.count(cause), cause))
     return f"no component of {path} can be placed; for most images: {most}"
-
-
-def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[str, str]) -> Iterator[str]:
-    """Yield what the user should know, a sentence each."""
-    if images.rigs.incomplete:
-        yield (
-            f"{len(images.rigs.incomplete)} rigs of the database are not used, rig "
-            f"{images.rigs.incomplete[0]} for one, because a sensor has no pose in them or an image no "
-            "frame: their cameras are placed one by one"
-        )
-    for number, model in enumerate(models):
-        share, agreements = model.averaging.share, model.averaging.agreements
-        if share < _ALARMING_SHARE:
-            yield (
-                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
-                "trust it without a look"
-            )
-        if model.averaging.num_repeated:
-            yield f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
-        if model.averaging.num_rivals:
-            yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
-        doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
-        if len(doubtful):
-            worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
-            yield (
-                f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
-                f"rotations, above all those of {worst}"
-            )
-    if left_out:
-        name, reason = next(iter(left_out.items()))
-        many = f"{len(left_out)} images are in no model, {name} for one"
-        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"

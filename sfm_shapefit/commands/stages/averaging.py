@@ -49,8 +49,8 @@ def average_consistently(
     """Return the most consistent rotations of some images; of several components one is answered.
 
     Args:
-        num_images: n. relative: pairs of them. min_matches: pairs of fewer matches are left out. With 0, all
-        count in our own averaging, and pycolmap's
+        num_images: n. relative: pairs of them.
+        min_matches: pairs of fewer are left out. With 0, all count in our own averaging, and pycolmap's
             tries several limits.
         averaging: who averages.
         threads: of our own averaging; the answer does not depend on it.
