@@ -300,19 +300,19 @@ def _unless_refused(found: PlacedByPriors | str | None) -> PlacedByPriors:
 
 def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence) -> Iterator[Group]:
     """Yield the models that were joined, each group in the world of its largest."""
-    groups = [_Group.of(number, model) for number, model in enumerate(models)]
+    merging = [_Merging(model.located.reconstruction, number) for number, model in enumerate(models)]
     root = list(range(len(models)))
     for done in joins:
         if done.join is not None:
             root[done.model] = root[done.to]
-            groups[root[done.to]].add(done, models[done.model], evidence.same_points(done))
-    for group in groups:
-        if len(group.world_from) > 1:
-            yield Group(group.reconstruction, group.world_from, group.joins)
+            merging[root[done.to]].add(done, models[done.model], evidence.same_points(done))
+    for merged in merging:
+        if merged.joins:
+            yield Group(merged.reconstruction, merged.world_from, merged.joins)
 
 
-class _Group:
-    """Models in the world of the largest of them; more come in."""
+class _Merging:
+    """A group of joined models as it grows, and the ids that its points had."""
 
     def __init__(self, reconstruction: "pycolmap.Reconstruction", number: int) -> None:
         self.reconstruction = reconstruction
@@ -320,11 +320,6 @@ class _Group:
         self.joins: list[Joined] = []
         # Of each model, the ids of its points here, by those in the model where they are others.
         self.ids: dict[int, dict[int, int]] = {number: {}}
-
-    @classmethod
-    def of(cls, number: int, model: MappedModel) -> "_Group":
-        """Return a model by itself."""
-        return cls(model.located.reconstruction, number)
 
     def add(self, done: Joined, model: MappedModel, same_points: list[tuple[int, int]]) -> None:
         """Take in a model that was joined to one of the group."""
