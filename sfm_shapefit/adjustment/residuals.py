@@ -27,17 +27,22 @@ import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import NUM_VALUES
+from sfm_shapefit.adjustment.projection import (
+    LENS,
+    SHIFT,
+    differentiate,
+    differentiate_by_lens,
+    is_ahead,
+    look,
+    miss,
+    turn_to_frame,
+)
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
 
 CHUNKS = 4
 """Into which the points are cut; each has sums of all nodes of its own."""
-
-_LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
-
-# A row of a camera has its rotation, its frame's center, the shift and rotation of the sensor, and the lens.
-_CENTER, _SHIFT, _SENSOR, _LENS = 9, 12, 15, 24
 
 # Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
 # large. The error of either is rounding.
@@ -103,7 +108,7 @@ def linearize(
     points = np.empty((layout.num_points, 6))
     point_gradients = np.empty((layout.num_points, 3))
     entries = np.empty((len(layout.entry_node), 3, SLOTS))
-    given = _inputs(layout, values, loss_scale_px)
+    given = kernel_inputs(layout, values, loss_scale_px)
     structure = (
         layout.lens_of_camera, layout.lens_slots, layout.turns, layout.frame_of_camera, layout.node_of_frame,
         layout.node_of_lens, layout.frame_entry, layout.lens_entry, layout.links_of_camera,
@@ -130,7 +135,7 @@ def linearize(
 
 def sum_losses(layout: Layout, values: Values, loss_scale_px: float | None, workers: Workers) -> float:
     """Return the cost of all observations, 1/2 sum rho(|r|^2), in px^2."""
-    given = _inputs(layout, values, loss_scale_px)
+    given = kernel_inputs(layout, values, loss_scale_px)
     sums = np.zeros(CHUNKS)
 
     def job(k: int, begin: int, end: int) -> Callable[[], None]:
@@ -143,13 +148,13 @@ def sum_losses(layout: Layout, values: Values, loss_scale_px: float | None, work
 def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
     """Return the residuals (m, 2) in pixels, in the problem's order; NaN behind the camera."""
     residuals = np.empty((len(layout.camera), 2))
-    _write_residuals(_inputs(layout, values, None), residuals)
+    _write_residuals(kernel_inputs(layout, values, None), residuals)
     ordered = np.empty_like(residuals)
     ordered[layout.observation] = residuals
     return ordered
 
 
-def _inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
+def kernel_inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
     """Return what every kernel here reads."""
     turned = values.sensor_rotations @ values.rotations[layout.frame_of_camera]
     views = np.concatenate(
@@ -173,83 +178,6 @@ def _chunks(layout: Layout) -> list[tuple[int, int]]:
     return list(zip([0, *cuts], [*cuts, layout.num_points], strict=True))
 
 
-@inner_kernel
-def _look(views: Any, camera: int, points: Any, p: int) -> tuple[float, float, float]:
-    """Return a point less the frame's center, in axes of the camera."""
-    x = points[p, 0] - views[camera, _CENTER]
-    y = points[p, 1] - views[camera, _CENTER + 1]
-    z = points[p, 2] - views[camera, _CENTER + 2]
-    return (
-        views[camera, 0] * x + views[camera, 1] * y + views[camera, 2] * z,
-        views[camera, 3] * x + views[camera, 4] * y + views[camera, 5] * z,
-        views[camera, 6] * x + views[camera, 7] * y + views[camera, 8] * z,
-    )
-
-
-@inner_kernel
-def _is_ahead(x: float, y: float, z: float) -> bool:
-    """Return whether a point, in axes of the camera, is in front of it."""
-    return bool(z > 0.0 and z * z > _LEAST_DEPTH * _LEAST_DEPTH * (x * x + y * y + z * z))
-
-
-@inner_kernel
-def _miss(views: Any, camera: int, u: float, v: float, observed: Any, k: int) -> tuple[float, float]:
-    """Return the pixel of the ray (u, v, 1), less the k-th that was observed."""
-    f, g = views[camera, _LENS], views[camera, _LENS + 1]
-    k1, k2 = views[camera, _LENS + 4], views[camera, _LENS + 5]
-    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
-    s, product = u * u + v * v, 2.0 * u * v
-    radial = 1.0 + s * (k1 + s * k2)
-    x = f * (u * radial + p1 * product + p2 * (s + 2.0 * u * u)) + views[camera, _LENS + 2]
-    y = g * (v * radial + p2 * product + p1 * (s + 2.0 * v * v)) + views[camera, _LENS + 3]
-    return x - observed[k, 0], y - observed[k, 1]
-
-
-@inner_kernel
-def _differentiate(views: Any, camera: int, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return the derivatives of the pixel by u and v: x by both, then y by both."""
-    f, g = views[camera, _LENS], views[camera, _LENS + 1]
-    k1, k2 = views[camera, _LENS + 4], views[camera, _LENS + 5]
-    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
-    s = u * u + v * v
-    radial = 1.0 + s * (k1 + s * k2)
-    # Twice the slope of the radial factor by s.
-    slope = 2.0 * (k1 + 2.0 * s * k2)
-    mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
-    return (
-        f * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u),
-        f * mixed,
-        g * mixed,
-        g * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v),
-    )
-
-
-@inner_kernel
-def _differentiate_by_lens(
-    views: Any, camera: int, u: float, v: float, slots: Any, lens: int, by_values: Any, by_lens: Any
-) -> None:
-    """Write the derivatives of the pixel by the unknowns of a lens (2, 6).
-
-    Each of these is the sum over the OPENCV parameters that it stands for, see `by_values` (2, 8).
-    """
-    f, g = views[camera, _LENS], views[camera, _LENS + 1]
-    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
-    s = u * u + v * v
-    radial = 1.0 + s * (views[camera, _LENS + 4] + s * views[camera, _LENS + 5])
-    by_values[0, 0] = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
-    by_values[1, 1] = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
-    by_values[0, 4], by_values[1, 4] = f * u * s, g * v * s
-    by_values[0, 5], by_values[1, 5] = f * u * s * s, g * v * s * s
-    by_values[0, 6], by_values[1, 6] = f * 2.0 * u * v, g * (s + 2.0 * v * v)
-    by_values[0, 7], by_values[1, 7] = f * (s + 2.0 * u * u), g * 2.0 * u * v
-    for q in range(SLOTS):
-        by_lens[0, q] = by_lens[1, q] = 0.0
-    for q in range(NUM_VALUES):
-        if slots[lens, q] >= 0:
-            by_lens[0, slots[lens, q]] += by_values[0, q]
-            by_lens[1, slots[lens, q]] += by_values[1, q]
-
-
 @kernel
 def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
     """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length.
@@ -263,12 +191,12 @@ def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
     for p in range(begin, end):
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
-            x, y, z = _look(views, camera, points, p)
-            x, y, z = x + views[camera, _SHIFT], y + views[camera, _SHIFT + 1], z + views[camera, _SHIFT + 2]
-            square = views[camera, _LENS] * views[camera, _LENS]
-            if _is_ahead(x, y, z):
+            x, y, z = look(views, camera, points, p)
+            x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
+            square = views[camera, LENS] * views[camera, LENS]
+            if is_ahead(x, y, z):
                 inverse = 1.0 / z
-                miss_x, miss_y = _miss(views, camera, x * inverse, y * inverse, pixels, k)
+                miss_x, miss_y = miss(views, camera, x * inverse, y * inverse, pixels, k)
                 square = miss_x * miss_x + miss_y * miss_y
             s = square * inverse_scale
             if plain:
@@ -290,11 +218,11 @@ def _write_residuals(given: Any, out: Any) -> None:
     for p in range(len(first) - 1):
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
-            x, y, z = _look(views, camera, points, p)
-            x, y, z = x + views[camera, _SHIFT], y + views[camera, _SHIFT + 1], z + views[camera, _SHIFT + 2]
+            x, y, z = look(views, camera, points, p)
+            x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
             out[k, 0] = out[k, 1] = np.nan
-            if _is_ahead(x, y, z):
-                out[k, 0], out[k, 1] = _miss(views, camera, x / z, y / z, pixels, k)
+            if is_ahead(x, y, z):
+                out[k, 0], out[k, 1] = miss(views, camera, x / z, y / z, pixels, k)
 
 
 @kernel
@@ -316,15 +244,15 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
         v00, v01, v02, v11, v12, v22, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
-            bx, by, bz = _look(views, camera, points, p)
-            x, y = bx + views[camera, _SHIFT], by + views[camera, _SHIFT + 1]
-            z = bz + views[camera, _SHIFT + 2]
-            if not _is_ahead(x, y, z):
+            bx, by, bz = look(views, camera, points, p)
+            x, y = bx + views[camera, SHIFT], by + views[camera, SHIFT + 1]
+            z = bz + views[camera, SHIFT + 2]
+            if not is_ahead(x, y, z):
                 continue
             inverse = 1.0 / z
             u, v = x * inverse, y * inverse
-            rx, ry = _miss(views, camera, u, v, pixels, k)
-            x_by_u, x_by_v, y_by_u, y_by_v = _differentiate(views, camera, u, v)
+            rx, ry = miss(views, camera, u, v, pixels, k)
+            x_by_u, x_by_v, y_by_u, y_by_v = differentiate(views, camera, u, v)
             w, m00, m01, m11 = _weigh(rx, ry, scale, least_curvature)
             # By the point in axes of the camera, then in those of the world.
             a0, a1, a2 = x_by_u * inverse, x_by_v * inverse, -(x_by_u * u + x_by_v * v) * inverse
@@ -345,8 +273,8 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             v00, v01, v02, v11, v12, v22 = v00 + h00, v01 + h01, v02 + h02, v11 + h11, v12 + h12, v22 + h22
             g0, g1, g2 = g0 + t0, g1 + t1, g2 + t2
             # By the rotation vector, in axes of the camera, then in those of the frame.
-            c0, c1, c2 = _turn(views, camera, by * a2 - bz * a1, bz * a0 - bx * a2, bx * a1 - by * a0)
-            d0, d1, d2 = _turn(views, camera, by * b2 - bz * b1, bz * b0 - bx * b2, bx * b1 - by * b0)
+            c0, c1, c2 = turn_to_frame(views, camera, by * a2 - bz * a1, bz * a0 - bx * a2, bx * a1 - by * a0)
+            d0, d1, d2 = turn_to_frame(views, camera, by * b2 - bz * b1, bz * b0 - bx * b2, bx * b1 - by * b0)
             if not turns:
                 c0, c1, c2, d0, d1, d2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             e = frame_entry[k]
@@ -410,7 +338,7 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             by_point[1, 0], by_point[1, 1], by_point[1, 2] = q0, q1, q2
             if lens_entry[k] >= 0:
                 lens = lens_of_camera[camera]
-                _differentiate_by_lens(views, camera, u, v, lens_slots, lens, by_values, by_lens)
+                differentiate_by_lens(views, camera, u, v, lens_slots, lens, by_values, by_lens)
                 _multiply(m00, m01, m11, by_lens, weighted)
                 _add_node(
                     by_point, by_lens, weighted, wx, wy, node_of_lens[lens], lens_entry[k],
@@ -419,11 +347,11 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
                 _add_link(by_point, by_turn, weighted, links, links_of_camera[0, camera])
             if sensor_entry[k] >= 0:
                 sensor = sensor_of_camera[camera]
-                c0, c1, c2 = _turn(views, camera, a0, a1, a2)
-                d0, d1, d2 = _turn(views, camera, b0, b1, b2)
+                c0, c1, c2 = turn_to_frame(views, camera, a0, a1, a2)
+                d0, d1, d2 = turn_to_frame(views, camera, b0, b1, b2)
                 by_center = (c0, c1, c2, d0, d1, d2)
-                c0, c1, c2 = _turn(views, camera, y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0)
-                d0, d1, d2 = _turn(views, camera, y * b2 - z * b1, z * b0 - x * b2, x * b1 - y * b0)
+                c0, c1, c2 = turn_to_frame(views, camera, y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0)
+                d0, d1, d2 = turn_to_frame(views, camera, y * b2 - z * b1, z * b0 - x * b2, x * b1 - y * b0)
                 _differentiate_by_sensor(by_center, (c0, c1, c2, d0, d1, d2), sensor_bases, sensor, by_sensor)
                 _multiply(m00, m01, m11, by_sensor, weighted)
                 _add_node(
@@ -436,17 +364,6 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
         blocks[p, 0], blocks[p, 1], blocks[p, 2] = v00, v01, v02
         blocks[p, 3], blocks[p, 4], blocks[p, 5] = v11, v12, v22
         point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2] = g0, g1, g2
-
-
-@inner_kernel
-def _turn(views: Any, camera: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return a vector in axes of the camera in those of its frame."""
-    s = _SENSOR
-    return (
-        x * views[camera, s] + y * views[camera, s + 3] + z * views[camera, s + 6],
-        x * views[camera, s + 1] + y * views[camera, s + 4] + z * views[camera, s + 7],
-        x * views[camera, s + 2] + y * views[camera, s + 5] + z * views[camera, s + 8],
-    )
 
 
 @inner_kernel

@@ -40,19 +40,12 @@ from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.residuals import (
-    _SHIFT,
-    _differentiate,
-    _inputs,
-    _is_ahead,
-    _look,
-    _miss,
-    _turn,
-)
+from sfm_shapefit.adjustment.projection import SHIFT, differentiate, is_ahead, look, miss, turn_to_frame
+from sfm_shapefit.adjustment.residuals import kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import METRIC_SIGMA
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 
 _MOST_GROUPS = 64
 _FEWEST_OF_A_GROUP = 8
@@ -179,7 +172,7 @@ class _Pulls:
         self, problem: AdjustmentProblem, options: AdjustmentOptions, system: GroundedSystem
     ) -> None:
         self.problem, self.system = problem, system
-        self.given = _inputs(system.layout, values_of(problem), options.loss_scale_px)
+        self.given = kernel_inputs(system.layout, values_of(problem), options.loss_scale_px)
         self.windows = _windows(problem)
         self.groups = _group_neighbors(problem.points)
         self.num_fields = _count_polynomials()
@@ -328,7 +321,7 @@ def _pull(
     longest = 0
     for p in range(len(first) - 1):
         longest = max(longest, first[p + 1] - first[p])
-    residual, by_pixel = np.empty(2), np.empty(3)
+    residual = np.empty(2)
     by_points, by_frames = np.empty((longest, 2, 3)), np.zeros((longest, 2, 6))
     errors, weights = np.empty((longest, 2, count + 1)), np.empty(longest)
     basis, p_x, p_y = np.empty(num_fields), np.ones(8), np.ones(8)
@@ -342,43 +335,20 @@ def _pull(
             at, camera = k - first[p], cameras[k]
             frame = frame_of_camera[camera]
             weights[at] = 0.0
-            bx, by, bz = _look(views, camera, points, p)
-            x = bx + views[camera, _SHIFT]
-            y = by + views[camera, _SHIFT + 1]
-            z = bz + views[camera, _SHIFT + 2]
-            if not _is_ahead(x, y, z):
+            bx, by, bz = look(views, camera, points, p)
+            x = bx + views[camera, SHIFT]
+            y = by + views[camera, SHIFT + 1]
+            z = bz + views[camera, SHIFT + 2]
+            if not is_ahead(x, y, z):
                 continue
             u, v = x / z, y / z
-            residual[0], residual[1] = _miss(views, camera, u, v, pixels, k)
-            slopes = _differentiate(views, camera, u, v)
-            b0, b1, b2 = _turn(views, camera, bx, by, bz)
-            for axis in range(2):
-                by_u, by_v = slopes[2 * axis], slopes[2 * axis + 1]
-                by_pixel[0], by_pixel[1], by_pixel[2] = by_u / z, by_v / z, -(by_u * u + by_v * v) / z
-                for a in range(3):
-                    slope = 0.0
-                    for c in range(3):
-                        slope += by_pixel[c] * views[camera, 3 * c + a]
-                    by_points[at, axis, a] = slope
-                    by_frames[at, axis, a] = -slope
-                g0, g1, g2 = _turn(views, camera, by_pixel[0], by_pixel[1], by_pixel[2])
-                by_frames[at, axis, 3] = b1 * g2 - b2 * g1
-                by_frames[at, axis, 4] = b2 * g0 - b0 * g2
-                by_frames[at, axis, 5] = b0 * g1 - b1 * g0
+            residual[0], residual[1] = miss(views, camera, u, v, pixels, k)
+            _differentiate_by_frame(views, camera, (bx, by, bz), u, v, z, by_points[at], by_frames[at])
             square = residual[0] * residual[0] + residual[1] * residual[1]
             weights[at] = 1.0 / (1.0 + square / scale)
             x = (pixels[k, 0] - windows[camera, 0]) / windows[camera, 2]
             y = (pixels[k, 1] - windows[camera, 1]) / windows[camera, 3]
-            # Legendre polynomials, of mean square 1 over the window.
-            p_x[1], p_y[1] = x, y
-            for i in range(1, degree):
-                p_x[i + 1] = ((2 * i + 1) * x * p_x[i] - i * p_x[i - 1]) / (i + 1)
-                p_y[i + 1] = ((2 * i + 1) * y * p_y[i] - i * p_y[i - 1]) / (i + 1)
-            t = 0
-            for i in range(degree + 1):
-                for j in range(degree + 1 - i):
-                    basis[t] = p_x[i] * p_y[j] * np.sqrt((2.0 * i + 1.0) * (2.0 * j + 1.0))
-                    t += 1
+            _write_polynomials(x, y, degree, p_x, p_y, basis)
             for axis in range(2):
                 for s in range(count):
                     error = 0.0
@@ -420,3 +390,48 @@ def _pull(
                         by_field[node, a, s] += pull
                     elif has_groups:
                         by_group[node, a, groups[p]] += pull
+
+
+@inner_kernel
+def _differentiate_by_frame(
+    views: Any, camera: int, point: Any, u: float, v: float, z: float, by_point: Any, by_frame: Any
+) -> None:
+    """Write the derivatives of a pixel by its point (2, 3) and by center and rotation of its frame (2, 6).
+
+    Args:
+        views, camera: of the observation.
+        point: less the frame's center, in axes of the camera. u, v: of its ray. z: its depth.
+        by_point, by_frame: are written.
+    """
+    slopes = differentiate(views, camera, u, v)
+    b0, b1, b2 = turn_to_frame(views, camera, point[0], point[1], point[2])
+    for axis in range(2):
+        by_u, by_v = slopes[2 * axis], slopes[2 * axis + 1]
+        j0, j1, j2 = by_u / z, by_v / z, -(by_u * u + by_v * v) / z
+        for a in range(3):
+            slope = j0 * views[camera, a] + j1 * views[camera, 3 + a] + j2 * views[camera, 6 + a]
+            by_point[axis, a], by_frame[axis, a] = slope, -slope
+        g0, g1, g2 = turn_to_frame(views, camera, j0, j1, j2)
+        by_frame[axis, 3], by_frame[axis, 4] = b1 * g2 - b2 * g1, b2 * g0 - b0 * g2
+        by_frame[axis, 5] = b0 * g1 - b1 * g0
+
+
+@inner_kernel
+def _write_polynomials(x: float, y: float, degree: int, p_x: Any, p_y: Any, basis: Any) -> None:
+    """Write the products of Legendre polynomials up to a degree, each of mean square 1 over the window.
+
+    Args:
+        x, y: in [-1, 1] over the window.
+        degree: of the products.
+        p_x, p_y: for the polynomials of one coordinate; the first, 1, is there.
+        basis: is written.
+    """
+    p_x[1], p_y[1] = x, y
+    for i in range(1, degree):
+        p_x[i + 1] = ((2 * i + 1) * x * p_x[i] - i * p_x[i - 1]) / (i + 1)
+        p_y[i + 1] = ((2 * i + 1) * y * p_y[i] - i * p_y[i - 1]) / (i + 1)
+    t = 0
+    for i in range(degree + 1):
+        for j in range(degree + 1 - i):
+            basis[t] = p_x[i] * p_y[j] * np.sqrt((2.0 * i + 1.0) * (2.0 * j + 1.0))
+            t += 1
