@@ -152,9 +152,8 @@ class MatchedKeypoints:
     def _rays(self, poses: CameraPoses) -> FloatArray:
         """Return the unit rays (K, 3) in axes of the world."""
         rays = np.empty((len(self.cameras), 3))
-        for first in range(
-            0, len(rays), _KEYPOINTS_A_SLICE
-        ):  # the rotations of all would take five times the rays
+        # The rotations of all at once would take five times what the rays do.
+        for first in range(0, len(rays), _KEYPOINTS_A_SLICE):
             own = slice(first, first + _KEYPOINTS_A_SLICE)
             ahead = np.concatenate([self.on_plane[own], np.ones((len(rays[own]), 1))], axis=1)
             rays[own] = normalized(np.einsum("kba,kb->ka", poses.rotations[self.cameras[own]], ahead))
