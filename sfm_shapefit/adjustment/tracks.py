@@ -1,7 +1,7 @@
 """Tracks: which keypoints of which cameras are taken for the same point, before any point is known."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,24 @@ class CameraPoses:
     """(c,)"""
     images: IntArray
     """(c,) the image of each; views of one image follow one another."""
+
+
+class JoinedRows(NamedTuple):
+    """Tracks by the rows of their keypoints: track t has rows[offsets[t]:offsets[t + 1]]."""
+
+    offsets: IntArray
+    """(t + 1,)"""
+    rows: IntArray
+    """(m,) rows of other arrays."""
+
+    def subset(self, chosen: IntArray) -> "JoinedRows":
+        """Return the given tracks, in that order."""
+        lengths = np.diff(self.offsets)[chosen]
+        offsets = np.append(0, np.cumsum(lengths))
+        return JoinedRows(
+            offsets,
+            self.rows[np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,12 +80,11 @@ class ObservedTracks:
 
     def subset(self, chosen: IntArray) -> "ObservedTracks":
         """Return the given tracks, in that order."""
-        lengths = self.lengths()[chosen]
-        offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        joined = JoinedRows(self.offsets, np.arange(len(self.cameras))).subset(chosen)
+        rows = joined.rows
         return replace(
             self,
-            offsets=offsets,
+            offsets=joined.offsets,
             cameras=self.cameras[rows],
             keypoints=self.keypoints[rows],
             pixels=self.pixels[rows],
@@ -132,21 +149,31 @@ class MatchedKeypoints:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
         """
+        return self.observed(self.join_rows(poses, limit_px))
+
+    def join_rows(self, poses: CameraPoses, limit_px: float) -> "JoinedRows":
+        """Return the same by the rows of the keypoints, which take a sixth of the memory."""
         parents = np.arange(len(self.cameras))
         given = self._rays(poses), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
             block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
             _join(block, *given, parents)
+        del given  # the rays
         track = number_trees(parents, np.arange(len(parents)))
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
         rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
+        return JoinedRows(np.append(0, np.cumsum(lengths)), rows)
+
+    def observed(self, joined: "JoinedRows") -> ObservedTracks:
+        """Return tracks that are known by their rows."""
+        rows = joined.rows
         return ObservedTracks(
-            offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            offsets=joined.offsets,
             cameras=self.cameras[rows],
             keypoints=self.keypoints[rows],
             pixels=self.pixels[rows],
             on_plane=self.on_plane[rows],
-            ids=np.arange(len(lengths)),
+            ids=np.arange(len(joined.offsets) - 1),
         )
 
     def _rays(self, poses: CameraPoses) -> FloatArray:

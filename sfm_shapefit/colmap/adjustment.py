@@ -233,23 +233,21 @@ def triangulate_in_blocks(
         most_points=_MOST_POINTS,
     )
     poses, matched = frames.poses(), _matched_keypoints(frames, seed, matches)
-    numbers, partners = _number_keypoints(frames, matched), matched.count_partners()
-    fewest = options.fewest_views(len(frames.image_ids))
-    is_left = np.ones(len(numbers), dtype=np.bool_)
+    partners, fewest = matched.count_partners(), options.fewest_views(len(frames.image_ids))
+    is_left = np.ones(len(partners), dtype=np.bool_)
     for share in _JOINING_SHARES:
-        tracks = matched.among(is_left).join(poses, share * limits.max_error_px)
+        joined = matched.among(is_left).join_rows(poses, share * limits.max_error_px)
         if share < max(_JOINING_SHARES):  # two keypoints may find a third one in the next joining
-            sizes = tracks.lengths()
+            sizes = np.diff(joined.offsets)
         else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
-            of_tracks = partners[np.searchsorted(numbers, _number_keypoints(frames, tracks))]
-            sizes = np.diff(np.append(0, np.cumsum(of_tracks))[tracks.offsets])
+            sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
         chosen = np.flatnonzero(sizes >= fewest)
         for first in range(0, len(chosen), _TRACKS_A_BLOCK):
-            block = tracks.subset(chosen[first : first + _TRACKS_A_BLOCK])
-            found = triangulate_tracks(block, poses, limits)
-            add_points(seed, frames, block, found)
-            seeing = _number_keypoints(frames, block)[found.points_seen >= 0]
-            is_left[np.searchsorted(numbers, seeing)] = False
+            block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
+            tracks = matched.observed(block)
+            found = triangulate_tracks(tracks, poses, limits)
+            add_points(seed, frames, tracks, found)
+            is_left[block.rows[found.points_seen >= 0]] = False
             if share == _JOINING_SHARES[0]:  # nearly all tracks
                 advance(min(first + _TRACKS_A_BLOCK, len(chosen)), len(chosen))
     filter_in_place(seed, options)
@@ -310,29 +308,35 @@ def with_points(
 def with_poses(
     reconstruction: pycolmap.Reconstruction, old: PosedFrames, new: PosedFrames
 ) -> pycolmap.Reconstruction:
-    """Return a copy whose frames and free sensors stand, and lenses are, as in `new`; points stay.
+    """Return a copy with other poses, see `set_poses`."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    set_poses(copy, old, new)
+    return copy
+
+
+def set_poses(reconstruction: pycolmap.Reconstruction, old: PosedFrames, new: PosedFrames) -> None:
+    """Let frames and free sensors of our own `reconstruction` stand, and lenses be, as in `new`; points stay.
 
     Args:
-        reconstruction: whose frames `old` were read from.
+        reconstruction: whose frames `old` were read from; changed in place.
         old: before; what is the same in `new` to the last bit keeps its bits.
         new: after.
     """
-    copy = pycolmap.Reconstruction(reconstruction)
     for k, frame_id in enumerate(new.frame_ids):
         rotation, center = new.rotations[k], new.centers[k]
         turns = bool((rotation != old.rotations[k]).any())
         if not turns and (center == old.centers[k]).all():
             continue
-        frame = copy.frame(frame_id)
+        frame = reconstruction.frame(frame_id)
         turn = pycolmap.Rotation3d(rotation) if turns else _pose(frame).rotation
         frame.rig_from_world = pycolmap.Rigid3d(turn, -(rotation @ center))
     for camera_id, pose in sensors_from_rigs(new).items():
-        sensor = copy.camera(camera_id).sensor_id
-        next(rig for rig in copy.rigs.values() if rig.has_sensor(sensor)).set_sensor_from_rig(sensor, pose)
+        sensor = reconstruction.camera(camera_id).sensor_id
+        rigs = reconstruction.rigs.values()
+        next(rig for rig in rigs if rig.has_sensor(sensor)).set_sensor_from_rig(sensor, pose)
     for before, after, camera_id in zip(old.lenses, new.lenses, new.colmap_camera_of_lens, strict=True):
         if after.parameters != before.parameters:
-            copy.camera(camera_id).params = list(after.parameters)
-    return copy
+            reconstruction.camera(camera_id).params = list(after.parameters)
 
 
 def sensors_from_rigs(frames: PosedFrames) -> dict[int, pycolmap.Rigid3d]:
@@ -482,11 +486,6 @@ def _matched_keypoints(
         on_plane=on_plane,
         matches=ends,
     )
-
-
-def _number_keypoints(frames: PosedFrames, of: ObservedTracks | MatchedKeypoints) -> IntArray:
-    """Return a number of each keypoint (m,), ascending by image and within it."""
-    return (frames.images[of.cameras] << 32) + of.keypoints
 
 
 def _look_up(

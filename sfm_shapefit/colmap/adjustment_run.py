@@ -53,7 +53,7 @@ from sfm_shapefit.colmap.adjustment import (
     add_points,
     collect_tracks,
     read_frames,
-    with_poses,
+    set_poses,
     with_rays_of,
 )
 from sfm_shapefit.colmap.ceres_adjustment import refuse_without_points
@@ -325,6 +325,12 @@ class AdjustmentRun:
         by_image = {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
         return Uncertainty(by_image, found.scale_sigma)
 
+    def posed(self, seed: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Return a copy of the seed without points, its frames where they stand now."""
+        copy = copy_without_points(seed)
+        set_poses(copy, self.start, self.frames)
+        return copy
+
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the loss that the errors of a problem call for, in pixel thresholds."""
         threshold_px = self.options.max_reprojection_error_px
@@ -355,7 +361,7 @@ class AdjustmentRun:
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self.adjust_coarsely_by_few(self.thin_problem(loosely, loose))
         joined, found, adjusted = self.adjust_by_all_points()
-        answer = with_poses(copy_without_points(seed), self.start, self.frames)
+        answer = self.posed(seed)
         found = replace(found, points=adjusted.points).of_length(self.checked_length)
         colors = None if isinstance(tracks, ImageMatches) else tracks
         add_points(answer, self.frames, joined, found, colors)

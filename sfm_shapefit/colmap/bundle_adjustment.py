@@ -9,11 +9,10 @@ import pycolmap
 from sfm_shapefit.adjustment import AdjustmentOptions
 from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
 from sfm_shapefit.colmap.adjusted import Adjusted, AdjustedPlacement, RefinedLenses, Uncertainty
-from sfm_shapefit.colmap.adjustment import read_bundle, read_frames, rotations_of_frames, with_poses
+from sfm_shapefit.colmap.adjustment import read_bundle, read_frames, rotations_of_frames
 from sfm_shapefit.colmap.adjustment_run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres
 from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
-from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 
@@ -127,9 +126,8 @@ def adjust_thinly(
     adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
     if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
         _, _, adjusted = run.adjust_by_all_points()
-    poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses,
+        reconstruction=run.posed(seed),
         weight=run.weight,
         frame_ids=run.frames.frame_ids,
         errors=None,
@@ -177,9 +175,8 @@ def adjust_placement(
     if is_repeated:
         # A frame whose rotation was far off has had few of its tracks; where it stands now it has all.
         adjusted = run.adjust_placed(run.problem_of_all(checked=True)[2], LAST_FALL)
-    poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses,
+        reconstruction=run.posed(seed),
         weight=weight,
         frame_ids=run.frames.frame_ids,
         errors=errors,

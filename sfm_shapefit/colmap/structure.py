@@ -20,7 +20,7 @@ primitives are pycolmap's.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -86,7 +86,7 @@ def collect_matches(
         seed.image(i) if is_in else None for i, is_in in zip(image_ids.tolist(), registered, strict=True)
     ]
     num_keypoints = np.array([0 if image is None else image.num_points2D() for image in images])
-    pairs, counts, keypoints = [], [], []
+    pairs, counts, keypoints = [], [], list[npt.NDArray[np.uint32]]()
     for batch in batches:
         kept = registered[batch.pairs].all(axis=1)
         lengths = np.diff(batch.offsets)
@@ -106,8 +106,19 @@ def collect_matches(
     return ImageMatches(
         image_pairs=np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs]),
         offsets=np.append(0, np.cumsum(np.concatenate([np.zeros(0, dtype=np.int64), *counts]))),
-        keypoints=np.concatenate([np.zeros((0, 2), dtype=np.uint32), *keypoints]),
+        keypoints=_concatenate(keypoints),
     )
+
+
+def _concatenate(parts: list[npt.NDArray[np.uint32]]) -> npt.NDArray[np.uint32]:
+    """Return all rows (M, 2). Each part is given up once it is copied, for matches take much memory twice."""
+    rows = np.empty((sum(map(len, parts)), 2), dtype=np.uint32)
+    end = len(rows)
+    while parts:
+        part = parts.pop()
+        rows[end - len(part) : end] = part
+        end -= len(part)
+    return rows
 
 
 def correspondence_graph(
@@ -191,13 +202,15 @@ def color_points(
     if not any(point.color.any() for point in source.points3D.values()):
         return reconstruction
     result = reconstruction if in_place else pycolmap.Reconstruction(reconstruction)
-    ours, theirs = _common_observations(result, source)
-    source_ids, source_rows = np.unique(theirs, return_inverse=True)
-    source_colors = [source.point3D(i).color for i in source_ids.tolist()]
-    colors = np.array(source_colors, dtype=np.float64).reshape(-1, 3)
-    our_ids, our_rows, counts = np.unique(ours, return_inverse=True, return_counts=True)
-    sums = [np.bincount(our_rows, colors[source_rows, channel]) for channel in range(3)]
-    means = np.rint(np.stack(sums, axis=1) / counts[:, None]).astype(np.uint8)
+    ids, source_ids = (np.array(sorted(model.point3D_ids()), dtype=np.uint64) for model in (result, source))
+    colors = np.array([source.point3D(i).color for i in source_ids.tolist()], dtype=np.float64).reshape(-1, 3)
+    sums, counts = np.zeros((len(ids), 3)), np.zeros(len(ids), dtype=np.int64)
+    for our, their in _common_observations(result, source):
+        rows = np.searchsorted(ids, our)
+        np.add.at(sums, rows, colors[np.searchsorted(source_ids, their)])
+        np.add.at(counts, rows, 1)
+    seen = counts > 0
+    our_ids, means = ids[seen], np.rint(sums[seen] / counts[seen, None]).astype(np.uint8)
     for point_id, mean in zip(our_ids.tolist(), means, strict=True):
         result.point3D(point_id).color = mean
     return result
@@ -408,9 +421,8 @@ class _Observations(NamedTuple):
 
 def _common_observations(
     result: pycolmap.Reconstruction, source: pycolmap.Reconstruction
-) -> tuple[UInt64Array, UInt64Array]:
-    """Return the ids of the two points that each points2D observes, where it observes one in both models."""
-    ours, theirs = [np.empty(0, dtype=np.uint64)], [np.empty(0, dtype=np.uint64)]
+) -> Iterator[tuple[UInt64Array, UInt64Array]]:
+    """Yield the ids of the two points that each points2D of an image observes, if it does in both models."""
     for image_id in sorted(result.reg_image_ids()):
         if not source.exists_image(image_id):
             continue
@@ -422,6 +434,4 @@ def _common_observations(
         _, left, right = np.intersect1d(
             our_keypoints, their_keypoints, assume_unique=True, return_indices=True
         )
-        ours.append(our_ids[left])
-        theirs.append(their_ids[right])
-    return np.concatenate(ours), np.concatenate(theirs)
+        yield our_ids[left], their_ids[right]
