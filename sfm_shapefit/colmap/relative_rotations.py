@@ -24,7 +24,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import fields
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -47,13 +47,24 @@ _MOST_TRIALS = 50
 # have images of many pairs each, and can do without the one right pair of 30 to 60 that is then missed
 # (lego100: 715 pairs within 5 degrees instead of 727; liberty-calibrated 449 instead of 464; a facade of
 # 2,500 images, a fifth of the matches wrong: 280 of 280, both, in 0.56 ms a pair instead of 1.29).
-_MANY_PAIRS = 20_000
+MANY_PAIRS = 20_000
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
+# Mean robust weight of its matches from which a pose that was likely is taken without a trial.
+_LIKELY_SHARE = 0.7
 # Of the trials. At 4 px, 36 pairs of lego100 that are right at 2 px are not; 1 px is as good as 2.
 _INLIER_PX = 2.0
 # Between two slices Python can be interrupted: about 50 ms.
 _PAIRS_PER_SLICE = 64
 _STORED_NOISE_PX = 20.0
+
+
+class LikelyPoses(NamedTuple):
+    """Relative poses that k pairs may have, to be tried before any other."""
+
+    rotations: FloatArray
+    """(k, 3, 3) cam_j_from_cam_i."""
+    translations: FloatArray
+    """(k, 3) unit vectors in axes of camera j; NaN for pairs of which nothing is known."""
 
 
 def estimate_relative_rotations(
@@ -62,6 +73,7 @@ def estimate_relative_rotations(
     advance: Callable[[int], None] | None = None,
     *,
     num_pairs: int = 0,
+    likely: LikelyPoses | None = None,
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that has one, in the order of pairs.
 
@@ -72,13 +84,15 @@ def estimate_relative_rotations(
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
         num_pairs: all that there are, of which these are a part: of many, each is tried less often.
+        likely: poses of the batch's pairs. Where most matches fit near one, that is the answer; the trials,
+            nine tenths of the time, are for the others.
     """
     firsts = range(0, len(batch.pairs), _PAIRS_PER_SLICE)
     with ExitStack() as stack:
         # Where memory is short, Python waits for ever for a thread that could not begin.
         share_out = map if threads <= 1 else stack.enter_context(ThreadPoolExecutor(threads)).map
         parts = []
-        for part in share_out(partial(_estimate_slice, batch, num_pairs), firsts):
+        for part in share_out(partial(_estimate_slice, batch, num_pairs, likely), firsts):
             parts.append(part)
             if advance is not None:
                 advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
@@ -128,18 +142,27 @@ def concatenate(parts: Sequence[RelativeRotations]) -> RelativeRotations:
     return RelativeRotations(**columns)
 
 
-def _estimate_slice(batch: RayMatches, num_pairs: int, first: int) -> RelativeRotations:
+def _estimate_slice(
+    batch: RayMatches, num_pairs: int, likely: LikelyPoses | None, first: int
+) -> RelativeRotations:
     """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
-    offsets = batch.offsets[first : first + _PAIRS_PER_SLICE + 1]
-    rows, pairs = slice(offsets[0], offsets[-1]), slice(first, first + _PAIRS_PER_SLICE)
-    matches = RayMatches(
-        pairs=batch.pairs[pairs],
-        offsets=offsets - offsets[0],
-        rays_i=batch.rays_i[rows],
-        rays_j=batch.rays_j[rows],
-        pixel_angles=batch.pixel_angles[pairs],
-    )
-    found, rotations, translations = _start_by_trials(matches, num_pairs)
+    pairs = np.arange(first, min(first + _PAIRS_PER_SLICE, len(batch.pairs)))
+    found, places = [], []
+    if likely is not None:
+        known = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
+        near = _refine(batch.rays_of(known), likely.rotations[known], likely.translations[known])
+        fits = near.weight_shares >= _LIKELY_SHARE
+        found, places = [near.subset(fits)], [known[fits]]
+        pairs = np.setdiff1d(pairs, known[fits])
+    matches = batch.rays_of(pairs)
+    has_pose, rotations, translations = _start_by_trials(matches, num_pairs)
+    found.append(_refine(matches, rotations, translations).subset(has_pose))
+    places.append(pairs[has_pose])
+    return concatenate(found).subset(np.argsort(np.concatenate(places)))
+
+
+def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:
+    """Return the relative rotations of pairs that fit all their matches best, near those given."""
     poses = refine_two_view_poses(matches, rotations, translations)
     return RelativeRotations(
         pairs=matches.pairs,
@@ -147,7 +170,7 @@ def _estimate_slice(batch: RayMatches, num_pairs: int, first: int) -> RelativeRo
         information=poses.information,
         num_matches=np.diff(matches.offsets),
         weight_shares=poses.weight_shares,
-    ).subset(found)
+    )
 
 
 def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -166,7 +189,7 @@ def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, Fl
     pixels = [camera.img_from_cam(rays[rows]) for rays in (matches.rays_i, matches.rays_j)]
     options = pycolmap.RANSACOptions()
     options.min_num_trials, options.max_num_trials, options.random_seed = _LEAST_TRIALS, _MOST_TRIALS, 0
-    if num_pairs > _MANY_PAIRS:
+    if num_pairs > MANY_PAIRS:
         options.mergedict(_FEWER_TRIALS)
     for p in range(k):
         options.max_error = _INLIER_PX * float(matches.pixel_angles[p])

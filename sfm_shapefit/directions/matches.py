@@ -27,6 +27,19 @@ class RayMatches:
     pixel_angles: FloatArray
     """(k,) angle of one pixel in radians, 1 / the smaller focal length in px."""
 
+    def rays_of(self, chosen: IntArray) -> "RayMatches":
+        """Return the rays of some of the pairs, in that order."""
+        counts = np.diff(self.offsets)[chosen]
+        offsets = np.append(0, np.cumsum(counts))
+        rows = np.repeat(self.offsets[chosen] - offsets[:-1], counts) + np.arange(offsets[-1])
+        return RayMatches(
+            pairs=self.pairs[chosen],
+            offsets=offsets,
+            rays_i=self.rays_i[rows],
+            rays_j=self.rays_j[rows],
+            pixel_angles=self.pixel_angles[chosen],
+        )
+
 
 def join_rays(parts: Sequence[RayMatches]) -> RayMatches:
     """Return the pairs of all parts, in order; there may be no parts."""

@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sfm_shapefit.colmap import relative_rotations
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.relative_rotations import (
+    LikelyPoses,
     concatenate,
     estimate_relative_rotations,
     stored_relative_rotations,
@@ -17,6 +19,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.problems import turn
 from tests.scenes import COURTYARD, real_scene
 
 MOVE, FORWARD = np.array([1.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -97,6 +100,36 @@ def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():
     right, before = (errors_deg(one, truth.rotations) < 5.0 for one in (found, usual))
     assert right.sum() > 0.97 * before.sum()
     assert (found.rotations != usual.rotations).any()  # else no trial was saved
+
+
+def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_changes_no_bit(monkeypatch):
+    truth = read_model(COURTYARD / "truth")
+    _, (batch,) = batches(COURTYARD / "database.db")
+    i, j = batch.pairs.T
+    offsets = truth.centers[i] - truth.centers[j]
+    rotations = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
+    translations = normalized(np.einsum("kab,kb->ka", truth.rotations[j], offsets))
+    rotations[1::3] = rotations[1::3] @ turn(np.array([0.0, 1.0, 0.0]), 20.0)
+    translations[2::3] = np.nan
+    tried, trials = [], relative_rotations._start_by_trials
+
+    def trying(matches, num_pairs):
+        tried.extend(matches.pairs.tolist())
+        return trials(matches, num_pairs)
+
+    without = estimate_relative_rotations(batch)
+    monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
+    likely = LikelyPoses(rotations, translations)
+    found = estimate_relative_rotations(batch, likely=likely)
+    is_tried = np.array([pair in tried for pair in batch.pairs.tolist()])
+    assert is_tried[2::3].all()
+    assert is_tried[1::3].any()  # the others come back to their matches
+    assert is_tried[::3].mean() < 0.2  # false pairs
+    assert_same_bits(found.subset(is_tried), without.subset(is_tried))
+    # Both ways end at the minimum, within what a last step may move.
+    close = rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ without.rotations)
+    assert np.quantile(close[~is_tried], 0.95) < 1e-3
+    assert_same_bits(estimate_relative_rotations(batch, threads=3, likely=likely), found)
 
 
 def test_stored_rotations_count_by_their_matches(tmp_path):

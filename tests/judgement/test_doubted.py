@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.colmap import relative_rotations
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
 from sfm_shapefit.commands.stages import doubts as doubts_stage
@@ -87,6 +88,24 @@ def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, 
     assert {row.name for row in found.cameras if not row.placed} == wrong
     kinds = dict(zip(found.model.names, found.placement.assessment.doubts.kinds, strict=True))
     assert {name for name, kind in kinds.items() if kind is not Doubt.RIGHT} == wrong
+
+
+@pytest.mark.parametrize("angle_deg", [2.0, 5.0])
+def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch, angle_deg):
+    tried, trials = [], relative_rotations._start_by_trials
+
+    def trying(matches, num_pairs):
+        tried.extend(matches.pairs.tolist())
+        return trials(matches, num_pairs)
+
+    monkeypatch.setattr(doubts_stage, "MANY_PAIRS", 0)
+    monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
+    chosen = (9, 10, 11, 12, 13)
+    model, wrong = turned(COURTYARD, chosen, angle_deg)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust=False)
+    assert {row.name for row in found.cameras if not row.placed} == wrong
+    touching = [any(found.model.names[k] in wrong for k in pair) for pair in tried]
+    assert np.mean(touching) > 0.9
 
 
 def test_a_camera_that_is_turned_a_little_is_put_right():

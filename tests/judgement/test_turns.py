@@ -79,7 +79,7 @@ def test_a_turn_between_what_a_pair_can_be_sure_of_and_what_it_shows_is_found():
 
 
 def test_a_turn_is_found_among_pairs_that_agree_exactly():
-    """Five pairs that each know 2 degrees tell one of 2; to be as exact as the others is not asked of them."""
+    """Five pairs that each know 2 degrees tell of 2; to be as exact as the others is not asked of them."""
     turns = np.tile(np.eye(3), (12, 1, 1))
     turns[0] = turn(np.array([0.6, 0.0, 0.8]), 2.0)
     others = [(i, j) for i, j in all_pairs(12) if i > 0]

@@ -9,7 +9,12 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.colmap.relative_rotations import concatenate, estimate_relative_rotations
+from sfm_shapefit.colmap.relative_rotations import (
+    MANY_PAIRS,
+    LikelyPoses,
+    concatenate,
+    estimate_relative_rotations,
+)
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import MatchBatch, RayMatches, join_rays
 from sfm_shapefit.directions.pair_directions import PairDirections
@@ -25,6 +30,12 @@ _LEAST_MATCHES = 8
 # Robust weight as placed below which a pair is poor, and the share of a camera's matches in poor pairs that
 # makes the camera doubtful.
 _POOR = 0.9
+# The same, from which a pair of very many is first tried as it is given. On made rings and a made facade, by
+# that all pairs of right cameras need no other trial, and on the ring of 900 images 1 % of them are off by
+# more than 3.5 standard deviations instead of 10 %: trials end beside the best pose. Turned by 0.5 to 3
+# degrees, pairs keep up to 6 % of the turn. On photographs (liberty-calibrated) some false pairs would be
+# believed as given, so that few pairs are asked without prejudice.
+_LIKELY = 0.7
 _DOUBTFUL_SHARE = 0.1
 # Pairs of each camera that are asked at most, those of most matches, and matches of a pair. Beyond 750 images
 # they are fewer, so that about so many are asked in all: a thousand take more than a second.
@@ -53,14 +64,30 @@ def ask_pairs(
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
         return concatenate([])
-    wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
-    parts = []
+    num_pairs, parts = len(directions.pairs), []
+    row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
     for batch in source.batches():
-        rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
+        rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
-        num_pairs = len(directions.pairs)
-        parts.append(estimate_relative_rotations(rays, options.num_threads(), num_pairs=num_pairs))
+        likely = None
+        if num_pairs > MANY_PAIRS:
+            asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
+            likely = _poses_as_given(source.model, directions, np.array(asked, dtype=np.int64))
+        parts.append(
+            estimate_relative_rotations(rays, options.num_threads(), num_pairs=num_pairs, likely=likely)
+        )
     return concatenate(parts)
+
+
+def _poses_as_given(model: PosedModel, directions: PairDirections, rows: IntArray) -> LikelyPoses:
+    """Return the relative poses of pairs by the given rotations and the directions measured with them.
+
+    Only of pairs most of whose matches fit that: a turned camera's would be drawn to how it is placed.
+    """
+    i, j = directions.pairs[rows].T
+    translations = np.einsum("kab,kb->ka", model.rotations[j], directions.directions[rows])
+    translations[fit_as_placed(directions)[rows] < _LIKELY] = np.nan
+    return LikelyPoses(model.rotations[j] @ model.rotations[i].transpose(0, 2, 1), translations)
 
 
 def doubt_cameras(
