@@ -50,7 +50,7 @@ _MOST_TRIALS = 50
 MANY_PAIRS = 20_000
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 # Mean robust weight of its matches from which a pose that was likely is taken without a trial.
-_LIKELY_SHARE = 0.7
+_LIKELY_SHARE = 0.6
 # Of the trials. At 4 px, 36 pairs of lego100 that are right at 2 px are not; 1 px is as good as 2.
 _INLIER_PX = 2.0
 # Between two slices Python can be interrupted: about 50 ms.
