@@ -156,13 +156,14 @@ def read_lines(file: Path, form: str) -> TextTable:
     Raises:
         InputError: if the file cannot be read or holds no line; `form` is what one should look like.
     """
-    numbers, rows = [], []
-    for number, line in enumerate(text_of(file).splitlines(), start=1):
+    text, numbers, rows = text_of(file), [], []
+    for number, line in enumerate(text.splitlines(), start=1):
         if words := line.split("#", 1)[0].split():
             numbers.append(number)
             rows.append(words)
     if not rows:
-        raise InputError(f"{file} has no lines of the form {form}; give some")
+        what = "has no lines" if text else "is empty, so it has no lines"
+        raise InputError(f"{file} {what} of the form {form}; give some")
     return TextTable(file, numbers, rows)
 
 

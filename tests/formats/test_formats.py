@@ -93,7 +93,7 @@ def test_the_bundled_graph_and_tables_are_those_that_their_script_makes():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no lines of the form i j vx vy vz"),
+        ("", "is empty, so it has no lines of the form i j vx vy vz"),
         ("# nothing\n\n", "no lines of the form"),
         ("0 1 1 0 0\n\n1 2 0 1\n", "line 3: has 4 columns"),
         ("0 1 1 0 0\n1 2 0 x 1\n", "line 2: 'x' is not a number"),
