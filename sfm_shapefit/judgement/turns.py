@@ -27,8 +27,8 @@ relative: of all bodies the one whose turn mends most is turned first, the small
 has more than half of all cameras; its pairs then agree, and bodies are found anew.
 
 Turns that are smaller than a pair can tell are looked for at last, in all pairs together (`small_turns`). Of
-a camera whose correction is larger than a degree, `turned` are the pairs that fit better with it, `placed`
-those that fit only without.
+a camera whose correction is larger than a degree, and than five of its standard deviations, `turned` are the
+pairs that fit better with it, `placed` those that fit only without.
 
 How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
 and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
@@ -80,6 +80,8 @@ RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
 _MOST_VOTES = 300
 _MOST_TURNED = 50
 _AVERAGING_STEPS = 4
+# Standard deviations from which a correction is no chance, however few and inexact the pairs are.
+_CERTAIN_SIGMAS = 5.0
 # For all pairs together, standard deviations are what the pairs that agree best show, and this at least.
 _LEAST_LEVEL = 0.2
 
@@ -403,12 +405,14 @@ def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: f
     if len(case.pairs) == 0:
         return {}
     turns = Rotation.from_matrix(case.turns).as_rotvec()
-    corrections = solve_corrections(case.pairs, turns, case.sigmas_rad, count, level=level)
+    corrections = solve_corrections(
+        case.pairs, turns, case.sigmas_rad, count, level=level, larger_than_rad=least_rad
+    )
     i, j = case.pairs.T
-    left, sigmas = turns - corrections[i] + corrections[j], level * case.sigmas_rad
+    left, sigmas = turns - corrections.vectors[i] + corrections.vectors[j], level * case.sigmas_rad
     found = {}
-    for camera in np.flatnonzero(np.linalg.norm(corrections, axis=1) > least_rad).tolist():
-        own = corrections[camera]
+    for camera, sigma in zip(corrections.cameras.tolist(), corrections.sigmas_rad.tolist(), strict=True):
+        own = corrections.vectors[camera]
         rows = np.flatnonzero((i == camera) | (j == camera))
         sides = np.where(i[rows] == camera, 1.0, -1.0)[:, None]
         off_turned = np.linalg.norm(left[rows], axis=1) / sigmas[rows]
@@ -422,7 +426,7 @@ def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: f
             num_pairs=len(rows),
             turn=np.asarray(Rotation.from_rotvec(own).as_matrix()),
         )
-        if judged.kind is Doubt.TURNED:
+        if judged.kind is Doubt.TURNED and np.linalg.norm(own) > _CERTAIN_SIGMAS * sigma:
             found[camera] = judged
     return found
 

@@ -78,6 +78,16 @@ def test_a_turn_between_what_a_pair_can_be_sure_of_and_what_it_shows_is_found():
     assert found.angles_deg[4] == pytest.approx(5.0, abs=0.3)
 
 
+def test_a_correction_of_less_than_five_standard_deviations_blames_nobody():
+    """Ten pairs, each of which knows 1.7 degrees, speak for 1.04, which is 4.87 standard deviations."""
+    turns = np.tile(np.eye(3), (20, 1, 1))
+    turns[0] = turn(np.array([0.6, 0.0, 0.8]), 1.8)
+    others = [(i, j) for i, j in all_pairs(20) if i > 0]
+    pairs = measured_turns(turns, 2, others + [(0, j) for j in range(1, 11)], sigma_rad=np.radians(1.7))
+    pairs.placed[:] = 1.0
+    assert set(find_turned(pairs, np.arange(20)).kinds) == {Doubt.RIGHT}
+
+
 def test_a_turn_is_found_among_pairs_that_agree_exactly():
     """Five pairs that each know 2 degrees tell of 2; to be as exact as the others is not asked of them."""
     turns = np.tile(np.eye(3), (12, 1, 1))
@@ -98,7 +108,10 @@ def test_corrections_are_those_of_the_exact_least_squares_where_all_pairs_fit():
     # Such small corrections leave all weights at 1: (L / sigma^2 + 1 / tau^2) x = L own / sigma^2.
     laplacian = 6.0 * np.eye(6) - np.ones((6, 6))
     information = laplacian / sigma**2 + np.eye(6) / np.radians(0.2) ** 2
-    np.testing.assert_allclose(found, np.linalg.solve(information, laplacian @ own / sigma**2), rtol=1e-3)
+    np.testing.assert_allclose(
+        found.vectors, np.linalg.solve(information, laplacian @ own / sigma**2), rtol=1e-3
+    )
+    np.testing.assert_allclose(found.sigmas_rad**2, np.diag(np.linalg.inv(information)), rtol=1e-3)
 
 
 def test_false_pairs_that_agree_on_nothing_blame_nobody():
