@@ -16,20 +16,13 @@ import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
-from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
+from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import camera_rays, observed_points, points2d_xy
-from sfm_shapefit.colmap.structure import Advance, ImageMatches, TrackSource, filter_in_place
-from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.structure import ImageMatches, TrackSource
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 
-# Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
-_TRACKS_A_BLOCK = 20_000
-# Of tracks: the shares of the pixel threshold that a match may miss by, one after the other, and the points
-# that a track may be of. Where a fifth of the matches is wrong, those within the whole threshold join a third
-# of all observations to long chains; so what is within half of it is joined first, and then what is left.
-_JOINING_SHARES, _MOST_POINTS = (0.5, 1.0), 50
 # Pairs of images, and matches, that are looked at together.
 _PAIRS_A_SLICE, _MATCHES_A_SLICE = 5_000, 1_000_000
 _ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -183,10 +176,10 @@ def collect_tracks(
     Args:
         frames: of `reconstruction`, which has the keypoints of its images.
         reconstruction: the same.
-        tracks: as in `colmap.structure.triangulate`.
+        tracks: as in `colmap.triangulation.triangulate`.
     """
     if isinstance(tracks, ImageMatches):
-        return _matched_keypoints(frames, reconstruction, tracks)
+        return matched_keypoints(frames, reconstruction, tracks)
     seen = [observed_points(tracks.image(i)) for i in frames.image_ids]
     images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
     keypoints = np.concatenate([keypoints for keypoints, _ in seen])
@@ -203,55 +196,6 @@ def collect_tracks(
         ids=names,
         may_split=False,
     )
-
-
-def triangulate_in_blocks(
-    seed: pycolmap.Reconstruction,
-    matches: ImageMatches,
-    options: StructureOptions,
-    advance: Advance = lambda _done, _total: None,
-) -> pycolmap.Reconstruction:
-    """Triangulate the tracks of matches at the poses of `seed`, a block at a time; return `seed` with them.
-
-    In about half the time of COLMAP's triangulator, which holds all matches in one graph. By its rule a track
-    of two keypoints that are matched with no other one is left out. Beside it, points fit better: on
-    fountain-P11, Herz-Jesus-P25, castle-P30 and lego100 it finds 0.4, 0.7, 0.9 and 4.3 % more observations,
-    with mean errors of 0.44 instead of 0.53, 0.57 (0.70), 0.40 (0.50) and 0.47 px (0.64). The mean length of
-    tracks is 4.60 (4.54), 5.64 (5.54), 4.90 (4.92) and 4.57 (4.65).
-
-    Args:
-        seed: the placed images, without points; changed in place.
-        matches: of their keypoints.
-        options: what a point must satisfy.
-        advance: called with the tracks of the first joining that are done, and their number.
-    """
-    frames = read_frames(seed)
-    limits = PointLimits(
-        max_error_px=options.max_reprojection_error_px,
-        min_angle_deg=options.min_triangulation_angle_deg,
-        min_length=options.min_track_length,
-        most_points=_MOST_POINTS,
-    )
-    poses, matched = frames.poses(), _matched_keypoints(frames, seed, matches)
-    partners, fewest = matched.count_partners(), options.fewest_views(len(frames.image_ids))
-    is_left = np.ones(len(partners), dtype=np.bool_)
-    for share in _JOINING_SHARES:
-        joined = matched.among(is_left).join_rows(poses, share * limits.max_error_px)
-        if share < max(_JOINING_SHARES):  # two keypoints may find a third one in the next joining
-            sizes = np.diff(joined.offsets)
-        else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
-            sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
-        chosen = np.flatnonzero(sizes >= fewest)
-        for first in range(0, len(chosen), _TRACKS_A_BLOCK):
-            block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
-            tracks = matched.observed(block)
-            found = triangulate_tracks(tracks, poses, limits)
-            add_points(seed, frames, tracks, found)
-            is_left[block.rows[found.points_seen >= 0]] = False
-            if share == _JOINING_SHARES[0]:  # nearly all tracks
-                advance(min(first + _TRACKS_A_BLOCK, len(chosen)), len(chosen))
-    filter_in_place(seed, options)
-    return seed
 
 
 def with_rays_of(
@@ -449,7 +393,7 @@ def _sensor_from_rig(
     return _matrix(pose.rotation), pose.translation
 
 
-def _matched_keypoints(
+def matched_keypoints(
     frames: PosedFrames, reconstruction: pycolmap.Reconstruction, matches: ImageMatches
 ) -> MatchedKeypoints:
     """Return the matches between posed images as pairs of keypoints."""

@@ -13,8 +13,9 @@ from sfm_shapefit.colmap.adjustment import read_bundle, read_frames, rotations_o
 from sfm_shapefit.colmap.adjustment_run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres
 from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
-from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, filter_points
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
+from sfm_shapefit.colmap.triangulation import triangulate
 
 # Of the last round of Ceres, by which its answer is judged.
 _CERES_LOSS_PX = 1.0

@@ -25,8 +25,9 @@ from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.colmap.model import sensors_of
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
 from sfm_shapefit.colmap.seed import transform_model
-from sfm_shapefit.colmap.structure import TrackSource, triangulate
+from sfm_shapefit.colmap.structure import TrackSource
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import Similarity
 

@@ -193,7 +193,6 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         options,
         clock,
         known.executor,
-        is_adjusted=adjustment is not None or known.centers is not None,
     )
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
     seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)

@@ -15,14 +15,15 @@ import pytest
 from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.adjustment import lens_of, triangulate_in_blocks
+from sfm_shapefit.colmap.adjustment import lens_of
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import collect_matches, color_points, filter_points, triangulate
+from sfm_shapefit.colmap.structure import collect_matches, color_points, filter_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
@@ -240,7 +241,7 @@ class Copying(ThreadPoolExecutor):
 
 
 def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.colmap.structure._TRACKS_A_TASK", 7)
+    monkeypatch.setattr("sfm_shapefit.colmap.triangulation._TRACKS_A_TASK", 7)
     original, points = ring_model(noise_px=3.0)
     seed, seen = seeded(original, ring_centers() + 0.01)[0], []
     with Copying(2) as executor:
@@ -277,50 +278,53 @@ def wrong_in_part(share):
     return batches
 
 
-def test_tracks_in_blocks_give_the_same_bits_whatever_the_blocks(monkeypatch):
+def test_points_of_matches_are_the_same_bits_whatever_the_blocks(monkeypatch):
     original, _ = ring_model(noise_px=0.3)
     found = []
     for tracks, pairs, matches in ((10**9, 10**9, 10**9), (7, 2, 11), (120, 1, 500)):
-        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._TRACKS_A_BLOCK", tracks)
+        monkeypatch.setattr("sfm_shapefit.colmap.triangulation._TRACKS_A_BLOCK", tracks)
         monkeypatch.setattr("sfm_shapefit.colmap.adjustment._PAIRS_A_SLICE", pairs)
         monkeypatch.setattr("sfm_shapefit.colmap.adjustment._MATCHES_A_SLICE", matches)
         monkeypatch.setattr("sfm_shapefit.adjustment.tracks._MATCHES_A_SLICE", matches)
-        found.append(
-            dump(triangulate_in_blocks(*seeded(original, batches=wrong_in_part(0.3)), StructureOptions()))
-        )
+        found.append(dump(triangulate(*seeded(original, batches=wrong_in_part(0.3)))))
     assert found[0] == found[1] == found[2]
 
 
-def test_tracks_in_blocks_are_the_points_of_colmaps_triangulator():
+def by_colmap(seed, matches):
+    """The points that COLMAP's own incremental triangulator makes of matches."""
+    structure, graph = pycolmap.Reconstruction(seed), pycolmap.CorrespondenceGraph()
+    for image_id in sorted(structure.reg_image_ids()):
+        graph.add_image(image_id, structure.image(image_id).num_points2D())
+    for pair, (first, second) in enumerate(matches.image_pairs.tolist()):
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
+        geometry.inlier_matches = matches.keypoints[matches.offsets[pair] : matches.offsets[pair + 1]]
+        graph.add_two_view_geometry(first, second, geometry)
+    graph.finalize()
+    settings = pycolmap.IncrementalTriangulatorOptions()
+    manager = pycolmap.ObservationManager(structure, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, structure, manager)
+    for image_id in sorted(structure.reg_image_ids()):
+        triangulator.triangulate_image(settings, image_id)
+    triangulator.complete_all_tracks(settings)
+    triangulator.merge_all_tracks(settings)
+    manager.filter_all_points3D(4.0, 1.5)
+    return structure
+
+
+def test_points_of_matches_are_those_of_colmaps_triangulator():
     original, points = ring_model(noise_px=0.3)
     seen = []
-    seed, matches = seeded(original)
-    ours = triangulate_in_blocks(seed, matches, StructureOptions(), lambda *done: seen.append(done))
-    theirs = triangulate(*seeded(original))
-    assert ours is seed
+    ours = triangulate(*seeded(original), None, lambda *done: seen.append(done))
+    theirs = by_colmap(*seeded(original))
     assert seen[-1] == (len(points), len(points))
     assert ours.num_points3D() == theirs.num_points3D() == len(points)
     assert ours.compute_num_observations() == theirs.compute_num_observations()
     # ours are at the least squares of their observations, up to what lenses make of pixels
     assert ours.compute_mean_reprojection_error() <= 1.01 * theirs.compute_mean_reprojection_error()
-    loose = triangulate_in_blocks(*seeded(original, batches=wrong_in_part(0.3)), StructureOptions())
-    assert loose.num_points3D() >= len(points)
-    assert max(reprojection_errors_px(loose)) <= 4.0
 
 
-def test_blocks_leave_out_what_only_two_images_share_as_colmaps_triangulator_does():
-    original, _ = ring_model()
-    two = [batch_of(np.array([[0, 1]]), 120)]
-    assert triangulate_in_blocks(*seeded(original, batches=two), StructureOptions()).num_points3D() == 0
-    both = StructureOptions(ignore_two_view_tracks=False)
-    assert triangulate_in_blocks(*seeded(original, batches=two), both).num_points3D() == 120
-    alone = seeded(original, placed=np.arange(NUM_IMAGES) < 2)
-    assert triangulate_in_blocks(*alone, StructureOptions()).num_points3D() == 120
-    nothing = triangulate_in_blocks(*seeded(original, batches=[]), StructureOptions())
-    assert nothing.num_points3D() == 0
-
-
-def test_blocks_keep_a_match_of_two_images_with_another_partner_as_colmaps_triangulator_does():
+def test_a_match_of_two_images_is_kept_if_one_has_another_partner_as_by_colmaps_triangulator():
     original, _ = ring_model()
     further = batch_of(np.array([[1, 2]]), 60)
     further.keypoints[:, 1] = 119 - further.keypoints[:, 1]  # of other points
@@ -335,8 +339,7 @@ def test_blocks_keep_a_match_of_two_images_with_another_partner_as_colmaps_trian
             if e.image_id == first
         }
 
-    assert seeing(lambda *given: triangulate_in_blocks(*given, StructureOptions())) == set(range(60))
-    assert seeing(triangulate) == set(range(60))
+    assert seeing(triangulate) == seeing(by_colmap) == set(range(60))
 
 
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
@@ -359,12 +362,7 @@ def reprojection_errors_px(structure):
 
 
 def test_wrong_matches_make_no_point_that_misses_its_observations():
-    rng = np.random.default_rng(1)
-    batches = all_matches()
-    for batch in batches:
-        wrong = rng.random(len(batch.keypoints)) < 0.3
-        batch.keypoints[wrong, 1] = rng.integers(0, 120, size=wrong.sum())
-    structure = triangulate(*seeded(ring_model(noise_px=0.3)[0], batches=batches))
+    structure = triangulate(*seeded(ring_model(noise_px=0.3)[0], batches=wrong_in_part(0.3)))
     assert structure.num_points3D() >= 120
     assert max(reprojection_errors_px(structure)) <= 4.0
 
@@ -377,6 +375,7 @@ def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_
     seed, matches = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
     assert triangulate(seed, matches).num_points3D() == 120
     assert bundle_adjust(seed, matches).reconstruction.num_points3D() == 120
+    assert triangulate(*seeded(ring_model()[0], batches=[])).num_points3D() == 0
 
 
 def test_matches_and_tracks_of_other_keypoints_are_refused():

@@ -10,7 +10,6 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.adjusted import Adjusted
-from sfm_shapefit.colmap.adjustment import triangulate_in_blocks
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
@@ -21,13 +20,8 @@ from sfm_shapefit.colmap.point_support import (
     images_without_support,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
-from sfm_shapefit.colmap.structure import (
-    ImageMatches,
-    TrackSource,
-    collect_matches,
-    color_points,
-    triangulate,
-)
+from sfm_shapefit.colmap.structure import TrackSource, collect_matches, color_points
+from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -41,8 +35,6 @@ from sfm_shapefit.results.result import FurtherPiece
 if TYPE_CHECKING:
     import pycolmap
 
-# COLMAP's triangulator takes seconds and 40 MB for a million matches.
-_MOST_MATCHES_OF_A_GRAPH = 2_000_000
 # Fewer trusted cameras are no result.
 _FEWEST_KEPT = 3
 
@@ -102,14 +94,11 @@ def build_seeded_model(
     options: LocateOptions,
     clock: Clock,
     executor: Executor | None = None,
-    *,
-    is_adjusted: bool = False,
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
-    executor shares out the model's own tracks. Where an adjustment had the cameras before, `is_adjusted`,
-    its own triangulation makes the points too: they fit better, in half the time (`triangulate_in_blocks`).
+    executor shares out the model's own tracks.
     """
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
@@ -119,7 +108,7 @@ def build_seeded_model(
             source.database.forget_rays()  # triangulation is where most memory is needed
     if not options.bundle_adjust:
         with clock("triangulation"):
-            seeded = _triangulate(seed, tracks, options, clock.advance, executor, is_adjusted)
+            seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
             adjusted = bundle_adjust(
@@ -155,20 +144,6 @@ def build_seeded_model(
     if adjusted is not None:
         adjusted = replace(adjusted, reconstruction=seeded)
     return Seeded(seeded, gauge, adjusted, poor, frozenset(unsupported), shares)
-
-
-def _triangulate(
-    seed: "pycolmap.Reconstruction",
-    tracks: TrackSource,
-    options: LocateOptions,
-    advance: Callable[[int, int], None],
-    executor: Executor | None,
-    is_adjusted: bool,
-) -> "pycolmap.Reconstruction":
-    """Return the seed itself with the points of the tracks."""
-    if isinstance(tracks, ImageMatches) and (is_adjusted or len(tracks.keypoints) > _MOST_MATCHES_OF_A_GRAPH):
-        return triangulate_in_blocks(seed, tracks, options, advance)
-    return triangulate(seed, tracks, options, advance, executor, in_place=True)
 
 
 def _set_gauge(
