@@ -11,6 +11,8 @@ from sfm_shapefit.directions.joining import number_trees, sampson_px, unite
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.jit import kernel
 
+Int32Array = npt.NDArray[np.int32]
+
 # Between two slices Python can be interrupted: about 50 ms.
 _MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000
 
@@ -115,9 +117,9 @@ class ObservedTracks:
 class MatchedKeypoints:
     """Keypoints of cameras, and which of them are matched with which."""
 
-    cameras: IntArray
+    cameras: Int32Array
     """(K,) ascending by image."""
-    keypoints: IntArray
+    keypoints: Int32Array
     """(K,) which of the image's keypoints it is."""
     pixels: FloatArray
     """(K, 2) as the adjustment's lens takes them."""
@@ -169,8 +171,8 @@ class MatchedKeypoints:
         rows = joined.rows
         return ObservedTracks(
             offsets=joined.offsets,
-            cameras=self.cameras[rows],
-            keypoints=self.keypoints[rows],
+            cameras=self.cameras[rows].astype(np.int64),
+            keypoints=self.keypoints[rows].astype(np.int64),
             pixels=self.pixels[rows],
             on_plane=self.on_plane[rows],
             ids=np.arange(len(joined.offsets) - 1),

@@ -7,24 +7,19 @@ those that see something take part. No ray is more than 28 degrees off the axis 
 is at most 1.3 times that of the image, even for rays at right angles to the camera or behind it.
 """
 
-import itertools
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
-from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.adjustment.tracks import CameraPoses, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.model import camera_rays, observed_points, points2d_xy
-from sfm_shapefit.colmap.structure import ImageMatches, TrackSource
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 
-# Pairs of images, and matches, that are looked at together.
-_PAIRS_A_SLICE, _MATCHES_A_SLICE = 5_000, 1_000_000
 _ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -168,70 +163,6 @@ def read_frames(
     )
 
 
-def collect_tracks(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource
-) -> ObservedTracks | MatchedKeypoints:
-    """Return the tracks of a model's points, or the matches, that posed images observe.
-
-    Args:
-        frames: of `reconstruction`, which has the keypoints of its images.
-        reconstruction: the same.
-        tracks: as in `colmap.triangulation.triangulate`.
-    """
-    if isinstance(tracks, ImageMatches):
-        return matched_keypoints(frames, reconstruction, tracks)
-    seen = [observed_points(tracks.image(i)) for i in frames.image_ids]
-    images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
-    keypoints = np.concatenate([keypoints for keypoints, _ in seen])
-    points = np.concatenate([ids for _, ids in seen]).astype(np.int64)
-    cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
-    order = np.argsort(points, kind="stable")
-    names, lengths = np.unique(points, return_counts=True)
-    return ObservedTracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        cameras=cameras[order],
-        keypoints=keypoints[order],
-        pixels=pixels[order],
-        on_plane=on_plane[order],
-        ids=names,
-        may_split=False,
-    )
-
-
-def with_rays_of(
-    frames: PosedFrames, tracks: ObservedTracks | MatchedKeypoints
-) -> ObservedTracks | MatchedKeypoints:
-    """Return the same observations with the rays that the lenses of the frames give them now."""
-    lens = frames.lens_of_camera[tracks.cameras]
-    on_plane = tracks.on_plane.copy()
-    for k, own in enumerate(frames.lenses):
-        rows = np.flatnonzero(lens == k)
-        if not own.fixed and len(rows):
-            camera = pycolmap.Camera(model=own.model, width=1, height=1, params=list(own.parameters))
-            on_plane[rows] = np.asarray(camera.cam_from_img(tracks.pixels[rows])).reshape(-1, 2)
-    return replace(tracks, on_plane=on_plane)
-
-
-def read_bundle(
-    reconstruction: pycolmap.Reconstruction, frames: PosedFrames
-) -> tuple[IntArray, AdjustmentProblem]:
-    """Return the points that posed images observe, by id, and the problem of all that they observe.
-
-    An observation that its lens gives no ray is left out.
-
-    Args:
-        reconstruction: with points.
-        frames: of it.
-    """
-    tracks = collect_tracks(frames, reconstruction, reconstruction)
-    assert isinstance(tracks, ObservedTracks)
-    points = np.array([reconstruction.point3D(i).xyz for i in tracks.ids.tolist()]).reshape(-1, 3)
-    has_ray = np.isfinite(tracks.on_plane).all(axis=1)
-    seen = np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
-    problem = frames.problem_of(points, tracks.cameras[has_ray], seen[has_ray], tracks.pixels[has_ray])
-    return tracks.ids, problem
-
-
 def with_points(
     reconstruction: pycolmap.Reconstruction, point_ids: IntArray, points: FloatArray
 ) -> pycolmap.Reconstruction:
@@ -357,10 +288,10 @@ def lens_of(camera: pycolmap.Camera) -> Lens:
     """Return the lens of a camera, or that of the views of one that is undistorted."""
     if is_adjusted(camera):
         return Lens(camera.model_name, tuple(camera.params.tolist()))
-    return Lens("SIMPLE_PINHOLE", (_focal_length_px(camera), 0.0, 0.0), fixed=True)
+    return Lens("SIMPLE_PINHOLE", (focal_length_px(camera), 0.0, 0.0), fixed=True)
 
 
-def _focal_length_px(camera: pycolmap.Camera) -> float:
+def focal_length_px(camera: pycolmap.Camera) -> float:
     """Return pixels per radian at the axis; those of an equirectangular camera are the same everywhere."""
     if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR:
         return float(camera.params[0] / (2.0 * np.pi))
@@ -371,7 +302,7 @@ def _views(camera: pycolmap.Camera) -> FloatArray:
     """Return the views of a camera, (v, 3, 3) view_from_camera: itself if it is adjusted as it is."""
     if is_adjusted(camera):
         return np.eye(3)[None]
-    return _CUBE
+    return CUBE
 
 
 def _is_reference(reconstruction: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:
@@ -393,68 +324,6 @@ def _sensor_from_rig(
     return _matrix(pose.rotation), pose.translation
 
 
-def matched_keypoints(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, matches: ImageMatches
-) -> MatchedKeypoints:
-    """Return the matches between posed images as pairs of keypoints."""
-    counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
-    begins = np.concatenate([[0], np.cumsum(counts)])
-    known = np.isin(matches.image_pairs, frames.image_ids).all(axis=1)
-    lengths, own = np.diff(matches.offsets), matches.keypoints
-    if not known.all():
-        own = own[np.repeat(known, lengths)]
-    firsts = begins[np.searchsorted(frames.image_ids, matches.image_pairs[known])]
-    all_offsets = np.append(0, np.cumsum(lengths[known]))
-    number = np.uint32 if begins[-1] < 2**32 else np.int64
-    ends = np.empty(own.shape, dtype=number)
-    is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
-    for first in range(0, len(firsts), _PAIRS_A_SLICE):  # whole arrays of int64 would take most of the memory
-        offsets = all_offsets[first : first + _PAIRS_A_SLICE + 1]
-        rows = slice(offsets[0], offsets[-1])
-        shifts = np.repeat(firsts[first : first + _PAIRS_A_SLICE], np.diff(offsets), axis=0)
-        ends[rows] = own[rows] + shifts
-        is_matched[ends[rows]] = True
-    matched = np.flatnonzero(is_matched)
-    place: IntArray = np.cumsum(is_matched, dtype=number)
-    place -= 1
-    for first in range(0, len(ends), _MATCHES_A_SLICE):
-        rows = slice(first, first + _MATCHES_A_SLICE)
-        ends[rows] = place[ends[rows]]
-    images = np.searchsorted(begins, matched, side="right") - 1
-    keypoints = matched - begins[images]
-    cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
-    return MatchedKeypoints(
-        cameras=cameras,
-        keypoints=keypoints,
-        pixels=pixels,
-        on_plane=on_plane,
-        matches=ends,
-    )
-
-
-def _look_up(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, images: IntArray, keypoints: IntArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return camera, pixels (m, 2) and rays on the plane z = 1 (m, 2) of keypoints; `images` ascend."""
-    cameras = np.searchsorted(frames.images, images)
-    pixels, on_plane = np.empty((len(images), 2)), np.empty((len(images), 2))
-    ends = np.searchsorted(images, np.arange(len(frames.image_ids) + 1)).tolist()
-    for k, (begin, end) in enumerate(itertools.pairwise(ends)):
-        image = reconstruction.image(frames.image_ids[k])
-        camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
-        xy = points2d_xy(image)[keypoints[own]]
-        if is_adjusted(camera):
-            pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
-            continue
-        rays = camera_rays(camera, xy)
-        view = np.argmax(rays @ _CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
-        local = np.einsum("mab,mb->ma", _CUBE[view], rays)
-        on_plane[own] = local[:, :2] / local[:, 2:]
-        pixels[own] = _focal_length_px(camera) * on_plane[own]
-        cameras[own] += view
-    return cameras, pixels, on_plane
-
-
 def _cube() -> FloatArray:
     """Return rotations (14, 3, 3) whose last rows are the faces and corners of a cube, +z first."""
     axes = np.concatenate([np.eye(3)[::-1], -np.eye(3), np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0])
@@ -464,4 +333,4 @@ def _cube() -> FloatArray:
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-_CUBE = _cube()
+CUBE = _cube()

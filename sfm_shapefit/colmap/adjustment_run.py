@@ -49,18 +49,12 @@ from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.colmap.adjusted import RefinedLenses, Uncertainty
-from sfm_shapefit.colmap.adjustment import (
-    add_points,
-    collect_tracks,
-    read_frames,
-    set_poses,
-    with_rays_of,
-)
+from sfm_shapefit.colmap.adjustment import add_points, read_frames, set_poses
 from sfm_shapefit.colmap.ceres_adjustment import refuse_without_points
 from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
 from sfm_shapefit.colmap.seed import copy_without_points
-from sfm_shapefit.colmap.structure import ImageMatches, TrackSource
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.tracks import TrackSource, collect_tracks, with_rays_of
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.known_positions import KnownPositions
 
@@ -363,7 +357,7 @@ class AdjustmentRun:
         joined, found, adjusted = self.adjust_by_all_points()
         answer = self.posed(seed)
         found = replace(found, points=adjusted.points).of_length(self.checked_length)
-        colors = None if isinstance(tracks, ImageMatches) else tracks
+        colors = None if isinstance(tracks, MatchedKeypoints) else tracks
         add_points(answer, self.frames, joined, found, colors)
         return answer, initial_error_px, adjusted
 

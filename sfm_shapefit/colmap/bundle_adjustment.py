@@ -9,12 +9,13 @@ import pycolmap
 from sfm_shapefit.adjustment import AdjustmentOptions
 from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
 from sfm_shapefit.colmap.adjusted import Adjusted, AdjustedPlacement, RefinedLenses, Uncertainty
-from sfm_shapefit.colmap.adjustment import read_bundle, read_frames, rotations_of_frames
+from sfm_shapefit.colmap.adjustment import read_frames, rotations_of_frames
 from sfm_shapefit.colmap.adjustment_run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres
 from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
-from sfm_shapefit.colmap.structure import TrackSource, filter_points
+from sfm_shapefit.colmap.structure import filter_points
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
+from sfm_shapefit.colmap.tracks import TrackSource, read_bundle
 from sfm_shapefit.colmap.triangulation import triangulate
 
 # Of the last round of Ceres, by which its answer is judged.

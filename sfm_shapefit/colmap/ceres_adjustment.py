@@ -22,11 +22,13 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
+from sfm_shapefit.adjustment.tracks import MatchedKeypoints
+from sfm_shapefit.colmap.adjustment import read_frames
 from sfm_shapefit.colmap.model import sensors_of
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
 from sfm_shapefit.colmap.seed import transform_model
-from sfm_shapefit.colmap.structure import TrackSource
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.tracks import TrackSource, with_rays_of
 from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import Similarity
@@ -62,6 +64,8 @@ def adjust_by_ceres(
         current = triangulate(current, tracks, replace(structure_options, max_reprojection_error_px=limit_px))
         refuse_without_points(current.num_points3D())
         steps, converged = _solve(current, loss_scale_px, fixed_frames, lenses, free_rigs=free_rigs)
+        if lenses is not None and isinstance(tracks, MatchedKeypoints):
+            tracks = with_rays_of(read_frames(current), tracks)
         if free_rigs and not fixed_frames:
             size = _mean_baseline(start) / _mean_baseline(current)
             motion = Similarity(scale=size, rotation=np.eye(3), translation=np.zeros(3))

@@ -33,13 +33,15 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.adjustment.tracks import MatchedKeypoints
 from sfm_shapefit.adjustment.triangulation import PointLimits, triangulate_tracks
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import add_points, matched_keypoints, read_frames
+from sfm_shapefit.colmap.adjustment import add_points, read_frames
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.colmap.seed import copy_without_points
-from sfm_shapefit.colmap.structure import Advance, ImageMatches, TrackSource, filter_in_place
+from sfm_shapefit.colmap.structure import Advance, filter_in_place
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.tracks import TrackSource
 from sfm_shapefit.executors import answers
 
 # Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
@@ -83,7 +85,7 @@ def triangulate(
     """
     options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
     structure = seed if in_place else copy_without_points(seed)
-    if isinstance(tracks, ImageMatches):
+    if isinstance(tracks, MatchedKeypoints):
         _triangulate_matches(structure, tracks, options, advance)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
@@ -93,7 +95,7 @@ def triangulate(
 
 def _triangulate_matches(
     structure: pycolmap.Reconstruction,
-    matches: ImageMatches,
+    matched: MatchedKeypoints,
     options: StructureOptions,
     advance: Advance,
 ) -> None:
@@ -109,8 +111,8 @@ def _triangulate_matches(
         min_length=options.min_track_length,
         most_points=_MOST_POINTS,
     )
-    poses, matched = frames.poses(), matched_keypoints(frames, structure, matches)
-    partners, fewest = matched.count_partners(), options.fewest_views(len(frames.image_ids))
+    poses, partners = frames.poses(), matched.count_partners()
+    fewest = options.fewest_views(len(frames.image_ids))
     is_left = np.ones(len(partners), dtype=np.bool_)
     for share in _JOINING_SHARES:
         joined = matched.among(is_left).join_rows(poses, share * limits.max_error_px)

@@ -15,7 +15,8 @@ from sfm_shapefit.adjustment import (
     estimate_covariances,
     isotropic_information,
 )
-from sfm_shapefit.colmap.adjustment import read_bundle, read_frames, with_points, with_poses
+from sfm_shapefit.colmap.adjustment import read_frames, with_points, with_poses
+from sfm_shapefit.colmap.tracks import read_bundle
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.settings import merge_options
 

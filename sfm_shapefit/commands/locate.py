@@ -158,18 +158,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("directions"):
         directions = measure_directions(opened, options, clock, known.executor)
     with clock("solve"):
-        measured = rigid.apply(build_graph(opened, directions, options))
-        work = count_work(opened, directions)
-        economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
-        source = opened.with_economy(economy)
-        measured = add_evidence(measured, source, directions, options)
-        placement = place_cameras(measured, options, clock)
-        if known.centers is not None:
-            placement = _at_known_centers(placement, known, model, options)
-        given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
-        located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
-        if known.priors is not None and options.refine_with_priors:
-            located = pull_cameras(model, located, known.priors, options)
+        source, options, located = _place(opened, directions, known, options, clock)
     before = source, directions
     source, directions, located, adjustment, intrinsics = _adjust(
         source, directions, located, known, options, clock
@@ -187,13 +176,9 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options, judge)
-    seeded = build_seeded_model(
-        source,
-        located,
-        options,
-        clock,
-        known.executor,
-    )
+    placement = placement.without_error_samples()  # all is placed
+    located = located._replace(placement=placement)
+    seeded = build_seeded_model(source, located, options, clock, known.executor)
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
     seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
@@ -246,6 +231,25 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         ),
         control_points=tuple(control_points),
     )
+
+
+def _place(
+    opened: MatchSource, directions: PairDirections, known: Locating, options: LocateOptions, clock: Clock
+) -> tuple[MatchSource, LocateOptions, Located]:
+    """Place the cameras within the memory that there is; what follows takes that source and those options."""
+    model, rigid = opened.model, known.rigid
+    measured = rigid.apply(build_graph(opened, directions, options))
+    work = count_work(opened, directions)
+    economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
+    source = opened.with_economy(economy)
+    placement = place_cameras(add_evidence(measured, source, directions, options), options, clock)
+    if known.centers is not None:
+        placement = _at_known_centers(placement, known, model, options)
+    given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
+    located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
+    if known.priors is not None and options.refine_with_priors:
+        located = pull_cameras(model, located, known.priors, options)
+    return source, options, located
 
 
 def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:

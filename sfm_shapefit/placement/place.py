@@ -150,6 +150,14 @@ class Placement(Displayed):
         rejected = f"{len(self.rejected_pairs)} of {self.num_pairs} pairs rejected"
         return f"{len(self.nodes)} of {self.graph.num_nodes} nodes placed, {rejected}"
 
+    def without_error_samples(self) -> "Placement":
+        """Return the placement without the samples of its directions' errors, its largest arrays."""
+        evidence = self.measured.evidence
+        if evidence is None:
+            return self
+        measured = replace(self.measured, evidence=replace(evidence, errors=None))
+        return replace(self, measured=measured)
+
     def measured_part(self) -> MeasuredGraph:
         """Return what was measured of the piece that is placed."""
         return self.measured.part(self.edges)[0]

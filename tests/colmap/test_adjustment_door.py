@@ -13,18 +13,11 @@ from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.colmap import adjustment_run
-from sfm_shapefit.colmap.adjustment import (
-    collect_tracks,
-    lens_of,
-    read_bundle,
-    read_frames,
-    with_points,
-    with_poses,
-)
+from sfm_shapefit.colmap.adjustment import lens_of, read_frames, with_points, with_poses
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly, bundle_adjust
-from sfm_shapefit.colmap.structure import collect_matches
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.tracks import collect_matches, collect_tracks, read_bundle
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.geometry import fit_similarity
 from tests.scenes import BUNDLED

@@ -21,8 +21,9 @@ from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import collect_matches, color_points, filter_points
+from sfm_shapefit.colmap.structure import color_points, filter_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.tracks import collect_matches
 from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.errors import InputError, UnsolvableError
@@ -281,30 +282,33 @@ def wrong_in_part(share):
 def test_points_of_matches_are_the_same_bits_whatever_the_blocks(monkeypatch):
     original, _ = ring_model(noise_px=0.3)
     found = []
-    for tracks, pairs, matches in ((10**9, 10**9, 10**9), (7, 2, 11), (120, 1, 500)):
+    for tracks, matches in ((10**9, 10**9), (7, 11), (120, 500)):
         monkeypatch.setattr("sfm_shapefit.colmap.triangulation._TRACKS_A_BLOCK", tracks)
-        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._PAIRS_A_SLICE", pairs)
-        monkeypatch.setattr("sfm_shapefit.colmap.adjustment._MATCHES_A_SLICE", matches)
+        monkeypatch.setattr("sfm_shapefit.colmap.tracks._MATCHES_A_SLICE", matches)
         monkeypatch.setattr("sfm_shapefit.adjustment.tracks._MATCHES_A_SLICE", matches)
         found.append(dump(triangulate(*seeded(original, batches=wrong_in_part(0.3)))))
     assert found[0] == found[1] == found[2]
 
 
-def by_colmap(seed, matches):
-    """The points that COLMAP's own incremental triangulator makes of matches."""
-    structure, graph = pycolmap.Reconstruction(seed), pycolmap.CorrespondenceGraph()
-    for image_id in sorted(structure.reg_image_ids()):
+def by_colmap(original, batches):
+    """The points that COLMAP's own incremental triangulator makes of matches, at the model's own poses."""
+    structure, graph = seeded(original, batches=[])[0], pycolmap.CorrespondenceGraph()
+    image_ids = sorted(structure.reg_image_ids())
+    for image_id in image_ids:
         graph.add_image(image_id, structure.image(image_id).num_points2D())
-    for pair, (first, second) in enumerate(matches.image_pairs.tolist()):
-        geometry = pycolmap.TwoViewGeometry()
-        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
-        geometry.inlier_matches = matches.keypoints[matches.offsets[pair] : matches.offsets[pair + 1]]
-        graph.add_two_view_geometry(first, second, geometry)
+    for batch in batches:
+        for k, (first, second) in enumerate(batch.pairs.tolist()):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
+            geometry.inlier_matches = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]].astype(
+                np.uint32
+            )
+            graph.add_two_view_geometry(image_ids[first], image_ids[second], geometry)
     graph.finalize()
     settings = pycolmap.IncrementalTriangulatorOptions()
     manager = pycolmap.ObservationManager(structure, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, structure, manager)
-    for image_id in sorted(structure.reg_image_ids()):
+    for image_id in image_ids:
         triangulator.triangulate_image(settings, image_id)
     triangulator.complete_all_tracks(settings)
     triangulator.merge_all_tracks(settings)
@@ -316,7 +320,7 @@ def test_points_of_matches_are_those_of_colmaps_triangulator():
     original, points = ring_model(noise_px=0.3)
     seen = []
     ours = triangulate(*seeded(original), None, lambda *done: seen.append(done))
-    theirs = by_colmap(*seeded(original))
+    theirs = by_colmap(original, all_matches())
     assert seen[-1] == (len(points), len(points))
     assert ours.num_points3D() == theirs.num_points3D() == len(points)
     assert ours.compute_num_observations() == theirs.compute_num_observations()
@@ -329,8 +333,9 @@ def test_a_match_of_two_images_is_kept_if_one_has_another_partner_as_by_colmaps_
     further = batch_of(np.array([[1, 2]]), 60)
     further.keypoints[:, 1] = 119 - further.keypoints[:, 1]  # of other points
 
-    def seeing(triangulator):
-        structure = triangulator(*seeded(original, batches=[batch_of(np.array([[0, 1]]), 120), further]))
+    batches = [batch_of(np.array([[0, 1]]), 120), further]
+
+    def seeing(structure):
         first = min(structure.images)
         return {
             e.point2D_idx
@@ -339,7 +344,8 @@ def test_a_match_of_two_images_is_kept_if_one_has_another_partner_as_by_colmaps_
             if e.image_id == first
         }
 
-    assert seeing(triangulate) == seeing(by_colmap) == set(range(60))
+    assert seeing(triangulate(*seeded(original, batches=batches))) == set(range(60))
+    assert seeing(by_colmap(original, batches)) == set(range(60))
 
 
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():

@@ -20,12 +20,14 @@ from sfm_shapefit.colmap.point_support import (
     images_without_support,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
-from sfm_shapefit.colmap.structure import TrackSource, collect_matches, color_points
+from sfm_shapefit.colmap.structure import color_points
+from sfm_shapefit.colmap.tracks import TrackSource, collect_matches
 from sfm_shapefit.colmap.triangulation import triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.geometry import Similarity
+from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
@@ -103,9 +105,11 @@ def build_seeded_model(
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
     with clock("structure"):
+        if source.database is not None:
+            source.database.forget_rays()  # from here to the end of triangulation most memory is needed
         seed, tracks = seed_and_tracks(source, located, clock.advance)
         if source.database is not None:
-            source.database.forget_rays()  # triangulation is where most memory is needed
+            source.database.forget_rays()  # of matches that are too many to be kept, and were read again
     if not options.bundle_adjust:
         with clock("triangulation"):
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
@@ -120,7 +124,8 @@ def build_seeded_model(
                 given=located.given,
             )
             seeded = adjusted.reconstruction
-    del tracks  # the graph of all matches is large
+    del tracks
+    hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
     if source.database is not None:  # points of the model's own tracks have their colors already
@@ -203,7 +208,7 @@ def place_further_pieces(
         seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
         pieces.append(
             FurtherPiece(
-                placement=further,
+                placement=further.without_error_samples(),
                 kept=kept & ~np.isin(source.model.image_ids[further.cameras], list(seeded.poor)),
                 gauge=seeded.gauge,
                 reconstruction=seeded.reconstruction,
