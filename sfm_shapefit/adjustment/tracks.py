@@ -128,19 +128,27 @@ class MatchedKeypoints:
     matches: npt.NDArray[np.integer]
     """(m, 2) rows of the above, of any type of integer."""
 
-    def count_partners(self) -> IntArray:
+    def count_partners(self) -> Int32Array:
         """Return how many matches each keypoint has, (K,)."""
-        counts = np.zeros(len(self.cameras), dtype=np.int64)
+        counts = np.zeros(len(self.cameras), dtype=np.int32)
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
             ends = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
-            counts += np.bincount(ends.ravel(), minlength=len(counts))
+            counts += np.bincount(ends.ravel(), minlength=len(counts)).astype(np.int32)
         return counts
 
     def among(self, chosen: BoolArray) -> "MatchedKeypoints":
-        """Return the same keypoints with the matches between chosen ones (K,) only."""
+        """Return the chosen ones of the keypoints (K,), and the matches between them."""
         if chosen.all():
             return self
-        return replace(self, matches=self.matches[chosen[self.matches].all(axis=1)])
+        row_of = np.cumsum(chosen, dtype=self.matches.dtype)
+        row_of -= 1
+        return MatchedKeypoints(
+            cameras=self.cameras[chosen],
+            keypoints=self.keypoints[chosen],
+            pixels=self.pixels[chosen],
+            on_plane=self.on_plane[chosen],
+            matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
+        )
 
     def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
         """Return the connected components under the matches that agree with the poses.

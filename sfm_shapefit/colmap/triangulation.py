@@ -115,12 +115,13 @@ def _triangulate_matches(
     fewest = options.fewest_views(len(frames.image_ids))
     is_left = np.ones(len(partners), dtype=np.bool_)
     for share in _JOINING_SHARES:
-        joined = matched.among(is_left).join_rows(poses, share * limits.max_error_px)
+        matched, partners = matched.among(is_left), partners[is_left]
+        joined = matched.join_rows(poses, share * limits.max_error_px)
         if share < max(_JOINING_SHARES):  # two keypoints may find a third one in the next joining
             sizes = np.diff(joined.offsets)
         else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
-        chosen = np.flatnonzero(sizes >= fewest)
+        chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
         for first in range(0, len(chosen), _TRACKS_A_BLOCK):
             block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
             tracks = matched.observed(block)
