@@ -6,11 +6,10 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentProblem
-from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
+from sfm_shapefit.adjustment.tracks import Int32Array, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import (
     CUBE,
@@ -33,7 +32,7 @@ _MATCHES_A_SLICE = 1_000_000
 
 
 def collect_matches(
-    seed: pycolmap.Reconstruction, image_ids: IntArray, batches: Iterable[KeypointMatches]
+    seed: pycolmap.Reconstruction, image_ids: IntArray, batches: Iterable[KeypointMatches], num_matches: int
 ) -> MatchedKeypoints:
     """Return all matches between registered images; batches are consumed one at a time.
 
@@ -41,6 +40,7 @@ def collect_matches(
         seed: the placed images, with the points2D that the matches refer to.
         image_ids: (n,) ids of the images that the batches' pairs index (`PosedModel.image_ids`).
         batches: matches; pairs with an image that is not registered in `seed` are skipped.
+        num_matches: that the batches have at most.
 
     Raises:
         InputError: if a match refers to a keypoint that its image does not have.
@@ -50,7 +50,9 @@ def collect_matches(
     begins = np.append(0, np.cumsum(counts))
     registered: BoolArray = np.asarray(np.isin(image_ids, frames.image_ids))
     place = np.where(registered, np.searchsorted(frames.image_ids, image_ids), 0)
-    parts, number = [], np.uint32 if begins[-1] < 2**32 else np.int64
+    number = np.uint32 if begins[-1] < 2**32 else np.int64
+    # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
+    room, end = np.empty((num_matches, 2), dtype=number), 0
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     for batch in batches:
         kept = registered[batch.pairs].all(axis=1)
@@ -65,36 +67,29 @@ def collect_matches(
             raise InputError(
                 f"the pair {names} has matches of keypoints that do not exist; match the images again"
             )
-        numbers = (own + np.repeat(begins[ends], lengths, axis=0)).astype(number)
+        numbers = room[end : end + len(own)]
+        numbers[:] = own + np.repeat(begins[ends], lengths, axis=0)
         is_matched[numbers] = True
-        parts.append(numbers)
-    matches = _concatenate(parts, number)
-    matched = np.flatnonzero(is_matched)
+        end += len(own)
     row_of = np.cumsum(is_matched, dtype=number)
-    for first in range(0, len(matches), _MATCHES_A_SLICE):  # of keypoints that are matched, from 0
-        numbers = matches[first : first + _MATCHES_A_SLICE]
+    for first in range(0, end, _MATCHES_A_SLICE):
+        numbers = room[first : min(first + _MATCHES_A_SLICE, end)]
         numbers[:] = row_of[numbers] - 1
-    images = np.searchsorted(begins, matched, side="right") - 1
-    keypoints = matched - begins[images]
+    images, keypoints = _images_of(np.flatnonzero(is_matched), begins)
     cameras, pixels, on_plane = _look_up(frames, seed, images, keypoints)
     return MatchedKeypoints(
         cameras=cameras.astype(np.int32),
-        keypoints=keypoints.astype(np.int32),
+        keypoints=keypoints,
         pixels=pixels,
         on_plane=on_plane,
-        matches=matches,
+        matches=room[:end],
     )
 
 
-def _concatenate(parts: list[npt.NDArray[np.integer]], number: type[np.integer]) -> npt.NDArray[np.integer]:
-    """Return all rows (M, 2). Each part is given up once it is copied, for matches take much memory twice."""
-    rows = np.empty((sum(map(len, parts)), 2), dtype=number)
-    end = len(rows)
-    while parts:
-        part = parts.pop()
-        rows[end - len(part) : end] = part
-        end -= len(part)
-    return rows
+def _images_of(numbers: IntArray, begins: IntArray) -> tuple[Int32Array, Int32Array]:
+    """Return the image of each keypoint, and which of its keypoints it is; image i begins at begins[i]."""
+    images = np.searchsorted(begins, numbers, side="right") - 1
+    return images.astype(np.int32), (numbers - begins[images]).astype(np.int32)
 
 
 def collect_tracks(
@@ -160,7 +155,10 @@ def read_bundle(
 
 
 def _look_up(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, images: IntArray, keypoints: IntArray
+    frames: PosedFrames,
+    reconstruction: pycolmap.Reconstruction,
+    images: IntArray | Int32Array,
+    keypoints: IntArray | Int32Array,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return camera, pixels (m, 2) and rays on the plane z = 1 (m, 2) of keypoints; `images` ascend."""
     cameras = np.searchsorted(frames.images, images)

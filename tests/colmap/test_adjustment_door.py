@@ -220,7 +220,7 @@ def matches_of(model, images_of=None):
             parts.append(np.array([[seen[a][p], seen[b][p]] for p in common]))
     offsets = np.append(0, np.cumsum([len(part) for part in parts]))
     batch = KeypointMatches(pairs=np.array(pairs), offsets=offsets, keypoints=np.concatenate(parts))
-    return collect_matches(model, np.array(images), [batch])
+    return collect_matches(model, np.array(images), [batch], len(batch.keypoints))
 
 
 def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():

@@ -96,7 +96,8 @@ def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=No
     placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
     centers = model.centers if centers is None else centers
     seed = build_seed(model, placed, centers, None if keypoints is None else keypoints.get)
-    return seed, collect_matches(seed, model.image_ids, all_matches() if batches is None else batches)
+    batches = all_matches() if batches is None else batches
+    return seed, collect_matches(seed, model.image_ids, batches, sum(len(b.keypoints) for b in batches))
 
 
 SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])

@@ -233,4 +233,5 @@ def seed_and_tracks(
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
-    return seed, collect_matches(seed, model.image_ids, source.counted(matches, advance))
+    counted = source.counted(matches, advance)
+    return seed, collect_matches(seed, model.image_ids, counted, source.database.num_matches)
