@@ -56,7 +56,7 @@ _BISECTIONS = 50
 # Cameras; two have no shape, so nothing in it is uncertain.
 _SMALLEST_RIGID = 3
 # Directions whose error samples are worked on at a time.
-_PART = 10_000
+_PART = 2_000
 # Noise for which it is asked at least which nodes are loose: with none, none would be.
 _LOOSENING_RAD = 1e-4
 # Median distances within which nodes are asked how uncertain they are, the next where that is singular; what

@@ -105,10 +105,11 @@ def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_n
 
 
 def test_points_that_are_given_up_are_in_the_graph_no_more():
-    problem = random_graph_problem(60, 0.5, sigma=0.01, seed=1)
-    measured = MeasuredGraph(ViewGraph(60, problem.edges, problem.directions), num_points=20)
+    # 5,000 of the edges are of points: more than a megabyte, in which limits are given
+    problem = random_graph_problem(200, 0.5, sigma=0.01, seed=1)
+    measured = MeasuredGraph(ViewGraph(200, problem.edges, problem.directions), num_points=60)
     work = Workload(
-        num_images=40, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=40
+        num_images=140, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=140
     )
     limit = forecast(describe_work(work, measured.without_points(), LocateOptions()), ECONOMIES[3]).peak_mb
     options = LocateOptions(max_memory_mb=int(np.ceil(limit)))

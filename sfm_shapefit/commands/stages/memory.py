@@ -242,14 +242,14 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
     is_kept = work.num_matches <= KEPT_MATCHES and economy.batch >= min(BATCH, work.num_matches)
     kept = 80.0 * work.num_matches if is_kept else 0.0
-    peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor
-    seeds = 66.0 * work.num_keypoints
-    matches = 46.0 * work.num_matches
+    peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor + batch
+    tracks = 75.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
+    seeded = throughout + kept + 300.0 * work.num_edges + tracks
     if work.adjusts_bundle or (work.adjusts and economy.adjustment):
         observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
         adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
-        peaks["adjusting"] = throughout + kept + 300.0 * work.num_edges + seeds + matches + adjusting
-    peaks["triangulating"] = throughout + kept + 300.0 * work.num_edges + seeds + matches + 0.5 * batch
+        peaks["adjusting"] = seeded + adjusting
+    peaks["triangulating"] = seeded - rays
     return peaks
 
 
