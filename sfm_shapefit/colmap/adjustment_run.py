@@ -190,11 +190,12 @@ class AdjustmentRun:
         """Move coarse frames to the optimum of a thin problem, and return it."""
         return self.solve(problem, _THIN_SCALE, _THIN_FALL)
 
-    def adjust_twice_thinly(self) -> AdjustmentProblem:
+    def adjust_twice_thinly(self, *, is_last: bool = False) -> AdjustmentProblem:
         """Move coarse frames: at the wide limit, then finely at the threshold; return the last problem.
 
         Finely: by more points, with the loss that their errors call for. All tracks are given back before
-        either is solved.
+        either is solved; and all matches before the second, if it `is_last`: if nothing follows but what
+        lenses and rigs call for.
         """
         adjusted = self.adjust_coarsely_by_few(
             self.thin_problem(*self.triangulate(_THIN_LIMIT, checked=True))
@@ -204,7 +205,7 @@ class AdjustmentRun:
             return adjusted
         problem = self.thin_problem(joined, found, times=_FINE_TIMES)
         del joined, found, adjusted
-        if not self.frees_more_than_poses():
+        if is_last and not self.frees_more_than_poses():
             del self.source  # all matches, at the peak of the memory; nothing is triangulated any more
         return self.solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 
 import pycolmap
 
@@ -125,7 +126,7 @@ def adjust_thinly(
     given = given or GivenPoses()
     freed = GivenPoses(lenses=given.lenses, free_rigs=given.free_rigs)
     run = AdjustmentRun(seed, tracks, structure_options or StructureOptions(), fixed_frames, freed)
-    adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
+    adjusted = run.repeat_with_known_lenses(partial(run.adjust_twice_thinly, is_last=True))
     if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
         _, _, adjusted = run.adjust_by_all_points()
     return AdjustedPlacement(

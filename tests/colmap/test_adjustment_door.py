@@ -15,7 +15,7 @@ from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.colmap import adjustment_run
 from sfm_shapefit.colmap.adjustment import lens_of, read_frames, with_points, with_poses
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
-from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import adjust_placement, adjust_thinly, bundle_adjust
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.colmap.tracks import collect_matches, collect_tracks, read_bundle
 from sfm_shapefit.directions.matches import KeypointMatches
@@ -297,6 +297,19 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == given
+
+
+def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monkeypatch):
+    truth = scene("PINHOLE")
+    start = disturbed(truth)
+    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
+    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    found = adjust_placement(
+        start, matches_of(truth), StructureOptions(), None, given=GivenPoses(lenses=free)
+    )
+    assert found.lenses.undetermined == (1,)
+    given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))
+    assert kept == given
 
 
 def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():
