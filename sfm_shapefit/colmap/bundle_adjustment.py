@@ -1,7 +1,7 @@
 """Bundle adjustment from a seed: our own (`adjustment_run`), or pycolmap's Ceres (`ceres_adjustment`)."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -95,7 +95,7 @@ def _ask_sensors(
 
 def adjust_thinly(
     seed: pycolmap.Reconstruction,
-    tracks: TrackSource,
+    read_tracks: Callable[[], TrackSource],
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
@@ -109,7 +109,8 @@ def adjust_thinly(
 
     Args:
         seed: the placed images, which is not changed; any points are ignored.
-        tracks: as in `triangulate`.
+        read_tracks: returns what `triangulate` takes. Nobody else holds them, so that matches are given back
+            before the last solve, which takes most memory.
         structure_options: filters; the defaults if None. Observations may miss by four times their limit.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
         given: lenses and rigs that change with the poses; nothing else of it counts. A lens whose focal
@@ -125,7 +126,7 @@ def adjust_thinly(
     """
     given = given or GivenPoses()
     freed = GivenPoses(lenses=given.lenses, free_rigs=given.free_rigs)
-    run = AdjustmentRun(seed, tracks, structure_options or StructureOptions(), fixed_frames, freed)
+    run = AdjustmentRun(seed, read_tracks(), structure_options or StructureOptions(), fixed_frames, freed)
     adjusted = run.repeat_with_known_lenses(partial(run.adjust_twice_thinly, is_last=True))
     if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
         _, _, adjusted = run.adjust_by_all_points()

@@ -45,11 +45,6 @@ class Rigs:
         return np.asarray(frame_centers[self.frame_of_image] + turned)
 
 
-def single_cameras(num_images: int) -> Rigs:
-    """Return one rig of one camera, and a frame for each image."""
-    return rigs_of(num_images, np.zeros(1), np.zeros((1, 3)))
-
-
 def mounted(kind: RigKind, num_images: int) -> Rigs:
     """Return one rig of a kind and its frames: whole ones only, so that there may be fewer images."""
     yaw_deg, offsets_m = _SENSORS[kind]

@@ -250,7 +250,7 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
         if frame_id not in fixed:
             start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
     tracks = truth if source == "tracks" else matches_of(truth)
-    found = adjust_thinly(start, tracks, fixed_frames=fixed).reconstruction
+    found = adjust_thinly(start, lambda: tracks, fixed_frames=fixed).reconstruction
     assert found.num_points3D() == 0
     true, before, after = centers_of(truth), centers_of(start), centers_of(found)
     errors = [np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean() for x in (before, after)]
@@ -268,7 +268,7 @@ def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch
 
     monkeypatch.setattr(adjustment_run, "adjust", noting)
     truth = scene()
-    adjust_thinly(disturbed(truth), matches_of(truth))
+    adjust_thinly(disturbed(truth), lambda: matches_of(truth))
     assert dampings == [1e-4, 1e-8]
 
 
@@ -279,22 +279,22 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    found = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
+    found = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert found.lenses.undetermined == ()
     assert 0.0 < found.lenses.sigmas[1] < 0.01
     monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
-    held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
+    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert 1 not in held.lenses.sigmas
     given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
     assert kept[:3] == given[:3]
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
-    again = adjust_thinly(start, tracks, given=GivenPoses(lenses=held.lenses.free))
+    again = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=held.lenses.free))
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
     monkeypatch.setattr(free_lenses, "_MOST_DISTORTION", 0.0)
-    held = adjust_thinly(start, tracks, given=GivenPoses(lenses=free))
+    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == given
 

@@ -19,7 +19,7 @@ from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
-from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
+from sfm_shapefit.commands.stages.seed import Located, read_tracks, seed_of
 from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
@@ -91,7 +91,8 @@ def adjust_placed(
     model, placement = source.model, located.placement
     fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    seed, tracks = seed_and_tracks(source, everyone, clock.advance)
+    seed = seed_of(source, everyone)
+    tracks = read_tracks(source, everyone, seed, clock.advance)
     adjusted = adjust_placement(seed, tracks, options, weight, fixed_frames=fixed, given=located.given)
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])

@@ -229,7 +229,7 @@ def draw_images(folder: Path) -> None:
 def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
     model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
-    adjust_thinly(model, model)
+    adjust_thinly(model, lambda: model)
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     estimate_covariances(adjusted.problem)
     estimate_center_errors(adjusted.problem, AdjustmentOptions())

@@ -5,6 +5,7 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.measure import build_graph, measure_directions
 from sfm_shapefit.commands.stages.rigs import place_cameras
-from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
+from sfm_shapefit.commands.stages.seed import Located, read_tracks, seed_of
 from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.placement.gauge import unit_gauge
 
@@ -66,10 +67,9 @@ def adjust_first_placement(
     if placement.unit is not None:  # the offsets of sensors have theirs
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
-    seed, tracks = seed_and_tracks(source, located, clock.advance)
-    if source.database is not None:
-        source.database.forget_rays()  # the adjustment is where most memory is needed
+    seed = seed_of(source, located)
     del directions, measured  # arrays of all pairs
+    tracks = partial(read_tracks, source, located, seed, clock.advance)
     given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
     adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())

@@ -105,11 +105,8 @@ def build_seeded_model(
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
     with clock("structure"):
-        if source.database is not None:
-            source.database.forget_rays()  # from here to the end of triangulation most memory is needed
-        seed, tracks = seed_and_tracks(source, located, clock.advance)
-        if source.database is not None:
-            source.database.forget_rays()  # of matches that are too many to be kept, and were read again
+        seed = seed_of(source, located)
+        tracks = read_tracks(source, located, seed, clock.advance)
     if not options.bundle_adjust:
         with clock("triangulation"):
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
@@ -218,20 +215,35 @@ def place_further_pieces(
     return tuple(pieces)
 
 
-def seed_and_tracks(
-    source: MatchSource, located: Located, advance: Callable[[int, int], None]
-) -> "tuple[pycolmap.Reconstruction, TrackSource]":
-    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
-    model, placement, fixed = source.model, located.placement, located.fixed
+def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":
+    """Return the model with its cameras moved, without points."""
+    model, placement = source.model, located.placement
     is_placed = np.zeros(model.num_images, dtype=np.bool_)
     is_placed[located.cameras] = True
     centers = np.full((model.num_images, 3), np.nan)
     centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
+    keypoints = None if source.database is None else source.database.keypoints
+    return build_seed(model, is_placed, centers, keypoints, located.fixed)
+
+
+def read_tracks(
+    source: MatchSource,
+    located: Located,
+    seed: "pycolmap.Reconstruction",
+    advance: Callable[[int, int], None],
+) -> TrackSource:
+    """Return the tracks to triangulate at the poses of a seed; all rays are forgotten.
+
+    From here to the end of a triangulation, or an adjustment, most memory is needed.
+    """
+    model, placement = source.model, located.placement
     if source.database is None:
-        return build_seed(model, is_placed, centers, fixed=fixed), model.reconstruction
-    seed = build_seed(model, is_placed, centers, source.database.keypoints, fixed)
+        return model.reconstruction
+    source.database.forget_rays()
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
     counted = source.counted(matches, advance)
-    return seed, collect_matches(seed, model.image_ids, counted, source.database.num_matches)
+    tracks = collect_matches(seed, model.image_ids, counted, source.database.num_matches)
+    source.database.forget_rays()  # of matches that are too many to be kept, and were read again
+    return tracks
