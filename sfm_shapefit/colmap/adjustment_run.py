@@ -131,13 +131,16 @@ class AdjustmentRun:
         return bool(self.lenses.doubts or self.frames.free_sensors)
 
     def judge_sensors(self, adjusted: AdjustmentProblem) -> Mapping[int, SensorSigma]:
-        """Return how well free sensors are known at the optimum last solved for; see the function."""
+        """Return how well free sensors are known at the optimum last solved for, see `free_sensors`."""
         if not self.frames.free_sensors:
             return NO_SENSORS
-        options = AdjustmentOptions(
+        return judge_sensors(self.frames, adjusted, self.options_at_optimum())
+
+    def options_at_optimum(self) -> AdjustmentOptions:
+        """Return the options by which the optimum last solved for is one."""
+        return AdjustmentOptions(
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
-        return judge_sensors(self.frames, adjusted, options)
 
     def triangulate(
         self, widening: float, *, checked: bool = False
@@ -229,12 +232,7 @@ class AdjustmentRun:
         """Note how well free focal lengths are known; return the cameras whose points leave them open."""
         if not self.lenses.doubts:
             return []
-        options = AdjustmentOptions(
-            loss_scale_px=self.loss_scale_px,
-            hold_rotations=self.weight.hold,
-            noise_px=self.weight.noise_px,
-            **self.lenses.overrides(),
-        )
+        options = replace(self.options_at_optimum(), **self.lenses.overrides())
         ids = self.frames.colmap_camera_of_lens
         try:
             found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
@@ -309,11 +307,10 @@ class AdjustmentRun:
         """Return how well centers and scale are known at the optimum last solved for."""
         if problem.num_frames > MOST_FRAMES:
             return Uncertainty()
-        options = AdjustmentOptions(
-            loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
-        )
         try:
-            found = estimate_center_errors(self.checked(problem), options, self.weight.open_rad())
+            found = estimate_center_errors(
+                self.checked(problem), self.options_at_optimum(), self.weight.open_rad()
+            )
         except UnsolvableError:
             return Uncertainty()
         of_camera = found.covariances[self.frames.frame_of_camera]
@@ -348,9 +345,8 @@ class AdjustmentRun:
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
         """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
-        (joined, found), (loosely, loose) = (
-            self.triangulate(widening, checked=True) for widening in (1.0, _THIN_LIMIT)
-        )
+        joined, found = self.triangulate(1.0, checked=True)
+        loosely, loose = self.triangulate(_THIN_LIMIT, checked=True)
         refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):

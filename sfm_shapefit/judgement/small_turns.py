@@ -36,8 +36,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 
 _ROBUST_SIGMAS = 3.5
 _PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)
-_MOST_ROUNDS = 30
-_COOLING = 0.8
+# Of the standard deviations, from one round to the next; a bound of the rounds: seven scenes took 8 to 16.
+_COOLING, _MOST_ROUNDS = 0.8, 30
 # Weights change no more once no correction moves by so much.
 _SETTLED_RAD = np.radians(0.002)
 
