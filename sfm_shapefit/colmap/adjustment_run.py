@@ -120,10 +120,13 @@ class AdjustmentRun:
         self.lenses, self.refined = given.lenses, RefinedLenses({}, (), given.lenses)
         self.start = self.frames = read_frames(seed, fixed_frames, given.centers, free_rigs=given.free_rigs)
         self.weight, self.given = _FREE, self.start.rotations
-        self.source, self.options = collect_tracks(self.frames, seed, tracks), options
+        self.source: ObservedTracks | MatchedKeypoints
+        if isinstance(tracks, MatchedKeypoints):
+            self.source, fewest = tracks, options.fewest_views(len(self.frames.image_ids))
+        else:
+            self.source, fewest = collect_tracks(self.frames, seed, tracks), 2
+        self.options = options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
-        is_matched = isinstance(self.source, MatchedKeypoints)
-        fewest = options.fewest_views(len(self.frames.image_ids)) if is_matched else 2
         self.checked_length = max(options.min_track_length, fewest)
 
     def frees_more_than_poses(self) -> bool:

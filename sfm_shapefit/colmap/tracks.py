@@ -93,18 +93,16 @@ def _images_of(numbers: IntArray, begins: IntArray) -> tuple[Int32Array, Int32Ar
 
 
 def collect_tracks(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource
-) -> ObservedTracks | MatchedKeypoints:
-    """Return the tracks of a model's points, or the matches, that posed images observe.
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction
+) -> ObservedTracks:
+    """Return the tracks of a model's points that posed images observe.
 
     Args:
         frames: of `reconstruction`, which has the keypoints of its images.
         reconstruction: the same.
-        tracks: of the same posed images.
+        source: the model, of the same keypoints.
     """
-    if isinstance(tracks, MatchedKeypoints):
-        return tracks
-    seen = [observed_points(tracks.image(i)) for i in frames.image_ids]
+    seen = [observed_points(source.image(i)) for i in frames.image_ids]
     images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
     keypoints = np.concatenate([keypoints for keypoints, _ in seen])
     points = np.concatenate([ids for _, ids in seen]).astype(np.int64)
@@ -146,7 +144,6 @@ def read_bundle(
         frames: of it.
     """
     tracks = collect_tracks(frames, reconstruction, reconstruction)
-    assert isinstance(tracks, ObservedTracks)
     points = np.array([reconstruction.point3D(i).xyz for i in tracks.ids.tolist()]).reshape(-1, 3)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
     seen = np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
