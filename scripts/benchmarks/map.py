@@ -380,7 +380,8 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
     yield (
         f"Made scenes: {sizes}, a share of {_LARGE['wrong_match_fraction']} of all matches wrong. The limit"
         f" of further scenes is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers, for"
-        " `map --bundle-adjust`. The better setting of a mapper is bold."
+        " `map --bundle-adjust`. The better setting of a mapper is bold. With `--folder`, what a peer"
+        " reached in an earlier run with the same threads and versions is not measured again."
     )
 
 
