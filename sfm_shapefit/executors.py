@@ -1,24 +1,33 @@
 """Work shared out to any `concurrent.futures` executor, in order, and reported where a worker dies."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from sfm_shapefit.errors import ShapeFitError
 
+ExecutorKind = Literal["serial", "processes", "dask"]
+"""No executor, processes of this machine, or a cluster."""
+
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
+
+# So many tasks are on their way at once, which bounds the memory that they take.
+_TASKS_AT_ONCE = 32
 
 
 class WorkerError(ShapeFitError):
     """A worker died, or the scheduler could not be reached."""
 
 
-def answers(executor: Executor, work: Callable[[Task], Answer], tasks: Iterable[Task]) -> Iterator[Answer]:
-    """Yield what an executor's workers make of each task, in the order of the tasks.
+def answers(
+    executor: Executor | None, work: Callable[[Task], Answer], tasks: Iterable[Task]
+) -> Iterator[tuple[Task, Answer]]:
+    """Yield each task with what an executor's workers make of it, in the order of the tasks.
 
     Args:
-        executor: submits tasks; it is not shut down.
+        executor: submits tasks, a few ahead of the answers; it is not shut down. None: all is done here.
         work: a function of a module, so that other processes find it.
         tasks: its arguments, which are pickled on the way to other processes.
 
@@ -26,12 +35,22 @@ def answers(executor: Executor, work: Callable[[Task], Answer], tasks: Iterable[
         WorkerError: if a worker died and the executor does not replace it.
         ShapeFitError: as a worker raised it.
     """
-    futures = [executor.submit(work, task) for task in tasks]
+    if executor is None:
+        for task in tasks:
+            yield task, work(task)
+        return
+    sent: deque[tuple[Task, Future[Answer]]] = deque()
     try:
-        for future in futures:
-            yield _answer(future)
+        for task in tasks:
+            sent.append((task, executor.submit(work, task)))
+            if len(sent) == _TASKS_AT_ONCE:
+                first, future = sent.popleft()
+                yield first, _answer(future)
+        while sent:
+            first, future = sent.popleft()
+            yield first, _answer(future)
     finally:
-        for future in futures:
+        for _, future in sent:
             future.cancel()
 
 

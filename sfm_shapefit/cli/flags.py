@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import typer
 from typer.core import TyperCommand
 
+from sfm_shapefit.executors import ExecutorKind
 from sfm_shapefit.settings import Settings, groups_of, option
 
 Options = TypeVar("Options", bound=Settings)
@@ -41,6 +42,18 @@ PriorsFile = Annotated[
         help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; or the "
         "folder of the images, for the GPS positions of their EXIF data.",
     ),
+]
+ExecutorName = Annotated[
+    ExecutorKind,
+    typer.Option(
+        "--executor",
+        help="Who measures pairs and triangulates tracks: this process, as many others as --threads says, or "
+        "a cluster of dask.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]

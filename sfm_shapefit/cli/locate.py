@@ -1,13 +1,12 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
     Database,
+    ExecutorName,
     GroupedCommand,
     InputPath,
     ModelArgument,
@@ -15,6 +14,7 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
+    Scheduler,
     one_path,
     takes,
 )
@@ -54,17 +54,8 @@ def locate_command(
     output_path: OutputPath = None,
     database: Database = None,
     priors: PriorsFile = None,
-    executor: Annotated[
-        Literal["serial", "processes", "dask"],
-        typer.Option(
-            "--executor",
-            help="Who measures directions: this process, so many others as --threads says, or a cluster.",
-        ),
-    ] = "serial",
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
-    ] = None,
+    executor: ExecutorName = "serial",
+    scheduler: Scheduler = None,
     **given: Any,
 ) -> None:
     """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""

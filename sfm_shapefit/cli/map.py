@@ -7,11 +7,13 @@ import typer
 
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
+    ExecutorName,
     GroupedCommand,
     OutArgument,
     OutputFlags,
     OutputPath,
     PriorsFile,
+    Scheduler,
     one_path,
     takes,
 )
@@ -50,6 +52,8 @@ def map_command(
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
     priors: PriorsFile = None,
+    executor: ExecutorName = "serial",
+    scheduler: Scheduler = None,
     **given: Any,
 ) -> None:
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
@@ -57,9 +61,11 @@ def map_command(
     target = one_path(out, output_path, "OUT")
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
         from sfm_shapefit.commands.map import map_database
+        from sfm_shapefit.commands.stages.execution import open_executor
         from sfm_shapefit.commands.write import write_result
 
-        found = map_database(source, run.options, progress=run.progress, priors=priors)
+        with open_executor(executor, run.options.num_threads(), scheduler) as workers:
+            found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
         write_result(found, target, **run.writing)
         title = f"{counted(found.num_images, 'image')} of {source}"
         run.heed(found.models[0].located.verdict)

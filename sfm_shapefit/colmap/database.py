@@ -10,7 +10,6 @@ import sqlite3
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,8 +162,7 @@ class MatchDatabase:
         if not same_intrinsics(model, self._model):
             other._looked_at = {}
             return other
-        turns = model.rotations.transpose(0, 2, 1) @ self._model.rotations
-        other._kept = {kind: [_turn(batch, turns) for batch in kept] for kind, kept in self._kept.items()}
+        other._kept = {kind: [other._with_rays(batch) for batch in kept] for kind, kept in self._kept.items()}
         return other
 
     @property
@@ -368,7 +366,10 @@ class MatchDatabase:
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
         """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
-        found = self._keypoint_batch(chosen, min_matches)
+        return self._with_rays(self._keypoint_batch(chosen, min_matches))
+
+    def _with_rays(self, found: KeypointMatches | MatchBatch) -> MatchBatch:
+        """Return the same matches with the rays of their keypoints."""
         rays = np.empty((2, len(found.keypoints), 3))
         bounds = found.offsets.tolist()
         for pair, (first, last) in zip(found.pairs.tolist(), itertools.pairwise(bounds), strict=True):
@@ -496,11 +497,3 @@ class _Keypoints(NamedTuple):
     number: int
     blind: BoolArray | None
     """(number,) which have no ray; None if all have one."""
-
-
-def _turn(batch: MatchBatch, turns: FloatArray) -> MatchBatch:
-    """Return matches whose rays turn as their images do, by turns (n, 3, 3) in world axes."""
-    images = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0)
-    rays = ((batch.rays_i, images[:, 0]), (batch.rays_j, images[:, 1]))
-    rays_i, rays_j = (np.einsum("mab,mb->ma", turns[image], old) for old, image in rays)
-    return replace(batch, rays_i=rays_i, rays_j=rays_j)

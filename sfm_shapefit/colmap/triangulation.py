@@ -19,13 +19,14 @@ and 4.3 % more observations, with mean errors of 0.44 instead of 0.53, 0.58 (0.7
 adjustment by Ceres, with and without a robust loss, then ends at mean errors between 6 % more
 (Herz-Jesus-P25) and 21 % less (liberty-calibrated) than from the points of that triangulator.
 
-No sample is random: the same input gives the same bits. The tracks of another reconstruction know nothing of
-one another, so an executor's workers may share them, with the same bits again.
+No sample is random: the same input gives the same bits. Tracks know nothing of one another, so an executor's
+workers may share them, with the same bits again.
 
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3.
 """
 
 import math
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,8 +34,8 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment.tracks import MatchedKeypoints
-from sfm_shapefit.adjustment.triangulation import PointLimits, triangulate_tracks
+from sfm_shapefit.adjustment.tracks import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import add_points, read_frames
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
@@ -72,7 +73,7 @@ def triangulate(
         tracks: matches from `collect_matches`, or the reconstruction whose own tracks serve.
         options: filters; the defaults if None.
         advance: called with the images, or tracks, that are done and their number.
-        executor: shares out the tracks of another model among its workers; no use for matches.
+        executor: shares out the tracks among its workers, with the same answer to the bit.
         in_place: return `seed` itself, which must be without points: a copy of a large model takes gigabytes.
 
     Returns:
@@ -86,7 +87,7 @@ def triangulate(
     options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
     structure = seed if in_place else copy_without_points(seed)
     if isinstance(tracks, MatchedKeypoints):
-        _triangulate_matches(structure, tracks, options, advance)
+        _triangulate_matches(structure, tracks, options, advance, executor)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
     filter_in_place(structure, options)
@@ -98,6 +99,7 @@ def _triangulate_matches(
     matched: MatchedKeypoints,
     options: StructureOptions,
     advance: Advance,
+    executor: Executor | None,
 ) -> None:
     """Add to `structure` the points of all matches, a block of tracks at a time.
 
@@ -122,14 +124,38 @@ def _triangulate_matches(
         else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
-        for first in range(0, len(chosen), _TRACKS_A_BLOCK):
-            block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
-            tracks = matched.observed(block)
-            found = triangulate_tracks(tracks, poses, limits)
-            add_points(structure, frames, tracks, found)
-            is_left[block.rows[found.points_seen >= 0]] = False
+        tasks, done = _cut_tracks(matched, joined, chosen, poses, limits), 0
+        for task, found in answers(executor, triangulate_block, tasks):
+            add_points(structure, frames, task.tracks, found)
+            is_left[task.rows[found.points_seen >= 0]] = False
+            done += task.tracks.num_tracks
             if share == _JOINING_SHARES[0]:  # nearly all tracks
-                advance(min(first + _TRACKS_A_BLOCK, len(chosen)), len(chosen))
+                advance(done, len(chosen))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BlockTask:
+    """Some tracks of matches, and all that is needed to triangulate them elsewhere."""
+
+    rows: IntArray
+    """(m,) which of all matched keypoints each observation is."""
+    tracks: ObservedTracks
+    poses: CameraPoses
+    limits: PointLimits
+
+
+def _cut_tracks(
+    matched: MatchedKeypoints, joined: JoinedRows, chosen: IntArray, poses: CameraPoses, limits: PointLimits
+) -> Iterator[BlockTask]:
+    """Yield the chosen ones of the joined tracks, a block at a time."""
+    for first in range(0, len(chosen), _TRACKS_A_BLOCK):
+        block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
+        yield BlockTask(rows=block.rows, tracks=matched.observed(block), poses=poses, limits=limits)
+
+
+def triangulate_block(task: BlockTask) -> TriangulatedPoints:
+    """Return the points of a task's tracks; what a worker runs."""
+    return triangulate_tracks(task.tracks, task.poses, task.limits)
 
 
 def _triangulate_tracks(
@@ -163,11 +189,8 @@ def _triangulate_tracks(
         )
         for chosen in (tracks[k : k + _TRACKS_A_TASK] for k in range(0, len(tracks), _TRACKS_A_TASK))
     )
-    answered = (
-        map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
-    )
     done = 0
-    for part in answered:
+    for _, part in answers(executor, triangulate_task, tasks):
         for track, found in zip(tracks[done : done + len(part)], part, strict=True):
             if found is None:
                 continue

@@ -99,8 +99,8 @@ def locate(
         priors: a table of position priors, see `colmap.priors.table_priors`, or the folder of the images,
             whose EXIF data have them; the database's own pose priors
             serve if the scale is "prior" and there is no table.
-        executor: shares out the pairs of a database among its workers, which must see its file, or a model's
-            own tracks, with the same answer to the bit. None: all is done here.
+        executor: shares out pairs and tracks among its workers, which must see the file of the database, with
+            the same answer to the bit; it is not shut down. None: all is done here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -110,6 +110,7 @@ def locate(
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
         UnsolvableError: if no pair has a usable direction, or the directions determine nothing.
+        WorkerError: if a worker died and the executor does not replace it.
 
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """

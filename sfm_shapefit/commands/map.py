@@ -7,6 +7,7 @@ Images that the averaging drops form components of their own.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -68,6 +69,7 @@ def map_database(
     *,
     progress: Progress | None = None,
     priors: Path | str | None = None,
+    executor: Executor | None = None,
     **overrides: Any,
 ) -> MapResult:
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
@@ -80,6 +82,7 @@ def map_database(
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
             "unit".
+        executor: shares out pairs and tracks among its workers, as of `locate`. None: all is done here.
 
     Returns:
         `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
@@ -88,10 +91,11 @@ def map_database(
     Raises:
         InputError: if the database cannot be used; the message says what to do.
         UnsolvableError: if no component of three images or more can be placed.
+        WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
     path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
-    run = _start(path, options, clock, priors)
+    run = _start(path, options, clock, priors)._replace(executor=executor)
     with open_database(path, run.unposed, run.without) as opened:
         return _map_opened(run._replace(opened=opened))
 
@@ -208,6 +212,8 @@ class _Run(NamedTuple):
     gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
+    executor: Executor | None = None
+    """Shares out pairs and tracks, if there is one."""
     opened: MatchDatabase | None = None
     """The open database, which keeps the matches that were read."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
@@ -216,7 +222,7 @@ class _Run(NamedTuple):
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
-            sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
+            sharing = Sharing(self.options.num_threads(), self.executor, self.clock.advance)
             source = self.options.relative_rotations
             return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, source, sharing)
 
@@ -284,7 +290,9 @@ class _Run(NamedTuple):
             with open_source(model, inputs, options, self.opened) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
-                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
+                    first = adjust_first_placement(
+                        source, rule, self.clock, free, thorough=False, executor=self.executor
+                    )
                 found = first.parameters() | found
         return with_parameters(self.unposed, found)
 
@@ -353,7 +361,9 @@ class _Run(NamedTuple):
             if self.options.adjust:
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
-                    first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
+                    first = adjust_first_placement(
+                        averaged, rule, self.clock, intrinsics.free, executor=self.executor
+                    )
                 centers, uncertainty = first.centers, first.adjusted.uncertainty
                 intrinsics = intrinsics.after(first.adjusted.lenses)
                 sensors = first.adjusted.sensors
@@ -363,6 +373,7 @@ class _Run(NamedTuple):
                 inputs,
                 rigid,
                 priors,
+                self.executor,
                 centers=centers,
                 uncertainty=uncertainty,
                 intrinsics=intrinsics,

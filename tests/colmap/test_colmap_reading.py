@@ -1,5 +1,6 @@
 """COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
 
+import dataclasses
 import itertools
 import os
 import shutil
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.colmap import sqlite_file
 from sfm_shapefit.colmap.check import check_model_files
@@ -896,6 +898,17 @@ def test_what_was_read_once_is_not_read_again_by_any_model_of_the_database(path,
     np.testing.assert_array_equal(part.pairs, whole.pairs[inside])
     rows = np.repeat(inside, np.diff(whole.offsets))
     np.testing.assert_array_equal(part.keypoints, whole.keypoints[rows])
+
+
+def test_turned_matches_have_the_rays_of_a_database_that_is_opened_with_those_rotations(path, model):
+    axis = np.linspace(0.1, 0.3, 3 * model.num_images).reshape(-1, 3)
+    turned = dataclasses.replace(model, rotations=Rotation.from_rotvec(axis).as_matrix() @ model.rotations)
+    with open_database(path, model) as database, open_database(path, turned) as other:
+        (before,) = database.iter_matches(1)
+        (found,), (expected,) = database.turned(turned).iter_matches(1), other.iter_matches(1)
+    assert not np.array_equal(before.rays_i, expected.rays_i)
+    for name in ("rays_i", "rays_j", "keypoints", "offsets", "pairs"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
 def test_matches_that_are_forgotten_are_read_again(path, model):

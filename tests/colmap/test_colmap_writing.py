@@ -253,6 +253,19 @@ def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
     assert seen[-1] == (len(points), len(points))
 
 
+def test_tracks_of_matches_shared_out_to_workers_give_the_same_bits(monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.colmap.triangulation._TRACKS_A_BLOCK", 7)
+    original, points = ring_model(noise_px=3.0)
+    (seed, matches), seen = seeded(original, ring_centers() + 0.01), []
+    with Copying(2) as executor:
+        shared = triangulate(seed, matches, None, lambda *done: seen.append(done), executor)
+    assert shared.num_points3D() > 0.9 * len(points)
+    (num_tracks,) = {total for _, total in seen}
+    assert [done for done, _ in seen] == [*range(7, num_tracks, 7), num_tracks]
+    monkeypatch.undo()
+    assert dump(shared) == dump(triangulate(seed, matches))
+
+
 @SOURCES
 def test_the_same_gives_the_same_bits_again_and_in_place(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried

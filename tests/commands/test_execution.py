@@ -136,7 +136,7 @@ def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
         shared(workspace, model, pool)
 
 
-def _die_once(flag, task):
+def die_once(flag, task):
     """Kill the first worker that comes here, in the middle of the work."""
     try:
         os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
@@ -150,7 +150,7 @@ def _die_once(flag, task):
 def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
-    monkeypatch.setattr("sfm_shapefit.commands.stages.execution.measure_task", partial(_die_once, str(flag)))
+    monkeypatch.setattr("sfm_shapefit.commands.stages.execution.measure_task", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
         found, _ = shared(workspace, model, pool)
     assert flag.exists()

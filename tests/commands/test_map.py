@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,11 +12,15 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from abuse import determinism
 from abuse.verdicts import read_cameras
+from sfm_shapefit.colmap import triangulation
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.merge import merge_models
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands import relative_rotations
 from sfm_shapefit.commands.relative_rotations import measure_rotations
+from sfm_shapefit.commands.stages import execution
 from sfm_shapefit.commands.stages.averaging import average_consistently
+from sfm_shapefit.commands.stages.execution import PairTask, open_executor
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
@@ -27,6 +32,7 @@ from sfm_shapefit.results.scene_words import describe_line, describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.commands.test_execution import die_once
 from tests.program import run, run_python
 from tests.results.test_schema import problems
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
@@ -250,6 +256,58 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor)
     assert len(given.directions.pairs) > 0
     centers = [found.table("cameras")["x"] for found in (given, gone)]
     np.testing.assert_array_equal(*centers)
+
+
+class Counting(ThreadPoolExecutor):
+    """Counts the tasks of each kind."""
+
+    def __init__(self, workers):
+        super().__init__(workers)
+        self.tasks = {}
+
+    def submit(self, work, /, task):
+        kind = task.work.estimate.func.__name__ if isinstance(task, PairTask) else work.__name__
+        self.tasks[kind] = self.tasks.get(kind, 0) + 1
+        return super().submit(work, task)
+
+
+def assert_same_bits(shared, serial, folder):
+    """Model and tables, as they are written."""
+    for found, out in ((shared, folder / "shared"), (serial, folder / "serial")):
+        sfm_shapefit.write_map_result(found, out, report=False)
+        for named in out.rglob("*.json"):  # which have timings
+            named.unlink()
+    written = sorted(path.name for path in (folder / "serial" / "0").iterdir())
+    assert {"cameras.csv", "images.bin", "pairs.csv", "points3D.bin"} <= set(written)
+    for name in written:
+        assert (folder / "shared" / "0" / name).read_bytes() == (folder / "serial" / "0" / name).read_bytes()
+
+
+def test_an_executor_shares_out_pairs_and_tracks_and_changes_no_bit(monkeypatch, tmp_path):
+    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
+    monkeypatch.setattr(triangulation, "_TRACKS_A_BLOCK", 200)
+    with Counting(2) as pool:
+        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
+    monkeypatch.undo()
+    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
+    assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions", "triangulate_block"}
+    assert pool.tasks["estimate_relative_rotations"] > 3 < pool.tasks["triangulate_block"]
+    assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
+    assert_same_bits(shared, serial, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_path):
+    pytest.importorskip("distributed")
+    flag = tmp_path / "killed"
+    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
+    monkeypatch.setattr(execution, "measure_task", partial(die_once, str(flag)))
+    with open_executor("dask", 2) as pool:
+        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
+    monkeypatch.undo()
+    assert flag.exists()
+    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
+    assert_same_bits(shared, serial, tmp_path)
 
 
 def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowhere(tmp_path, monkeypatch):

@@ -18,19 +18,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_pairs import PairRows
 from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.executors import WorkerError, answers
+from sfm_shapefit.executors import ExecutorKind, WorkerError, answers
 from sfm_shapefit.extras import MissingExtraError
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
 Measured = TypeVar("Measured")
-ExecutorKind = Literal["serial", "processes", "dask"]
 
 MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work for directions, and 230 MB."""
@@ -79,9 +78,9 @@ def measure_with_workers(
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
     parts = database.parts(work.matches_per_task)
-    tasks = [PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts]
+    tasks = (PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts)
     found: list[Measured] = []
-    for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
+    for (_, stop), (_, measured) in zip(parts, answers(executor, measure_task, tasks), strict=True):
         found += measured
         advance(stop, database.num_pairs)
     return found

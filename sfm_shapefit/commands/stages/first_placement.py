@@ -5,6 +5,7 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
+from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -44,7 +45,13 @@ class FirstPlacement(NamedTuple):
 
 
 def adjust_first_placement(
-    source: MatchSource, rule: GaugeRule, clock: Clock, lenses: FreeLenses, *, thorough: bool = True
+    source: MatchSource,
+    rule: GaugeRule,
+    clock: Clock,
+    lenses: FreeLenses,
+    *,
+    thorough: bool = True,
+    executor: Executor | None = None,
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
@@ -54,12 +61,14 @@ def adjust_first_placement(
         clock: hears of progress.
         lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
+        executor: shares out the pairs of a database; None: all is done here.
 
     Raises:
+        WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
     model, options = source.model, rule.options
-    directions = measure_directions(source, options, clock)
+    directions = measure_directions(source, options, clock, executor)
     measured = rule.rigid.apply(build_graph(source, directions, options))
     placement = place_cameras(measured, options, clock)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)

@@ -100,7 +100,7 @@ def build_seeded_model(
     """Move the cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
-    executor shares out the model's own tracks.
+    executor shares out the tracks that are triangulated where nothing is adjusted.
     """
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
