@@ -183,10 +183,21 @@ def test_layers_sizes_colors_and_the_theme_can_be_switched_and_the_scene_follows
     assert complaints(driver) == []
 
 
+CUT_TEXTS = """
+    return [...document.querySelectorAll('svg[role=img] text')].filter((text) => {
+      const [own, chart] = [text.getBoundingClientRect(), text.ownerSVGElement.getBoundingClientRect()];
+      return own.width > 0 && (own.left < chart.left - 1 || own.right > chart.right + 1);
+    }).map((text) => text.textContent);
+"""
+
+
 def test_it_fits_a_narrow_window_and_a_row_brings_the_scene_into_view(driver, report):
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": False}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     wait_for(driver, "return document.documentElement.scrollWidth <= 390")
+    # Charts are drawn anew for the width, and every text of them is to be seen.
+    wait_for(driver, "return document.querySelector('#histogram svg').viewBox.baseVal.width < 390")
+    assert driver.execute_script(CUT_TEXTS) == []
     driver.execute_script("document.querySelector('#pairs tbody tr').scrollIntoView()")
     click(driver, "#pairs tbody tr")
     wait_for(

@@ -46,12 +46,21 @@ const drawAxes = (svg, box, x, y, titles) => {
   const middle = (box.top + box.bottom) / 2;
   svg.append(shape("text", { x: 12, y: middle, transform: `rotate(-90 12 ${middle})`, "text-anchor": "middle", class: "title" }, titles[1]));
 };
-const drawKey = (svg, entries) => {
-  let x = 60;
-  for (const [text, paint] of entries) {
-    svg.append(shape("rect", { x, y: 4, width: 14, height: 4, rx: 2, fill: paint }));
-    svg.append(shape("text", { x: x + 19, y: 10 }, text));
-    x += 34 + 6.2 * text.length;
+// Entries [text, paint] of a key in rows that fit the width, and what the rows below the first one take.
+const layOutKey = (entries) => {
+  let [x, y] = [60, 0];
+  const places = entries.map(([text, paint]) => {
+    const width = 34 + 6.2 * text.length;
+    if (x > 60 && x + width - 15 > WIDTH) [x, y] = [60, y + 16];
+    x += width;
+    return { text, paint, x: x - width, y };
+  });
+  return { places, more: y };
+};
+const drawKey = (svg, { places }) => {
+  for (const { text, paint, x, y } of places) {
+    svg.append(shape("rect", { x, y: y + 4, width: 14, height: 4, rx: 2, fill: paint }));
+    svg.append(shape("text", { x: x + 19, y: y + 10 }, text));
   }
 };
 // What lies at a place of the chart, in its own coordinates, is told, and chosen by a press.
@@ -78,7 +87,10 @@ const drawHistogram = () => {
   const { edges, counts } = data.histogram;
   const states = Object.keys(counts);
   if (!states.length) return null;
-  const [svg, box] = [chart(270, "Errors of the pairs"), { left: 56, right: WIDTH - 16, top: 24, bottom: 226 }];
+  const paint = { input: "var(--nodirection)", optimum: "var(--undetermined)", output: "var(--agrees)" };
+  const key = layOutKey(states.map((state) => [STATES[state], paint[state]]));
+  const box = { left: 56, right: WIDTH - 16, top: 24 + key.more, bottom: 226 + key.more };
+  const svg = chart(270 + key.more, "Errors of the pairs");
   let [first, last] = [edges.length, 0];
   for (const values of Object.values(counts)) {
     values.forEach((value, k) => { if (value) [first, last] = [Math.min(first, k), Math.max(last, k + 1)]; });
@@ -87,7 +99,6 @@ const drawHistogram = () => {
   const x = logarithmic(edges[first], edges[last], box.left, box.right, "°");
   const y = linear(0, top, box.bottom, box.top);
   drawAxes(svg, box, x, y, ["error, log scale", "pairs"]);
-  const paint = { input: "var(--nodirection)", optimum: "var(--undetermined)", output: "var(--agrees)" };
   for (const state of states) {
     let path = `M${x.place(edges[first])} ${box.bottom}`;
     for (let k = first; k < last; k++) path += `V${y.place(counts[state][k])}H${x.place(edges[k + 1])}`;
@@ -95,7 +106,7 @@ const drawHistogram = () => {
       d: `${path}V${box.bottom}`, class: state === "output" ? "area" : "line", stroke: paint[state], fill: state === "output" ? paint[state] : "none",
     }));
   }
-  drawKey(svg, states.map((state) => [STATES[state], paint[state]]));
+  drawKey(svg, key);
   listen(svg, (u) => {
     const k = edges.findIndex((edge, i) => i < edges.length - 1 && x.place(edge) <= u && u < x.place(edges[i + 1]));
     if (k < first || k >= last) return null;
@@ -107,7 +118,7 @@ const drawHistogram = () => {
 const drawBars = (name, title, label) => {
   if (!data[name]) return null;
   const { counts, texts, ticks } = data[name];
-  const [svg, box] = [chart(220, title), { left: 56, right: WIDTH - 16, top: 10, bottom: 176 }];
+  const [svg, box] = [chart(220, title), { left: 64, right: WIDTH - 16, top: 10, bottom: 176 }];
   const width = (box.right - box.left) / counts.length;
   const x = { place: (value) => box.left + value * width, ticks };
   const y = linear(0, Math.max(...counts), box.bottom, box.top);
@@ -142,7 +153,8 @@ const drawTrust = (onChoice) => {
   for (const [value, text] of [[data.minTrust, number(data.minTrust, 2)], [1, "1"]]) {
     const where = x.place(value);
     svg.append(shape("line", { x1: where, x2: where, y1: 0, y2: bottom, class: "mark" }));
-    svg.append(shape("text", { x: where, y: bottom + 14, "text-anchor": "middle" }, value < 1 ? `${text}: left out below` : text));
+    const [anchor, words] = value < 1 ? ["end", `${text}: left out below`] : ["middle", text];
+    svg.append(shape("text", { x: where, y: bottom + 14, "text-anchor": anchor }, words));
   }
   listen(svg, (u, v) => {
     const place = Math.floor((v - 3) / row);
@@ -212,7 +224,10 @@ const drawSupport = (onChoice) => {
   const shown = [];
   for (let p = 0; p < numPairs; p++) if (pairs.verdict[p] !== 3 && pairs.residual[p] > 0 && pairs.support[p] > 0) shown.push(p);
   if (!shown.length) return null;
-  const [svg, box] = [chart(330, "Matches against error"), { left: 64, right: WIDTH - 24, top: 24, bottom: 286 }];
+  const told = [0, 1, 2].filter((v) => shown.some((p) => pairs.verdict[p] === v));
+  const key = layOutKey(told.map((v) => [VERDICTS[v], `var(${VARIABLES[v]})`]));
+  const box = { left: 64, right: WIDTH - 24, top: 24 + key.more, bottom: 286 + key.more };
+  const svg = chart(330 + key.more, "Matches against error");
   const least = 10 ** -5;
   const [xs, ys] = [shown.map((p) => pairs.support[p]), shown.map((p) => Math.max(pairs.residual[p], least))];
   const limits = (values) => values.reduce(([low, high], v) => [Math.min(low, v), Math.max(high, v)], [Infinity, 0]);
@@ -224,7 +239,7 @@ const drawSupport = (onChoice) => {
     const path = places.filter((_, k) => pairs.verdict[shown[k]] === verdict).map(([u, v]) => `M${u.toFixed(1)} ${v.toFixed(1)}h.01`);
     if (path.length) svg.append(shape("path", { d: path.join(""), class: "dots", stroke: `var(${VARIABLES[verdict]})` }));
   }
-  drawKey(svg, [0, 1, 2].filter((v) => shown.some((p) => pairs.verdict[p] === v)).map((v) => [VERDICTS[v], `var(${VARIABLES[v]})`]));
+  drawKey(svg, key);
   listen(svg, (u, v) => {
     let [best, nearest] = [null, 10];
     places.forEach(([a, b], k) => {
@@ -251,7 +266,7 @@ const drawConvergence = () => {
   line(objectives, "var(--agrees)", "");
   line(bounds, "var(--undetermined)", "3 3");
   const hasBound = bounds.some((bound) => bound !== null);
-  drawKey(svg, [["objective", "var(--agrees)"], ...(hasBound ? [["lower bound", "var(--undetermined)"]] : [])]);
+  drawKey(svg, layOutKey([["objective", "var(--agrees)"], ...(hasBound ? [["lower bound", "var(--undetermined)"]] : [])]));
   listen(svg, (u) => {
     const near = iterations.map((k) => Math.abs(x.place(k) - u));
     const k = near.indexOf(Math.min(...near));
