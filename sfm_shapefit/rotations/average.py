@@ -281,7 +281,7 @@ def check_pairs(
         known = _numbers("information", information, (k, 3, 3))
         size = np.abs(known).max(axis=(1, 2), initial=0.0)
         skew = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-        definite = (np.linalg.eigvalsh(known)[:, 0] > 0.0) & (skew <= _ROTATION_TOLERANCE * size)
+        definite = _are_definite(known) & (skew <= _ROTATION_TOLERANCE * size)
         _refuse(~definite, joined, "has information that is not symmetric and positive definite")
     ends = np.sort(joined, axis=1)
     order = np.lexsort(ends.T[::-1])
@@ -289,6 +289,15 @@ def check_pairs(
     repeated[order[1:]] = (np.diff(ends[order], axis=0) == 0).all(axis=1)
     _refuse(repeated, joined, "is given twice; join what its matches say before")
     return _ordered(joined, measured, known, supports, n)
+
+
+def _are_definite(blocks: FloatArray) -> BoolArray:
+    """Return which symmetric 3 x 3 blocks are positive definite: whose pivots are positive."""
+    (a, b, c), (_, d, e), (_, _, f) = blocks.transpose(1, 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        second, beside = d - b * b / a, e - b * c / a
+        third = f - c * c / a - beside * beside / second
+    return np.asarray((a > 0.0) & (second > 0.0) & (third > 0.0))
 
 
 def _ordered(
