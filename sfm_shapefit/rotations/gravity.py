@@ -87,9 +87,7 @@ def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:
     spread = np.maximum(gravity.sigmas, np.median(gravity.sigmas))
     for _ in range(20):
         off = angle_between(down, best)
-        near = off <= _VOTING
-        level = max(float(np.median(off[near])) / _MEDIAN_LENGTH, 1e-9)
-        scale = _SCALE_OF_MEDIAN * np.maximum(spread, level)
+        scale = _SCALE_OF_MEDIAN * np.maximum(spread, _level(off))
         best = normalized(down.T @ (1.0 / (spread * (1.0 + (off / scale) ** 2)) ** 2))
     return np.asarray(best)
 
@@ -102,9 +100,17 @@ def turn_upright(down: FloatArray) -> FloatArray:
 def judge_gravity(rotations: FloatArray, gravity: Gravity) -> tuple[FloatArray, BoolArray]:
     """Return how far gravities are off an upright world's, in radians, and which of them are wrong, (k,)."""
     off = angle_between(np.einsum("kba,kb->ka", rotations[gravity.indices], gravity.directions), DOWN)
+    return off, np.asarray(off > _WRONG_SIGMAS * np.maximum(gravity.sigmas, _level(off)))
+
+
+def _level(off: FloatArray) -> float:
+    """Return the standard deviation that angles (k,) show where most are near; 0 where none is near.
+
+    None is near the middle of gravities that are all as inexact as 40 degrees; their own standard deviations
+    say enough then.
+    """
     near = off <= _VOTING
-    level = float(np.median(off[near])) / _MEDIAN_LENGTH if near.any() else 0.0
-    return off, np.asarray(off > _WRONG_SIGMAS * np.maximum(gravity.sigmas, level))
+    return float(np.median(off[near])) / _MEDIAN_LENGTH if near.any() else 0.0
 
 
 def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gravity) -> AveragedRotations:

@@ -14,7 +14,7 @@ from sfm_shapefit.commands.stages.gravity import refine_with_gravity
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.gravity import DOWN, Gravity, judge_gravity
+from sfm_shapefit.rotations.gravity import DOWN, Gravity, down_of, judge_gravity
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 from tests.scenes import BUNDLED, RING
 
@@ -53,6 +53,22 @@ def test_gravity_halves_the_errors_of_a_drifting_chain_and_wrong_ones_are_found(
     assert named[wrong].all()
     assert named[~wrong].sum() <= 1
     assert np.median(found.sigmas_deg) < np.median(without.sigmas_deg)
+
+
+def test_gravities_of_which_none_is_near_their_middle_are_followed():
+    """Two that lean 20 degrees to either side, by no better an instrument: their middle is down."""
+    lean = np.sin(np.radians(20.0)), np.cos(np.radians(20.0))
+    directions = np.array([[lean[0], lean[1], 0.0], [-lean[0], lean[1], 0.0]])
+    inexact = Gravity(np.arange(2), directions, np.full(2, np.radians(40.0)))
+    middle = down_of(np.tile(np.eye(3), (2, 1, 1)), inexact)
+    assert angle_between_deg(middle, np.array([0.0, 1.0, 0.0])) < 1e-6  # both weigh the same
+    problem, gravity, _ = drifting_chain(12)
+    without = average_relative_rotations(12, problem.relative)
+    rng = np.random.default_rng(2)
+    far = Rotation.from_rotvec(np.radians(40.0) * normalized(rng.standard_normal((12, 3))))
+    loose = gravity._replace(directions=far.apply(gravity.directions), sigmas=np.full(12, np.radians(80.0)))
+    found = refine_with_gravity(without, problem.relative, loose)
+    assert np.isfinite(found.rotations).all()
 
 
 def test_one_gravity_says_too_little():
