@@ -22,6 +22,13 @@ from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.viewgraph import connected_components
 from sfm_shapefit.wording import counted
 
+# Our own averaging leaves out what only unsound pairs tie to the rest, or pairs below `min_matches`;
+# pycolmap's what contradicts its answer, too.
+_UNTIED = (
+    "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
+    "contradict the rest"
+)
+
 
 class ComponentAveraging(NamedTuple):
     """How the rotations of components are averaged."""
@@ -57,13 +64,16 @@ class ComponentAveraging(NamedTuple):
             except UnsolvableError as error:
                 reasons |= dict.fromkeys(members.tolist(), str(error))
                 continue
-            left = members[~answer.registered]
-            reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
+            kept, left = members[answer.registered], members[~answer.registered]
+            reasons |= dict.fromkeys(left.tolist(), _UNTIED)
             if len(left) < len(members):
                 rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
                 waiting = [*waiting, *(group for group in _group_frames(num_frames, rest) if len(group) > 1)]
-            if answer.registered.sum() >= least:
-                yield members[answer.registered], answer.subset(answer.registered)
+            if len(kept) >= least:
+                yield kept, answer.subset(answer.registered)
+            else:
+                tied = f"tied to {counted(len(kept) - 1, 'other image')} only by pairs that can be believed"
+                reasons |= dict.fromkeys(kept.tolist(), f"{tied}; a model needs {least}")
 
     def _average_component(
         self, members: IntArray, inside: RelativeRotations, local: RelativeRotations
