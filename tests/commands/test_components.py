@@ -8,7 +8,7 @@ from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 
-def averaged(pairs, weight_shares):
+def averaged(pairs, weight_shares, **options):
     """The groups of frames that get rotations, and the reasons of the others."""
     k = len(pairs)
     relative = RelativeRotations(
@@ -19,7 +19,7 @@ def averaged(pairs, weight_shares):
         weight_shares=np.array(weight_shares),
     )
     reasons: dict[int, str] = {}
-    components = ComponentAveraging(MapOptions(), Clock(), gravity=None, shares={})
+    components = ComponentAveraging(MapOptions(**options), Clock(), gravity=None, shares={})
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
     return [frames.tolist() for frames, _ in found], reasons
 
@@ -40,3 +40,8 @@ def test_frames_behind_unsound_pairs_are_a_component_of_their_own():
     groups, reasons = averaged(pairs, [SOUND, SOUND, SOUND, UNSOUND, SOUND, SOUND, SOUND])
     assert groups == [[0, 1, 2], [3, 4, 5]]
     assert set(reasons) <= {3, 4, 5}  # the caller takes these back once they have a model
+
+
+def test_a_limit_of_matches_that_no_pair_reaches_is_named():
+    _, reasons = averaged([(0, 1), (1, 2), (0, 2)], [SOUND] * 3, min_matches=101)
+    assert reasons[0] == "none of 3 pairs has 101 inlier matches; lower min_matches"

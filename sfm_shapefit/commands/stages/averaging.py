@@ -32,6 +32,7 @@ from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
 from sfm_shapefit.rotations.options import Averaging
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.wording import counted
 
 _LIMITS = (LEAST_MATCHES, 20, 30, 50, 80)
 _LOSSES: tuple[Loss, ...] = ("geman-mcclure", "half-norm")
@@ -71,6 +72,10 @@ def average_consistently(
             )
             highest = np.fmax.reduce([one.answer.agreements for one in judged])
             return replace(chosen.answer, best_agreements=highest, num_tried=len(judged))
+    if len(relative.pairs) and not (relative.num_matches >= min_matches).any():
+        raise UnsolvableError(
+            f"none of {counted(len(relative.pairs), 'pair')} has {min_matches} inlier matches; lower min_matches"
+        )
     raise UnsolvableError(
         f"the relative rotations of {len(relative.pairs)} pairs cannot be averaged; match more images"
     )
