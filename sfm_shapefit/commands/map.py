@@ -163,9 +163,15 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
     """Read what a run works from, but for the matches."""
     with clock("read"):
         images = read_images(path)
-        if options.refine_rigs and not images.rigs.rigs:
-            raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
         unposed = read_model(images.reconstruction)
+        frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
+        if not _has_shared_frames(frame_of_image):
+            if options.refine_rigs:
+                raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
+            if options.scale == "rig":
+                raise InputError(
+                    f"{path} has no rig of several cameras to take the scale from; use another scale"
+                )
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         inputs = read_left_out(inputs, unposed.names, options)
         unposed, intrinsics = settle_intrinsics(unposed, inputs, options)
@@ -175,7 +181,6 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         positions = read_priors(unposed, inputs, options, priors)
         control = read_control(unposed, options)
         gravity = read_gravity(path, unposed, options)
-    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
     return _Run(
         options=options,
         clock=clock,
@@ -410,8 +415,10 @@ class _Run(NamedTuple):
             settings["scale"] = settings["scale"] if known else "auto"
         if not has_priors:
             settings["refine_with_priors"] = False
-        has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
+        has_rigs = _has_shared_frames(self.frame_of_image[members])
         settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
+        if settings["scale"] == "rig" and not has_rigs:  # that of other components
+            settings["scale"] = "auto"
         is_told = bool(known or has_priors or has_rigs or self.options.control_points)
         if not is_told and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
@@ -431,6 +438,11 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
+
+
+def _has_shared_frames(frames: IntArray) -> bool:
+    """Return whether several images (n,) are of one frame, whose rig then knows a scale."""
+    return len(np.unique(frames)) < len(frames)
 
 
 def _suspicions(averaging: AveragedRotations) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """Rigs and fixed cameras in `locate`: metric scale, poses that stay, and what is refused."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.database_images import read_images
+from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
@@ -406,6 +408,25 @@ def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(dis
     fit = fit_similarity(own, scene.centers)
     assert np.linalg.norm(fit.apply(own) - scene.centers, axis=1).max() < 0.01  # as they are said: 0.2
     assert abs(fit.scale / size - 1.0) < 2e-3
+
+
+def test_a_component_without_rigs_has_a_scale_of_its_own_beside_one_with_rigs(workspace, tmp_path):
+    database = tmp_path / "database.db"
+    shutil.copy(workspace / "database.db", database)
+    of_second = "SELECT frame_id FROM frames WHERE rig_id = 2"
+    second = f"(SELECT data_id FROM frame_data WHERE frame_id IN ({of_second}))"
+    ends = (f"pair_id / {MAX_NUM_IMAGES} IN {second}", f"pair_id % {MAX_NUM_IMAGES} IN {second}")
+    edit_database(
+        database,
+        f"DELETE FROM two_view_geometries WHERE ({ends[0]}) != ({ends[1]})",
+        f"DELETE FROM frame_data WHERE frame_id IN ({of_second})",
+        *(f"DELETE FROM {table} WHERE rig_id = 2" for table in ("frames", "rig_sensors", "rigs")),
+    )
+    found = sfm_shapefit.map_database(database, scale="rig", points="never")
+    scales = [model.located.gauge.scale for model in found.models]
+    assert sorted(scales) == ["rig", "unit"]
+    with pytest.raises(InputError, match="no rig of several cameras to take the scale from"):
+        sfm_shapefit.map_database(RING / "database.db", scale="rig")
 
 
 def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
