@@ -98,7 +98,7 @@ class Loops(NamedTuple):
     """What became of the loops of all videos."""
 
     visits: tuple[Visit, ...]
-    """By the time of their first frames."""
+    """Video by video, by the time of their first frames."""
     refused: IntArray
     """Rows of the pairs that are not to be used."""
 
@@ -248,7 +248,7 @@ def _judge_visits(
                 tolerance_deg=float(np.mean(tolerances[rows])),
             )
         )
-    return sorted(visits, key=lambda visit: visit.first), refused
+    return sorted(visits, key=lambda visit: videos.time_of[list(visit.first)].tolist()), refused
 
 
 def _by_time(videos: Videos, pairs: IntArray) -> list[int]:

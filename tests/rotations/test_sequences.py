@@ -84,6 +84,12 @@ def test_loops_are_taken_where_the_chain_says_the_same_and_refused_where_not():
     assert taken.angle_deg < 0.5 < taken.tolerance_deg
 
 
+def test_visits_come_by_their_time_whatever_the_order_of_the_images():
+    given = measured(neighbors() + visit(0, 30) + visit(10, 50))
+    found = judge_loops(find_videos(NAMES[::-1]), given)
+    assert [(one.first, one.second) for one in found.visits] == [((52, 50), (12, 10)), ((32, 30), (2, 0))]
+
+
 def test_a_visit_most_of_which_is_false_is_refused_as_a_whole():
     loop = visit(5, 45)
     given = measured(neighbors() + loop, loop[:6])
