@@ -1,9 +1,11 @@
 """Components with averaged rotations, and what is said of the frames that get none."""
 
 import numpy as np
+import pytest
 
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.components import ComponentAveraging
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
@@ -45,3 +47,10 @@ def test_frames_behind_unsound_pairs_are_a_component_of_their_own():
 def test_a_limit_of_matches_that_no_pair_reaches_is_named():
     _, reasons = averaged([(0, 1), (1, 2), (0, 2)], [SOUND] * 3, min_matches=101)
     assert reasons[0] == "none of 3 pairs has 101 inlier matches; lower min_matches"
+
+
+def test_a_stage_that_fails_has_taken_its_time():
+    clock = Clock()
+    with pytest.raises(UnsolvableError), clock("locate"):
+        raise UnsolvableError
+    assert list(clock.seconds) == ["locate"]

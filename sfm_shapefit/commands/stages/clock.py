@@ -22,13 +22,15 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Time a stage; one that comes again adds to its time."""
+        """Time a stage; one that comes again adds to its time, and so does one that fails."""
         self.stage = stage
         hand_back_memory()
         self.progress(stage, 0, 1)
         start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+        try:
+            yield
+        finally:  # a component that cannot be placed has taken its time, too
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
         self.progress(stage, 1, 1)
 
     def advance(self, done: int, total: int) -> None:
