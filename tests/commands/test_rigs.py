@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -15,6 +16,8 @@ from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
+from sfm_shapefit.commands.stages import rigs as rigs_stage
+from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import fit_similarity, rotation_angles_deg
 from sfm_shapefit.synthetic import (
@@ -227,6 +230,21 @@ def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(
     assert found.summary()["rigid_groups"]["num_fixed"] == 5
     assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
     assert found.certified.gap <= 1e-8
+
+
+def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkeypatch):
+    loose = SimpleNamespace(
+        assessment=SimpleNamespace(loose_groups=[SimpleNamespace(cameras=[1])]), cameras=[1]
+    )
+
+    def place(graph, *_, **__):
+        if graph != "without points":
+            raise UnsolvableError("rays to far points let the start collapse")
+        return loose
+
+    monkeypatch.setattr(rigs_stage, "place", place)
+    measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
+    assert rigs_stage.place_cameras(measured, LocateOptions(), Clock()) is loose
 
 
 def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):

@@ -5,7 +5,6 @@ has them: two or more are one group, whose offsets are their centers; of a singl
 taken.
 """
 
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -116,19 +115,25 @@ def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock)
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     hand_back_memory()  # of what the graph was made of
-    first = None
-    if measured.groups is not None and measured.num_points and options.points != "always":
-        with suppress(UnsolvableError):
-            first = place(measured.without_points(), options, on_iteration=clock.iteration)
-        if first is not None and not first.assessment.loose_groups:
-            return first
-    second = place(measured, options, on_iteration=clock.iteration)
+    if measured.groups is None or not measured.num_points or options.points == "always":
+        return place(measured, options, on_iteration=clock.iteration)
+    try:
+        first = place(measured.without_points(), options, on_iteration=clock.iteration)
+    except UnsolvableError:
+        return place(measured, options, on_iteration=clock.iteration)
+    if not first.assessment.loose_groups:
+        return first
+    try:
+        second = place(measured, options, on_iteration=clock.iteration)
+    except UnsolvableError:
+        return first
+    return second if _count_held(second) > _count_held(first) else first
 
-    def count_held(placement: Placement) -> int:
-        loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
-        return len(placement.cameras) - loose
 
-    return second if first is None or count_held(second) > count_held(first) else first
+def _count_held(placement: Placement) -> int:
+    """Return how many of the placed cameras do not hang loose."""
+    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+    return len(placement.cameras) - loose
 
 
 def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
