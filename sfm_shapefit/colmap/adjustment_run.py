@@ -107,7 +107,13 @@ class GivenPoses(NamedTuple):
 
 
 class AdjustmentRun:
-    """The frames and tracks of one adjustment; each solve moves the frames on."""
+    """The frames and tracks of one adjustment; each solve moves the frames on.
+
+    A solve moves `frames`, gives the tracks of `source` the rays of lenses that changed with them, and counts
+    `iterations`. It leaves behind what its optimum is one of: `loss_scale_px`, `weight`, and the `lenses` that
+    were free, of which `refined` says how well they are known. Whoever adjusts sets `weight`, and the
+    `given_rotations` that it is of, before.
+    """
 
     def __init__(
         self,
@@ -119,7 +125,7 @@ class AdjustmentRun:
     ) -> None:
         self.lenses, self.refined = given.lenses, RefinedLenses({}, (), given.lenses)
         self.start = self.frames = read_frames(seed, fixed_frames, given.centers, free_rigs=given.free_rigs)
-        self.weight, self.given = _FREE, self.start.rotations
+        self.weight, self.given_rotations = _FREE, self.start.rotations
         self.source: ObservedTracks | MatchedKeypoints
         if isinstance(tracks, MatchedKeypoints):
             self.source, fewest = tracks, options.fewest_views(len(self.frames.image_ids))
@@ -137,15 +143,15 @@ class AdjustmentRun:
         """Return how well free sensors are known at the optimum last solved for, see `free_sensors`."""
         if not self.frames.free_sensors:
             return NO_SENSORS
-        return judge_sensors(self.frames, adjusted, self.options_at_optimum())
+        return judge_sensors(self.frames, adjusted, self._options_at_optimum())
 
-    def options_at_optimum(self) -> AdjustmentOptions:
+    def _options_at_optimum(self) -> AdjustmentOptions:
         """Return the options by which the optimum last solved for is one."""
         return AdjustmentOptions(
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
 
-    def triangulate(
+    def _triangulate(
         self, widening: float, *, checked: bool = False
     ) -> tuple[ObservedTracks, TriangulatedPoints]:
         """Return the tracks and points at the frames' poses, at so many pixel thresholds.
@@ -166,11 +172,11 @@ class AdjustmentRun:
         self, *, checked: bool = False
     ) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
         """Return tracks and points at the pixel threshold, as `triangulate` does, and the problem of all."""
-        joined, found = self.triangulate(1.0, checked=checked)
+        joined, found = self._triangulate(1.0, checked=checked)
         refuse_without_points(len(found.points))
         return joined, found, self.frames.problem(joined, found)
 
-    def checked(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+    def _of_checked_points(self, problem: AdjustmentProblem) -> AdjustmentProblem:
         """Return a problem without the points that the model may not have; as it is if it has no others.
 
         Errors are estimated by these: of two images' a single residual is left, which says little of them.
@@ -180,7 +186,7 @@ class AdjustmentRun:
         is_checked = np.bincount(problem.points_seen, minlength=problem.num_points) >= self.checked_length
         return problem.of_points(is_checked) if is_checked.any() else problem
 
-    def thin_problem(
+    def _thin_problem(
         self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
@@ -192,9 +198,9 @@ class AdjustmentRun:
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
         return self.frames.problem(thin.subset(chosen), points)
 
-    def adjust_coarsely_by_few(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+    def _adjust_by_few(self, problem: AdjustmentProblem) -> AdjustmentProblem:
         """Move coarse frames to the optimum of a thin problem, and return it."""
-        return self.solve(problem, _THIN_SCALE, _THIN_FALL)
+        return self._solve(problem, _THIN_SCALE, _THIN_FALL)
 
     def adjust_twice_thinly(self, *, is_last: bool = False) -> AdjustmentProblem:
         """Move coarse frames: at the wide limit, then finely at the threshold; return the last problem.
@@ -203,17 +209,15 @@ class AdjustmentRun:
         either is solved; and all matches before the second, if it `is_last`: if nothing follows but what
         lenses and rigs call for.
         """
-        adjusted = self.adjust_coarsely_by_few(
-            self.thin_problem(*self.triangulate(_THIN_LIMIT, checked=True))
-        )
-        joined, found = self.triangulate(1.0)
+        adjusted = self._adjust_by_few(self._thin_problem(*self._triangulate(_THIN_LIMIT, checked=True)))
+        joined, found = self._triangulate(1.0)
         if len(found.points) == 0:
             return adjusted
-        problem = self.thin_problem(joined, found, times=_FINE_TIMES)
+        problem = self._thin_problem(joined, found, times=_FINE_TIMES)
         del joined, found, adjusted
         if is_last and not self.frees_more_than_poses():
             del self.source  # all matches, at the peak of the memory; nothing is triangulated any more
-        return self.solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)
+        return self._solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)
 
     def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
         """Solve, and where focal lengths are left open, hold what was given of them and solve again.
@@ -222,20 +226,20 @@ class AdjustmentRun:
         """
         adjusted = solve()
         for _ in range(_MOST_REPETITIONS):
-            unknown = self.judge_lenses(adjusted)
+            unknown = self._judge_lenses(adjusted)
             if not unknown:
                 break
-            self.hold_lenses(unknown)
+            self._hold_lenses(unknown)
             adjusted = solve()
         else:
-            self.judge_lenses(adjusted)
+            self._judge_lenses(adjusted)
         return adjusted
 
-    def judge_lenses(self, adjusted: AdjustmentProblem) -> list[int]:
+    def _judge_lenses(self, adjusted: AdjustmentProblem) -> list[int]:
         """Note how well free focal lengths are known; return the cameras whose points leave them open."""
         if not self.lenses.doubts:
             return []
-        options = replace(self.options_at_optimum(), **self.lenses.overrides())
+        options = replace(self._options_at_optimum(), **self.lenses.overrides())
         ids = self.frames.colmap_camera_of_lens
         try:
             found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
@@ -246,7 +250,7 @@ class AdjustmentRun:
         lenses, doubts = dict(zip(ids, self.frames.lenses, strict=True)), self.lenses.doubts
         return [i for i in ids if i in doubts and not doubts[i].accepts(lenses[i], found[i])]
 
-    def hold_lenses(self, camera_ids: Sequence[int]) -> None:
+    def _hold_lenses(self, camera_ids: Sequence[int]) -> None:
         """Give lenses back what was given of them, and hold their focal lengths from now on.
 
         A lens that is not to be believed even so is held as a whole.
@@ -260,14 +264,14 @@ class AdjustmentRun:
         undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *camera_ids)))
         self.refined = self.refined._replace(undetermined=undetermined, free=self.lenses)
 
-    def solve(
+    def _solve(
         self, problem: AdjustmentProblem, scale: float, fall: float, first_damping: float = _FIRST_DAMPING
     ) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = self.loss_scale_px = scale * self.options.max_reprojection_error_px
         problem = self.lenses.apply(problem, self.frames.colmap_camera_of_lens)
         adjusted = adjust(
-            self.weight.apply(problem, self.given),
+            self.weight.apply(problem, self.given_rotations),
             loss_scale_px=loss_scale_px,
             cost_tolerance=fall,
             first_damping=first_damping,
@@ -292,13 +296,13 @@ class AdjustmentRun:
 
     def adjust_placed(self, problem: AdjustmentProblem, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, but those that would gain nothing by it."""
-        adjusted = self.solve(problem, self.choose_scale(problem), fall)
+        adjusted = self._solve(problem, self.choose_scale(problem), fall)
         if not self.frees_more_than_poses():
-            return self.return_frames(problem, adjusted)
-        self.judge_lenses(adjusted)
+            return self._return_frames(problem, adjusted)
+        self._judge_lenses(adjusted)
         return adjusted
 
-    def return_frames(self, before: AdjustmentProblem, after: AdjustmentProblem) -> AdjustmentProblem:
+    def _return_frames(self, before: AdjustmentProblem, after: AdjustmentProblem) -> AdjustmentProblem:
         """Put the frames back that gained nothing by moving, and return the problem with them."""
         returned = frames_not_gained(before, after, self.loss_scale_px)
         rotations = np.where(returned[:, None, None], before.rotations, after.rotations)
@@ -312,7 +316,7 @@ class AdjustmentRun:
             return Uncertainty()
         try:
             found = estimate_center_errors(
-                self.checked(problem), self.options_at_optimum(), self.weight.open_rad()
+                self._of_checked_points(problem), self._options_at_optimum(), self.weight.open_rad()
             )
         except UnsolvableError:
             return Uncertainty()
@@ -331,29 +335,29 @@ class AdjustmentRun:
         threshold_px = self.options.max_reprojection_error_px
         return choose_loss_scale_px(problem, [scale * threshold_px for scale in _SCALES]) / threshold_px
 
-    def adjust_coarsely(self) -> AdjustmentProblem:
+    def _adjust_by_all_points_once(self) -> AdjustmentProblem:
         """Move the frames by all points, the first of two times; return the problem."""
         _, _, problem = self.problem_of_all()
-        return self.solve(problem, self.choose_scale(problem), FIRST_FALL)
+        return self._solve(problem, self.choose_scale(problem), FIRST_FALL)
 
     def adjust_by_all_points(self) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
         """Move the frames by all points, twice; return what was solved for last, and the problem."""
-        self.repeat_with_known_lenses(self.adjust_coarsely)
+        self.repeat_with_known_lenses(self._adjust_by_all_points_once)
         joined, found, problem = self.problem_of_all()
-        adjusted = self.solve(problem, self.choose_scale(problem), LAST_FALL)
-        self.judge_lenses(adjusted)
+        adjusted = self._solve(problem, self.choose_scale(problem), LAST_FALL)
+        self._judge_lenses(adjusted)
         return joined, found, adjusted
 
     def adjust_all(
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
         """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
-        joined, found = self.triangulate(1.0, checked=True)
-        loosely, loose = self.triangulate(_THIN_LIMIT, checked=True)
+        joined, found = self._triangulate(1.0, checked=True)
+        loosely, loose = self._triangulate(_THIN_LIMIT, checked=True)
         refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
-            self.adjust_coarsely_by_few(self.thin_problem(loosely, loose))
+            self._adjust_by_few(self._thin_problem(loosely, loose))
         joined, found, adjusted = self.adjust_by_all_points()
         answer = self.posed(seed)
         found = replace(found, points=adjusted.points).of_length(self.checked_length)

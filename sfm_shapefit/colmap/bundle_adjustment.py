@@ -59,13 +59,13 @@ def bundle_adjust(
         unfiltered, iterations, converged = adjust_by_ceres(
             start, tracks, structure_options, fixed_frames, given.lenses, free_rigs=given.free_rigs
         )
-        uncertainty, sensors = Uncertainty(), _ask_sensors(unfiltered, fixed_frames, given)
+        uncertainty, sensors = Uncertainty(), _judge_sensors_of_ceres(unfiltered, fixed_frames, given)
         refined = RefinedLenses(dict.fromkeys(given.lenses.with_free_focal(), math.nan), (), given.lenses)
     else:
         run = AdjustmentRun(seed, tracks, structure_options, fixed_frames, given)
         run.weight = given.weight_of(run.frames.frame_ids)
         if given.model is not None:
-            run.given = rotations_of_frames(given.model, run.frames.frame_ids)
+            run.given_rotations = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
         iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
         refined, sensors = run.refined, run.judge_sensors(last)
@@ -82,7 +82,7 @@ def bundle_adjust(
     )
 
 
-def _ask_sensors(
+def _judge_sensors_of_ceres(
     adjusted: pycolmap.Reconstruction, fixed_frames: Collection[int], given: GivenPoses
 ) -> Mapping[int, SensorSigma]:
     """Return how well the free sensors of a model that Ceres has adjusted are known."""
