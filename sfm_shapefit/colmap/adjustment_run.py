@@ -110,9 +110,8 @@ class AdjustmentRun:
     """The frames and tracks of one adjustment; each solve moves the frames on.
 
     A solve moves `frames`, gives the tracks of `source` the rays of lenses that changed with them, and counts
-    `iterations`. It leaves behind what its optimum is one of: `loss_scale_px`, `weight`, and the `lenses` that
-    were free, of which `refined` says how well they are known. Whoever adjusts sets `weight`, and the
-    `given_rotations` that it is of, before.
+    `iterations`. `loss_scale_px` is that of the last one. `lenses` are those still free, and `refined` says
+    how well they are known. Whoever adjusts sets `weight`, and the `given_rotations` that it is of, before.
     """
 
     def __init__(

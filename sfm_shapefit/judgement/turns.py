@@ -434,8 +434,7 @@ def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: f
 def _common_turn(
     votes: FloatArray, sigmas: FloatArray, weights: FloatArray, candidates: BoolArray
 ) -> FloatArray | None:
-    """Return the turn that votes of most weight agree on, averaged over those; None without
-    candidates.
+    """Return the turn that votes of most weight agree on, averaged over those; None without candidates.
 
     Args:
         votes: (k, 3, 3) turns.

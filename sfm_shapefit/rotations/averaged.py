@@ -25,8 +25,7 @@ class AveragedRotations(Displayed):
     """(n,) standard deviation of each rotation per axis, relative to the mean turn of all. It counts errors
     of pairs as independent; what they share, as errors of the calibration, comes on top. Infinite where the
     pairs that agree do not tie the image to the largest part of the others, NaN without rotation, or where
-    the averaging does
-    not say."""
+    the averaging does not say."""
     agreements: FloatArray
     """(n,) of the weight of each image's pairs, the share that agrees within 5 deg; NaN where it has none."""
     best_agreements: FloatArray

@@ -50,9 +50,10 @@ def average_consistently(
     """Return the most consistent rotations of some images; of several components one is answered.
 
     Args:
-        num_images: n. relative: pairs of them.
-        min_matches: pairs of fewer are left out. With 0, all count in our own averaging, and pycolmap's
-            tries several limits.
+        num_images: n.
+        relative: pairs of them.
+        min_matches: pairs of fewer are left out. With 0, our own averaging leaves none out for that, and
+            pycolmap's tries several limits.
         averaging: who averages.
         threads: of our own averaging; the answer does not depend on it.
 
@@ -74,7 +75,8 @@ def average_consistently(
             return replace(chosen.answer, best_agreements=highest, num_tried=len(judged))
     if len(relative.pairs) and not (relative.num_matches >= min_matches).any():
         raise UnsolvableError(
-            f"none of {counted(len(relative.pairs), 'pair')} has {min_matches} inlier matches; lower min_matches"
+            f"none of {counted(len(relative.pairs), 'pair')} has {min_matches} inlier matches; lower "
+            "min_matches"
         )
     raise UnsolvableError(
         f"the relative rotations of {len(relative.pairs)} pairs cannot be averaged; match more images"

@@ -81,7 +81,9 @@ class ComponentAveraging(NamedTuple):
         """Average rotations, by the arrangement of the frames that the matches speak for, and by gravity.
 
         Args:
-            members: the frames. inside: the pairs among them. local: the same by their place among these.
+            members: the frames.
+            inside: the pairs among them.
+            local: the same by their place among these.
         """
         answer = self._arrange(len(members), local, self._evidence_of(inside))
         if self.gravity is None:
