@@ -25,22 +25,40 @@ from sfm_shapefit.jit import inner_kernel, kernel
 
 
 @inner_kernel
+def _multiply(
+    ax: float, ay: float, az: float, aw: float, bx: float, by: float, bz: float, bw: float
+) -> tuple[float, float, float, float]:
+    """Return the product a b of quaternions, (x, y, z, w)."""
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+@inner_kernel
+def _predict(measured: Any, is_second: bool, other: Any) -> tuple[float, float, float, float]:
+    """Return what a pair says of one of its cameras by the other: R_ij R_i of j, R_ij^T R_j of i."""
+    s = 1.0 if is_second else -1.0
+    return _multiply(
+        s * measured[0], s * measured[1], s * measured[2], measured[3], other[0], other[1], other[2], other[3]
+    )
+
+
+@inner_kernel
 def relative_in_world(measured: Any, at_i: Any, at_j: Any) -> tuple[float, float, float, float]:
     """Return R_j^T R_ij R_i of unit quaternions, (x, y, z, w): the identity if all three agree."""
-    ax, ay, az, aw = measured[0], measured[1], measured[2], measured[3]
-    bx, by, bz, bw = at_i[0], at_i[1], at_i[2], at_i[3]
-    # p = R_ij R_i
-    px = aw * bx + ax * bw + ay * bz - az * by
-    py = aw * by - ax * bz + ay * bw + az * bx
-    pz = aw * bz + ax * by - ay * bx + az * bw
-    pw = aw * bw - ax * bx - ay * by - az * bz
-    # R_j^T p
-    cx, cy, cz, cw = -at_j[0], -at_j[1], -at_j[2], at_j[3]
-    x = cw * px + cx * pw + cy * pz - cz * py
-    y = cw * py - cx * pz + cy * pw + cz * px
-    z = cw * pz + cx * py - cy * px + cz * pw
-    w = cw * pw - cx * px - cy * py - cz * pz
-    return x, y, z, w
+    px, py, pz, pw = _predict(measured, True, at_i)
+    return _multiply(-at_j[0], -at_j[1], -at_j[2], at_j[3], px, py, pz, pw)
+
+
+@inner_kernel
+def fill_matrix(x: float, y: float, z: float, w: float, r: Any) -> None:
+    """Fill the rotation matrix r of a unit quaternion."""
+    r[0, 0], r[0, 1], r[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+    r[1, 0], r[1, 1], r[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+    r[2, 0], r[2, 1], r[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
 
 
 @inner_kernel
@@ -61,12 +79,7 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
     """Replace the unit quaternion q by q exp(s), of unit length again."""
     half = 0.5 * np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
     factor = 0.5 * (np.sin(half) / half if half > 1e-150 else 1.0)
-    bx, by, bz, bw = factor * s0, factor * s1, factor * s2, np.cos(half)
-    ax, ay, az, aw = q[0], q[1], q[2], q[3]
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
-    w = aw * bw - ax * bx - ay * by - az * bz
+    x, y, z, w = _multiply(q[0], q[1], q[2], q[3], factor * s0, factor * s1, factor * s2, np.cos(half))
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     q[0], q[1], q[2], q[3] = x / norm, y / norm, z / norm, w / norm
 
@@ -104,10 +117,7 @@ def residual_squares(pairs: Any, measured: Any, turns: Any, squares: Any) -> Non
 @inner_kernel
 def _turn_information(h: Any, q: Any, r: Any, hr: Any, block: Any) -> None:
     """Fill the block R^T H R with R of the unit quaternion q; r and hr are scratch (3, 3)."""
-    x, y, z, w = q[0], q[1], q[2], q[3]
-    r[0, 0], r[0, 1], r[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
-    r[1, 0], r[1, 1], r[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
-    r[2, 0], r[2, 1], r[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+    fill_matrix(q[0], q[1], q[2], q[3], r)
     for a in range(3):
         for b in range(3):
             hr[a, b] = h[a, 0] * r[0, b] + h[a, 1] * r[1, b] + h[a, 2] * r[2, b]
@@ -189,14 +199,8 @@ def follow_tree(order: Any, parents: Any, links: Any, pairs: Any, measured: Any,
         i = order[k]
         if parents[i] < 0:
             continue
-        e = links[i]
-        q, p, out = measured[e], turns[parents[i]], turns[i]
-        sign = 1.0 if pairs[e, 1] == i else -1.0
-        ax, ay, az, aw = sign * q[0], sign * q[1], sign * q[2], q[3]
-        x = aw * p[0] + ax * p[3] + ay * p[2] - az * p[1]
-        y = aw * p[1] - ax * p[2] + ay * p[3] + az * p[0]
-        z = aw * p[2] + ax * p[1] - ay * p[0] + az * p[3]
-        w = aw * p[3] - ax * p[0] - ay * p[1] - az * p[2]
+        e, out = links[i], turns[i]
+        x, y, z, w = _predict(measured[e], pairs[e, 1] == i, turns[parents[i]])
         norm = np.sqrt(x * x + y * y + z * z + w * w)
         out[0], out[1], out[2], out[3] = x / norm, y / norm, z / norm, w / norm
 
@@ -270,13 +274,8 @@ def move_to_modes(
         for k in range(count):
             p = pointers[c] + k
             e, other = edge_of[p], neighbors[p]
-            q, b = measured[e], turns[other]
-            sign = 1.0 if pairs[e, 1] == c else -1.0
-            ax, ay, az, aw = sign * q[0], sign * q[1], sign * q[2], q[3]
-            predicted[k, 0] = aw * b[0] + ax * b[3] + ay * b[2] - az * b[1]
-            predicted[k, 1] = aw * b[1] - ax * b[2] + ay * b[3] + az * b[0]
-            predicted[k, 2] = aw * b[2] + ax * b[1] - ay * b[0] + az * b[3]
-            predicted[k, 3] = aw * b[3] - ax * b[0] - ay * b[1] - az * b[2]
+            x, y, z, w = _predict(measured[e], pairs[e, 1] == c, turns[other])
+            predicted[k, 0], predicted[k, 1], predicted[k, 2], predicted[k, 3] = x, y, z, w
             weight[k] = weights[e]
             total += weights[e]
             own += weights[e] * _closeness(predicted[k], turns[c], scale)
@@ -332,16 +331,12 @@ def close_triangles(
                 first, second = edge_of[a], edge_of[b]
                 p, q = measured[first], measured[second]  # from i to the third, and from it to j
                 s = 1.0 if pairs[first, 0] == i else -1.0
-                px, py, pz, pw = s * p[0], s * p[1], s * p[2], p[3]
-                s = 1.0 if pairs[second, 1] == j else -1.0
-                qx, qy, qz, qw = s * q[0], s * q[1], s * q[2], q[3]
-                around[0] = qw * px + qx * pw + qy * pz - qz * py
-                around[1] = qw * py - qx * pz + qy * pw + qz * px
-                around[2] = qw * pz + qx * py - qy * px + qz * pw
-                around[3] = qw * pw - qx * px - qy * py - qz * pz
-                w = min(weights[first], weights[second])
-                total += w
-                closed += w * _closeness(around, measured[e], scale)
+                t = 1.0 if pairs[second, 1] == j else -1.0
+                x, y, z, w = _multiply(t * q[0], t * q[1], t * q[2], q[3], s * p[0], s * p[1], s * p[2], p[3])
+                around[0], around[1], around[2], around[3] = x, y, z, w
+                votes = min(weights[first], weights[second])
+                total += votes
+                closed += votes * _closeness(around, measured[e], scale)
                 a += 1
                 b += 1
         closing[e], all_votes[e] = closed, total

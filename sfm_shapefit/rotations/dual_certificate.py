@@ -37,7 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
-from sfm_shapefit.rotations.averaging_kernels import relative_in_world, turn_cameras
+from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
 _TOLERANCE = 1e-6
@@ -206,6 +206,4 @@ def apply_certificate(pairs: Any, blocks: Any, diagonal: Any, x: Any, out: Any) 
 def _around(measured: Any, at_i: Any, at_j: Any, e: Any) -> None:
     """Fill the matrix E = R_j^T R_ij R_i of unit quaternions."""
     x, y, z, w = relative_in_world(measured, at_i, at_j)
-    e[0, 0], e[0, 1], e[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
-    e[1, 0], e[1, 1], e[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
-    e[2, 0], e[2, 1], e[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+    fill_matrix(x, y, z, w, e)
