@@ -36,13 +36,16 @@ from sfm_shapefit.rotations.averaging_kernels import (
 )
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
+# From 60 degrees nine rounds lead down to 5; the others are spent there.
 _ROUNDS = 14
 _COOLING = 0.75
 _COLDEST = np.radians(AGREEMENT_DEG)
-_LONGEST_STEP = 0.5
+LONGEST_STEP = 0.5
+"""No camera turns farther in a step, in radians, as steps are of first order."""
 FULL_LIMIT = np.radians(AGREEMENT_DEG)
 """Pairs with a larger residual are left out of the phase with the full information."""
-_SCALE_OF_MEDIAN = 3.0
+SCALE_OF_MEDIAN = 3.0
+"""Of the loss with the full information, in medians of the Mahalanobis lengths."""
 # Triangles that close to within about this angle count as closed.
 _CLOSING_SCALE = np.radians(AGREEMENT_DEG)
 # Python can be interrupted between slices of so many.
@@ -51,10 +54,10 @@ _PAIRS_PER_SLICE = 200_000
 _VOTING_SCALE = np.radians(10.0)
 _MARGIN = 0.05
 _SWEEPS = 5
-# Steps shorter than this, in radians, end the rounds.
-_SETTLED = 1e-7
+SETTLED = 1e-7
+"""Steps shorter than this, in radians, end the rounds."""
 # Right sides of the rounds are solved to this share where there is no factor, the last ones further.
-_REDUCTION, _LAST_REDUCTION = 3e-2, 1e-4
+_REDUCTION, LAST_REDUCTION = 3e-2, 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,8 +139,8 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
     for step in range(_ROUNDS):
         tau = max(widest * _COOLING**step, float(_COLDEST))
         weigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
-        turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), _LONGEST_STEP)
-        if tau <= _COLDEST and turned <= _SETTLED:
+        turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), LONGEST_STEP)
+        if tau <= _COLDEST and turned <= SETTLED:
             break
     return turns
 
@@ -178,14 +181,14 @@ def refine_fully(
             gradient,
         )
         inside = distances[~np.isnan(distances)]
-        return max(_SCALE_OF_MEDIAN * float(np.median(inside)) if len(inside) else 1.0, 1e-12)
+        return max(SCALE_OF_MEDIAN * float(np.median(inside)) if len(inside) else 1.0, 1e-12)
 
     scale = weigh(1.0)
     scale = weigh(scale)
     for step in range(rounds):
-        tol = _LAST_REDUCTION if step == rounds - 1 else _REDUCTION
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, tol), _LONGEST_STEP)
+        tol = LAST_REDUCTION if step == rounds - 1 else _REDUCTION
+        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, tol), LONGEST_STEP)
         scale = weigh(scale)
-        if turned <= _SETTLED:
+        if turned <= SETTLED:
             break
     return turns, Linearized(blocks, distances)

@@ -37,8 +37,8 @@ from sfm_shapefit.viewgraph import connected_components
 
 _LOSS_FACTOR = 0.823
 _MEDIAN_SQUARE = 2.366
-# Pairs of a higher leverage say nothing of the residual scale.
-_MOST_LEVERAGE = 0.9
+MOST_LEVERAGE = 0.9
+"""Pairs of a higher leverage say nothing of the residual scale."""
 _SAMPLES = 16
 _REDUCTION = 1e-2
 _SEED = 2
@@ -80,7 +80,7 @@ def _ties(num_cameras: int, last: Linearized) -> BoolArray:
 
 def residual_variance(distances: FloatArray, leverages: FloatArray) -> float:
     """Return the variance of the residuals over that of the given information; 1 if they do not say."""
-    asked = (leverages <= _MOST_LEVERAGE) & ~np.isnan(distances)
+    asked = (leverages <= MOST_LEVERAGE) & ~np.isnan(distances)
     if not asked.any():
         return 1.0
     return float(np.median(distances[asked] ** 2 / (1.0 - leverages[asked]))) / _MEDIAN_SQUARE

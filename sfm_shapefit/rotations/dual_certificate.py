@@ -37,6 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.rotations.annealing import LONGEST_STEP
 from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
@@ -107,7 +108,7 @@ def _polish(
     turns, gradient = turns.copy(), np.empty((system.num_nodes, 3))
     for _ in range(_POLISHING_STEPS):
         chordal_gradient(system.pairs, measured, turns, weights, gradient)
-        if turn_cameras(turns, system.solve_scalar(weights, gradient, _REDUCTION), 0.5) <= _SETTLED:
+        if turn_cameras(turns, system.solve_scalar(weights, gradient, _REDUCTION), LONGEST_STEP) <= _SETTLED:
             break
     return turns
 

@@ -22,11 +22,18 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between, normalized
-from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
+from sfm_shapefit.rotations.annealing import (
+    LAST_REDUCTION,
+    LONGEST_STEP,
+    SCALE_OF_MEDIAN,
+    SETTLED,
+    AveragingPairs,
+    Linearized,
+)
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
-from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas, residual_variance
+from sfm_shapefit.rotations.averaging_uncertainty import MOST_LEVERAGE, estimate_sigmas, residual_variance
 
 DOWN = np.array([0.0, 0.0, -1.0])
 """In axes of the world."""
@@ -36,14 +43,8 @@ _VOTING = np.radians(10.0)
 # A gravity that is farther off has no part.
 _LIMIT = np.radians(45.0)
 _ROUNDS = 60
-_SETTLED = 1e-7
-_SCALE_OF_MEDIAN = 3.0
-_REDUCTION = 1e-4
-_LONGEST_STEP = 0.5
 # Share of the information about the axis of gravity, which it says nothing of, that keeps blocks definite.
 _ABOUT_DOWN = 1e-9
-# A residual variance is not asked of pairs that hide more of theirs.
-_MOST_LEVERAGE = 0.9
 # A gravity is wrong beyond so many of its standard deviations, or of the level of all.
 _WRONG_SIGMAS = 5.0
 # Median of the length of two normal components of variance 1.
@@ -87,7 +88,7 @@ def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:
     spread = np.maximum(gravity.sigmas, np.median(gravity.sigmas))
     for _ in range(20):
         off = angle_between(down, best)
-        scale = _SCALE_OF_MEDIAN * np.maximum(spread, _level(off))
+        scale = SCALE_OF_MEDIAN * np.maximum(spread, _level(off))
         best = normalized(down.T @ (1.0 / (spread * (1.0 + (off / scale) ** 2)) ** 2))
     return np.asarray(best)
 
@@ -164,13 +165,13 @@ def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Re
         )  # fmt: skip
         inside = distances[: k - m][~np.isnan(distances[: k - m])]
         median = float(np.median(inside)) if len(inside) else 1.0
-        return _SCALE_OF_MEDIAN * max(median, 1.0)
+        return SCALE_OF_MEDIAN * max(median, 1.0)
 
-    scale = weigh(weigh(_SCALE_OF_MEDIAN))
+    scale = weigh(weigh(SCALE_OF_MEDIAN))
     for _ in range(_ROUNDS):
-        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, _REDUCTION), _LONGEST_STEP)
+        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, LAST_REDUCTION), LONGEST_STEP)
         scale = weigh(scale)
-        if turned <= _SETTLED:
+        if turned <= SETTLED:
             break
     return _Refined(turns, Linearized(blocks, distances), graph, system)
 
@@ -189,7 +190,7 @@ def _join_world(given: AveragingPairs, turns: FloatArray, gravity: Gravity) -> A
     )  # fmt: skip
     agreeing = given.subset(~np.isnan(distances))
     # On average, of a connected graph.
-    leverage = min((n - 1) / max(len(agreeing.pairs), 1), _MOST_LEVERAGE)
+    leverage = min((n - 1) / max(len(agreeing.pairs), 1), MOST_LEVERAGE)
     excess = max(1.0, residual_variance(distances, np.full(k, leverage)))
     # What gravity does not say, of the axis along it, keeps the blocks definite.
     across = np.eye(3) - (1.0 - _ABOUT_DOWN) * np.outer(DOWN, DOWN)
