@@ -286,6 +286,8 @@ class MapOptions(LocateOptions):
             raise ValueError(
                 "map finds the rotations itself; what given ones are worth is for locate to know"
             )
+        if self.fix:
+            raise ValueError("a database has no positions that cameras could stay at; fix is for locate")
         if self.min_matches:
             self.check_range("min_matches", LEAST_MATCHES)
         self.check_range("min_model_size", 3)

@@ -88,6 +88,7 @@ REFUSED = [
     (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
     (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),
     (MapOptions, {"rotations": "measured"}, "map finds the rotations itself"),
+    (MapOptions, {"fix": "names.txt"}, "a database has no positions that cameras could stay at"),
     (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
     (LocateOptions, {"scale": "distance"}, "needs known_distance"),
     (LocateOptions, {"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),

@@ -39,7 +39,7 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.control_points import ControlPoints
-from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors, UselessPriorsError
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.map_warnings import lost_distances, map_warnings
@@ -81,7 +81,7 @@ def map_database(
         **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
-            "unit".
+            "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
         executor: shares out pairs and tracks among its workers, as of `locate`. None: all is done here.
 
     Returns:
@@ -344,11 +344,27 @@ class _Run(NamedTuple):
     def locate_component(
         self, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
     ) -> LocateResult:
+        """Place one component, on the position priors of its images if they can set a scale."""
+        priors = None if self.priors is None else self.priors.of(members)
+        if priors is None or len(priors) < FEWEST_PRIORS:
+            return self.locate_with_priors(members, averaging, relative, None)
+        try:
+            return self.locate_with_priors(members, averaging, relative, priors)
+        except UselessPriorsError as error:  # which other components need not share
+            found = self.locate_with_priors(members, averaging, relative, None)
+            return replace(
+                found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
+            )
+
+    def locate_with_priors(
+        self,
+        members: IntArray,
+        averaging: AveragedRotations,
+        relative: RelativeRotations,
+        priors: PositionPriors | None,
+    ) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
-        priors = None if self.priors is None else self.priors.of(members)
-        if priors is not None and len(priors) < FEWEST_PRIORS:
-            priors = None
         control = None if self.control is None else self.control.of(members)
         gravity = None if self.gravity is None else self.gravity.among(members)
         options = self._options_of(members, has_priors=priors is not None)
@@ -356,9 +372,7 @@ class _Run(NamedTuple):
         inputs = self.inputs_of(model)
         if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
             _, among = pairs_among(relative, members)
-            false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
-            names = {tuple(sorted((model.names[i], model.names[j]))) for i, j in false}
-            inputs = replace(inputs, left_out=inputs.left_out | names)
+            inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
@@ -443,6 +457,13 @@ class _Run(NamedTuple):
 def _has_shared_frames(frames: IntArray) -> bool:
     """Return whether several images (n,) are of one frame, whose rig then knows a scale."""
     return len(np.unique(frames)) < len(frames)
+
+
+def _false_pairs(model: PosedModel, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:
+    """Return the pairs of a model's images that its averaged rotations contradict, by name."""
+    false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
+    names = ((model.names[i], model.names[j]) for i, j in false)
+    return frozenset((min(pair), max(pair)) for pair in names)
 
 
 def _suspicions(averaging: AveragedRotations) -> Iterator[str]:

@@ -41,6 +41,10 @@ _KERNEL_WIDTH = 3.0
 _REWEIGHTINGS = 20
 
 
+class UselessPriorsError(InputError):
+    """Position priors cannot set scale and origin of the cameras that were found."""
+
+
 class Datum(NamedTuple):
     """A point on Earth: the origin of axes east, north and up, in meters."""
 
@@ -235,17 +239,18 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
             is turned onto that line, and about it by any angle.
 
     Raises:
-        InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
+        UselessPriorsError: if fewer than two cameras have one, or the priors coincide or contradict the
+            answer.
     """
     if len(priors) < FEWEST_PRIORS:
-        raise InputError(
+        raise UselessPriorsError(
             f"{len(priors)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
         )
     source, target = locations[priors.known.indices], priors.known.positions
     size = median_spread(target)
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
-        raise InputError("the position priors coincide, so they set no scale; choose another scale")
+        raise UselessPriorsError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
     found, weights, level = fit_to_priors(source, priors, size, rotate=turns)
     across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
@@ -255,7 +260,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
     if not turns and not axes_known:
         found, weights, level = fit_to_priors(source, priors, size, rotate=True)
     if found.scale <= 0.0:
-        raise InputError(
+        raise UselessPriorsError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
     return Gauge(

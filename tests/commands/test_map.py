@@ -109,6 +109,23 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
     assert scales == {True: "unit", False: "prior"}
 
 
+def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
+    # The receiver of the first four said the same place all the time.
+    positions = np.where(np.arange(8)[:, None] < 4, truth.centers[0], truth.centers)
+    table = tmp_path / "priors.txt"
+    rows = zip(truth.names, positions, strict=True)
+    table.write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
+    path = changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}")
+    found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
+    scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
+    assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
+    said = "the scale is not that of position priors: the position priors coincide"
+    assert any(warning.startswith(said) for warning in scales[True].warnings)
+
+
 def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
     database = RING / "database.db"
     arguments = ["map", database, tmp_path / "out", "--bundle-adjust", "--points", "never", "--json"]
