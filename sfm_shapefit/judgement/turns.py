@@ -78,6 +78,8 @@ RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
 """Shares s from which a camera is right, and below which it is turned."""
 # Turns of a body that are compared with one another; those of most weight.
 _MOST_VOTES = 300
+# Bodies that are turned, one after the other: each time all others are looked at again. What is left is
+# judged as it stands, and by all pairs together.
 _MOST_TURNED = 50
 _AVERAGING_STEPS = 4
 # Standard deviations from which a correction is no chance, however few and inexact the pairs are.
@@ -212,55 +214,21 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
         pairs: between cameras.
         labels: (n,) the rigid group, such as the frame, of each camera; cameras of a group turn as one.
     """
-    group, count = labels, int(labels.max(initial=-1)) + 1
-    ends = group[pairs.pairs]
+    count = int(labels.max(initial=-1)) + 1
+    ends = labels[pairs.pairs]
     kept = ends[:, 0] != ends[:, 1]
     case = pairs.subset(kept)._replace(pairs=ends[kept])
     level = _level(case)
     inflation = max(1.0, level)
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
-    touching = _Touching.of(case.pairs, count)
-    judged = [_Judged() for _ in range(count)]
-    body_of = np.arange(count)
-    done: BoolArray = np.zeros(count, dtype=np.bool_)
-    for _ in range(_MOST_TURNED):
-        bodies = _find_bodies(case, count)
-        worst = _worst_body(case, touching, bodies, done, least_rad)
-        if worst is None:
-            break
-        body, found = worst
-        members = np.flatnonzero(body)
-        for member in members.tolist():
-            judged[member] = found
-        body_of[members] = members[0]
-        done |= body
-        case = _mend(case, body, found.turn)
-    bodies = _find_bodies(case, count)
-    largest = bodies == 0
-    for label in range(int(bodies.max(initial=-1)) + 1):
-        inside = (bodies == label) & ~done
-        together = np.flatnonzero(inside)
-        for members in together[:, None] if label == 0 else [together]:
-            if len(members) == 0:
-                continue
-            part = np.isin(np.arange(count), members)
-            found = _judge(case.subset(touching.rows_of(members)), part, largest & ~part, least_rad)
-            for member in members.tolist():
-                judged[member] = found
-            body_of[members] = members[0]
-    for member, found in _judge_by_all_pairs(case, count, level, least_rad).items():
-        if judged[member].kind is not Doubt.TURNED:
-            judged[member], body_of[member] = found, member
-    return Doubts(
-        kinds=tuple(judged[g].kind for g in group.tolist()),
-        placed=np.array([judged[g].placed for g in group.tolist()]),
-        turned=np.array([judged[g].turned for g in group.tolist()]),
-        num_turned=np.array([judged[g].num_turned for g in group.tolist()], dtype=np.int64),
-        angles_deg=np.array([judged[g].angle_deg for g in group.tolist()]),
-        astray=np.array([judged[g].astray for g in group.tolist()]),
-        bodies=body_of[group],
-    )
+    touching, verdicts = _Touching.of(case.pairs, count), _Verdicts(count)
+    case, done = _turn_bodies(case, touching, verdicts, least_rad)
+    _judge_as_placed(case, touching, done, verdicts, least_rad)
+    for group, found in _judge_by_all_pairs(case, count, level, least_rad).items():
+        if verdicts.judged[group].kind is not Doubt.TURNED:
+            verdicts.note(np.array([group]), found)
+    return verdicts.of_cameras(labels)
 
 
 class _Judged(NamedTuple):
@@ -289,6 +257,33 @@ class _Judged(NamedTuple):
         if self.placed <= 0.0:
             return Doubt.UNSUPPORTED if self.is_alone and self.num_pairs else Doubt.UNKNOWN
         return Doubt.RIGHT if share >= RIGHT_SHARE else Doubt.AMBIGUOUS
+
+
+class _Verdicts:
+    """What is said of each group so far, and the body that it was judged with."""
+
+    def __init__(self, count: int) -> None:
+        self.judged = [_Judged() for _ in range(count)]
+        self.body_of: IntArray = np.arange(count)
+
+    def note(self, members: IntArray, found: _Judged) -> None:
+        """Note what is said of the groups of a body."""
+        for member in members.tolist():
+            self.judged[member] = found
+        self.body_of[members] = members[0]
+
+    def of_cameras(self, labels: IntArray) -> Doubts:
+        """Return what is said of cameras by their groups (n,)."""
+        judged = [self.judged[group] for group in labels.tolist()]
+        return Doubts(
+            kinds=tuple(one.kind for one in judged),
+            placed=np.array([one.placed for one in judged]),
+            turned=np.array([one.turned for one in judged]),
+            num_turned=np.array([one.num_turned for one in judged], dtype=np.int64),
+            angles_deg=np.array([one.angle_deg for one in judged]),
+            astray=np.array([one.astray for one in judged]),
+            bodies=self.body_of[labels],
+        )
 
 
 class _Touching(NamedTuple):
@@ -337,6 +332,39 @@ def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
     """Return the body of each of the groups, (count,); 0 is the largest."""
     signed = np.where(_contradicts(pairs), pairs.placed - 1.0, pairs.placed)
     return find_bodies(count, pairs.pairs, pairs.weights * signed)
+
+
+def _turn_bodies(
+    case: PairTurns, touching: _Touching, verdicts: _Verdicts, least_rad: float
+) -> tuple[PairTurns, BoolArray]:
+    """Turn one body after the other, the worst first; return the pairs as mended, and which groups turned."""
+    count = len(verdicts.judged)
+    done: BoolArray = np.zeros(count, dtype=np.bool_)
+    for _ in range(_MOST_TURNED):
+        worst = _worst_body(case, touching, _find_bodies(case, count), done, least_rad)
+        if worst is None:
+            break
+        body, found = worst
+        verdicts.note(np.flatnonzero(body), found)
+        done |= body
+        case = _mend(case, body, found.turn)
+    return case, done
+
+
+def _judge_as_placed(
+    case: PairTurns, touching: _Touching, done: BoolArray, verdicts: _Verdicts, least_rad: float
+) -> None:
+    """Judge the groups that were not turned: those of the largest body alone, others with their bodies."""
+    bodies = _find_bodies(case, len(done))
+    largest = bodies == 0
+    for label in range(int(bodies.max(initial=-1)) + 1):
+        together = np.flatnonzero((bodies == label) & ~done)
+        for members in together[:, None] if label == 0 else [together]:
+            if len(members) == 0:
+                continue
+            part = np.isin(np.arange(len(done)), members)
+            own = case.subset(touching.rows_of(members))
+            verdicts.note(members, _judge(own, part, largest & ~part, least_rad))
 
 
 def _worst_body(
