@@ -29,7 +29,8 @@ from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.viewgraph import connected_components
 
-_LAST_NUMBER = re.compile(r"^(.*?)(\d+)(\D*)$", re.DOTALL)
+# Of so many digits at most, as Python reads no integer of more than 4,300.
+_LAST_NUMBER = re.compile(r"^(.*?)(\d{1,255})(\D*)$", re.DOTALL)
 # Fewer images with running numbers are no video.
 _FEWEST_FRAMES = 10
 # Of successive frames, the share that must be matched, and how many times more matches these pairs have than

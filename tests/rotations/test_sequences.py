@@ -49,6 +49,13 @@ def test_names_with_a_running_number_make_videos_in_their_order():
     assert videos.video_of[[0, 11]].tolist() == [-1, -1]
 
 
+def test_numbers_of_any_length_are_read():
+    long = [f"{'7' * 5000}{k:02d}.png" for k in range(10)]
+    assert find_videos(long[::-1]).time_of.tolist() == list(range(9, -1, -1))
+    nanoseconds = [f"{1403636579763555584 + 50_000_000 * k}.png" for k in range(10)]
+    assert find_videos(nanoseconds).time_of.tolist() == list(range(10))
+
+
 def test_photographs_with_numbers_are_no_video_unless_their_matches_say_so():
     given, videos = measured(neighbors() + visit(0, 40)), find_videos(NAMES)
     assert confirm_videos(videos, given).num_frames == FRAMES
