@@ -21,6 +21,9 @@ m_i = A_i^-1 sum_j B_ij x_j with the covariance A_i^-1, where A_i = sum_j B_ij; 
 
 the first part exact, and the second one small in graphs whose factor is large (Siden, Lindgren, Bolin,
 Villani, "Efficient covariance approximations for large sparse precision matrices", JCGS 2018).
+
+Relative to the mean turn of some cameras only, P is I - 1 u^T with their shares u of it, the samples are
+shifted to u^T x = 0, and 1/n is u_i.
 """
 
 from typing import Any
@@ -44,11 +47,23 @@ _REDUCTION = 1e-2
 _SEED = 2
 
 
-def estimate_sigmas(given: AveragingPairs, system: AveragingSystem, last: Linearized) -> FloatArray:
-    """Return each camera's standard deviation per axis in radians, (n,), relative to the mean of all.
+def estimate_sigmas(
+    given: AveragingPairs,
+    system: AveragingSystem,
+    last: Linearized,
+    references: BoolArray | None = None,
+) -> FloatArray:
+    """Return each camera's standard deviation per axis in radians, (n,), relative to the mean of some or all.
 
     Infinite for cameras that the pairs of the last system do not tie to the largest part of the others.
+
+    Args:
+        given: the pairs of n cameras.
+        system: of these.
+        last: at the answer.
+        references: (n,) whose mean turn counts as exact; all if None.
     """
+    references = np.ones(given.num_cameras, dtype=np.bool_) if references is None else references
     n, inside = given.num_cameras, _ties(given.num_cameras, last)
     sigmas = np.full(n, np.inf)
     labels = connected_components(n, given.pairs[inside])
@@ -62,7 +77,8 @@ def estimate_sigmas(given: AveragingPairs, system: AveragingSystem, last: Linear
         last = Linearized(np.ascontiguousarray(last.blocks[kept]), last.distances[kept])
         weights = np.trace(last.blocks, axis1=1, axis2=2)
         system = plan_system(int(main.sum()), pairs, weights, system.threads)
-    variances, leverages = _factored(system, last) if system.factors_blocks else _sampled(system, last)
+    estimate = _factored if system.factors_blocks else _sampled
+    variances, leverages = estimate(system, last, references[main])
     sigmas[main] = np.sqrt(_LOSS_FACTOR * residual_variance(last.distances, leverages) * variances)
     return sigmas
 
@@ -86,20 +102,25 @@ def residual_variance(distances: FloatArray, leverages: FloatArray) -> float:
     return float(np.median(distances[asked] ** 2 / (1.0 - leverages[asked]))) / _MEDIAN_SQUARE
 
 
-def _factored(system: AveragingSystem, last: Linearized) -> tuple[FloatArray, FloatArray]:
+def _factored(
+    system: AveragingSystem, last: Linearized, references: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Return a third of the trace of P L^+ P at each camera, (n,), and the leverage of each pair, (k,)."""
     factor = system.ground_blocks(last.blocks)
     inverse = selected_inverse(factor, system.pairs)
     i, j = system.pairs.T
     difference = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
     leverages = np.einsum("kab,kab->k", last.blocks, difference) / 3.0
-    n = system.num_nodes
-    means = factor.solve(np.tile(np.eye(3) / n, (n, 1, 1)))
-    covariances = inverse.nodes - means - means.transpose(0, 2, 1) + means.mean(axis=0)
+    shares = np.zeros((system.num_nodes, 3, 3))
+    shares[references] = np.eye(3) / references.sum()
+    means = factor.solve(shares)
+    covariances = inverse.nodes - means - means.transpose(0, 2, 1) + means[references].mean(axis=0)
     return np.trace(covariances, axis1=1, axis2=2) / 3.0, leverages
 
 
-def _sampled(system: AveragingSystem, last: Linearized) -> tuple[FloatArray, FloatArray]:
+def _sampled(
+    system: AveragingSystem, last: Linearized, references: BoolArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the same from samples; the leverages are their mean."""
     n, k = system.num_nodes, len(system.pairs)
     rng = np.random.default_rng(_SEED)
@@ -107,14 +128,16 @@ def _sampled(system: AveragingSystem, last: Linearized) -> tuple[FloatArray, Flo
     sum_blocks(system.pairs, last.blocks, diagonal)
     own = np.linalg.inv(diagonal)
     apply = system.block_operator(last.blocks)
+    share = references / references.sum()
     total, right = np.zeros(n), np.empty((n, 3))
     for _ in range(_SAMPLES):
         draw_right_side(system.pairs, last.blocks, rng.normal(size=(k, 3)), right)
         x = system.solve_blocks(last.blocks, right, _REDUCTION)
+        x = x - x[references].mean(axis=0)
         # A m = A x - L x.
         around = x - np.einsum("nab,nb->na", own, apply(x))
-        total += np.sum(((1.0 - 1.0 / n) * around + x / n) ** 2, axis=1)
-    exact = (1.0 - 1.0 / n) ** 2 * np.trace(own, axis1=1, axis2=2)
+        total += np.sum(((1.0 - share)[:, None] * around + share[:, None] * x) ** 2, axis=1)
+    exact = (1.0 - share) ** 2 * np.trace(own, axis1=1, axis2=2)
     return (exact + total / _SAMPLES) / 3.0, np.full(k, (n - 1) / np.sum(~np.isnan(last.distances)))
 
 

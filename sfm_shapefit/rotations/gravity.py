@@ -134,7 +134,7 @@ def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gr
     rotations, sigmas = averaged.rotations.copy(), averaged.sigmas_deg.copy()
     to_world = Rotation.from_quat(found.turns[:-1]) * Rotation.from_quat(found.turns[-1]).inv()
     rotations[members] = to_world.as_matrix()
-    sigmas[members] = np.degrees(estimate_sigmas(found.graph, found.system, found.last))[:-1]
+    sigmas[members] = np.degrees(_sigmas_of_cameras(found))
     return replace(averaged, rotations=rotations, sigmas_deg=sigmas, certified=None)
 
 
@@ -146,6 +146,19 @@ class _Refined(NamedTuple):
     last: Linearized
     graph: AveragingPairs
     system: AveragingSystem
+
+
+def _sigmas_of_cameras(found: "_Refined") -> FloatArray:
+    """Return the standard deviations of the cameras per axis, in radians, (n,), relative to their mean turn.
+
+    The world has no part in that mean: how it is turned about gravity nothing says. It becomes the first
+    node, since the system is grounded at the last one, and all is known relative to a camera.
+    """
+    n = found.graph.num_cameras
+    pairs = np.ascontiguousarray(np.sort((found.graph.pairs + 1) % n, axis=1))
+    system = plan_system(n, pairs, np.sqrt(found.graph.supports), found.system.threads)
+    is_camera = np.arange(n) > 0
+    return estimate_sigmas(replace(found.graph, pairs=pairs), system, found.last, is_camera)[1:]
 
 
 def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Refined:

@@ -71,6 +71,17 @@ def test_gravities_of_which_none_is_near_their_middle_are_followed():
     assert np.isfinite(found.rotations).all()
 
 
+def test_standard_deviations_are_relative_to_the_cameras_and_not_to_the_world_whose_heading_is_free():
+    problem, gravity, _ = drifting_chain(12)
+    without = average_relative_rotations(12, problem.relative)
+    found = refine_with_gravity(without, problem.relative, gravity)
+    off = Rotation.from_matrix(found.rotations.transpose(0, 2, 1) @ problem.rotations)
+    errors = np.degrees((off * off.mean().inv()).as_rotvec())
+    ratio = np.sqrt(np.mean((errors / found.sigmas_deg[:, None]) ** 2))
+    # Of errors of few cameras that neighbors share. With the world in the mean it was 0.26.
+    assert 0.4 < ratio < 2.5
+
+
 def test_one_gravity_says_too_little():
     problem, gravity, _ = drifting_chain(12)
     without = average_relative_rotations(12, problem.relative)
