@@ -17,6 +17,8 @@ from sfm_shapefit.formats.lines import is_number, lines_of_cells
 from sfm_shapefit.rotations.gravity import Gravity
 
 _SIGMA_DEG = 1.0
+# No instrument is as exact, and beside a gravity that is, the pairs' share of the system drowns in rounding.
+_LEAST_SIGMA_DEG = 1e-3
 _LARGEST = 1e30
 _FORM = "the name of an image, three components of its gravity and at most a standard deviation in degrees"
 
@@ -39,10 +41,10 @@ def table_gravity(path: Path, model: PosedModel) -> Gravity:
             raise InputError(f"{where}expected {_FORM}")
         values = [float(cell) for cell in cells[1:]]
         length, sigma = float(np.linalg.norm(values[:3])), [*values, _SIGMA_DEG][3]
-        if not 1.0 / _LARGEST <= length <= _LARGEST or not 0.0 < sigma < 90.0:
+        if not 1.0 / _LARGEST <= length <= _LARGEST or not _LEAST_SIGMA_DEG <= sigma < 90.0:
             raise InputError(
-                f"{where}the direction must be finite and not zero, the standard deviation between 0 and 90 "
-                "deg"
+                f"{where}the direction must be finite and not zero, the standard deviation between "
+                f"{_LEAST_SIGMA_DEG:g} and 90 deg"
             )
         if cells[0] in rows:
             raise InputError(f"{where}{cells[0]} stands twice; keep one of its gravities")
