@@ -570,7 +570,7 @@ def test_too_few_iterations_and_no_points_are_told(monkeypatch):
     assert adjusted.iterations == 3
     seed, matches = seeded(original, np.zeros((NUM_IMAGES, 3)))
     for adjuster in ("own", "ceres"):
-        with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
+        with pytest.raises(UnsolvableError, match="run with --no-adjust and without --bundle-adjust"):
             bundle_adjust(seed, matches, adjuster=adjuster)
 
 
