@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import signal
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -12,6 +13,7 @@ import pytest
 
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras, read_model
+from sfm_shapefit.commands.stages import execution
 from sfm_shapefit.commands.stages.execution import (
     PairTask,
     PairWork,
@@ -26,6 +28,7 @@ from sfm_shapefit.directions.pair_directions import concatenate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.program import run_python
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +158,41 @@ def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, mon
         found, _ = shared(workspace, model, pool)
     assert flag.exists()
     assert_same_bits(found, serial(workspace, model))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+def test_an_interrupt_of_all_processes_is_the_business_of_the_first_one(kind):
+    if kind == "dask":
+        pytest.importorskip("distributed")
+    script = """
+import os, signal, sys, time
+os.setsid()
+from sfm_shapefit.commands.stages.execution import open_executor
+try:
+    with open_executor(sys.argv[1], 2) as pool:
+        list(pool.map(abs, range(20)))  # all workers are there, and wait
+        os.killpg(os.getpgrp(), signal.SIGINT)  # as a terminal does
+        time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    done = run_python("-c", script, kind)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
+    done = []
+
+    def open_cluster():
+        with execution._interrupts_wait():
+            signal.raise_signal(signal.SIGINT)
+            done.append(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        open_cluster()
+    assert done == [1]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_scheduler_without_dask_is_refused():

@@ -12,11 +12,13 @@ task to another one.
 """
 
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -117,11 +119,51 @@ def open_executor(
         yield None
     elif kind == "processes":
         # Processes are spawned, because forking clashes with threads.
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        with _Pool(workers, mp_context=get_context("spawn")) as pool:
             yield pool
     else:
         with _dask_client(workers, scheduler) as client:
             yield client.get_executor(retries=_RETRIES)
+
+
+class _Pool(ProcessPoolExecutor):
+    """A pool whose processes leave interrupts to this one."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit a task, for which a process may have to be started."""
+        with _children_are_not_interrupted():
+            return super().submit(fn, *args, **kwargs)
+
+
+@contextmanager
+def _children_are_not_interrupted() -> Iterator[None]:
+    """Start threads and processes in which SIGINT is blocked.
+
+    A terminal interrupts all processes of a command at once. The first one ends the others; what these had to
+    say of it would be tracebacks.
+    """
+    resource_tracker.ensure_running()  # whose start would end the blocking
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Let an interrupt come at the end of the block; a cluster that is half open cannot be closed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -132,10 +174,10 @@ def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
     except ModuleNotFoundError:
         raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
     if scheduler is None:
-        with (
-            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
-            Client(cluster) as client,
-        ):
+        with ExitStack() as opened:
+            with _interrupts_wait(), _children_are_not_interrupted():
+                local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+                client = opened.enter_context(Client(opened.enter_context(local)))
             yield client
         return
     try:
