@@ -37,8 +37,14 @@ def describe_doubtful_pairs(count: int) -> str:
     if not count:
         return ""
     if count == 1:
-        return "1 pair in use looks like repeated structure; --without doubtful_pairs.csv leaves it out"
-    return f"{count} pairs in use look like repeated structure; --without doubtful_pairs.csv leaves them out"
+        return (
+            "1 pair in use looks like repeated structure, though no position contradicts it; --without "
+            "doubtful_pairs.csv leaves it out"
+        )
+    return (
+        f"{count} pairs in use look like repeated structure, though no position contradicts them; --without "
+        "doubtful_pairs.csv leaves them out"
+    )
 
 
 def describe_repeated_pairs(count: int) -> str:
