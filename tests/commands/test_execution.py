@@ -195,6 +195,14 @@ def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.slow
+def test_a_second_cluster_on_a_machine_opens_without_a_word(recwarn):
+    pytest.importorskip("distributed")
+    with open_executor("dask", 1) as first, open_executor("dask", 1) as second:
+        assert [pool.submit(abs, -2).result() for pool in (first, second)] == [2, 2]
+    assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
+
+
 def test_a_scheduler_without_dask_is_refused():
     with pytest.raises(InputError, match="belongs to the executor dask"), open_executor("serial", 1, "a:1"):
         pass

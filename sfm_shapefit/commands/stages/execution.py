@@ -176,7 +176,8 @@ def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         with ExitStack() as opened:
             with _interrupts_wait(), _children_are_not_interrupted():
-                local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+                # The port of the dashboard is taken where another run has a cluster.
+                local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
                 client = opened.enter_context(Client(opened.enter_context(local)))
             yield client
         return
