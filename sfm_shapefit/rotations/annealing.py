@@ -52,7 +52,9 @@ _CLOSING_SCALE = np.radians(AGREEMENT_DEG)
 _PAIRS_PER_SLICE = 200_000
 # Predictions of a camera's rotation within about this angle vote for each other.
 _VOTING_SCALE = np.radians(10.0)
+# A camera moves only for so much more votes: by less, two could move for one another for ever.
 _MARGIN = 0.05
+# A move can make a neighbor move; whoever is still wrong after these has annealing to come.
 _SWEEPS = 5
 SETTLED = 1e-7
 """Steps shorter than this, in radians, end the rounds."""

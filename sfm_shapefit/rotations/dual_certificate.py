@@ -48,6 +48,7 @@ _MOST_FLOPS = 3e11
 _POLISHING_STEPS = 30
 _SETTLED = 1e-10
 _REDUCTION = 1e-3
+# Restarts of Lanczos' method; who has not settled by then is not certified, which is safe.
 _LANCZOS_STEPS = 300
 _SEED = 3
 

@@ -42,6 +42,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 _VOTING = np.radians(10.0)
 # A gravity that is farther off has no part.
 _LIMIT = np.radians(45.0)
+# Rounds end when cameras have settled; each leaves about half of the way, so these are enough for rounding.
 _ROUNDS = 60
 # Share of the information about the axis of gravity, which it says nothing of, that keeps blocks definite.
 _ABOUT_DOWN = 1e-9
