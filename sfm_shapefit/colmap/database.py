@@ -24,8 +24,14 @@ from sfm_shapefit.colmap.database_pairs import (
     read_pairs,
 )
 from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, same_intrinsics, world_rays
-from sfm_shapefit.colmap.sorted_matches import MOST_MATCHES, SortedMatches, UInt32Array
-from sfm_shapefit.colmap.sqlite_file import columns_of, is_blob, readonly_connection, sqlite_errors
+from sfm_shapefit.colmap.sorted_matches import MOST_BESIDE_TRACKS, MOST_MATCHES, SortedMatches, UInt32Array
+from sfm_shapefit.colmap.sqlite_file import (
+    columns_of,
+    is_blob,
+    readonly_connection,
+    readonly_rows,
+    sqlite_errors,
+)
 from sfm_shapefit.directions.matches import KeypointMatches, MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.pair_list import PairNames
@@ -58,6 +64,16 @@ def find_database(model_folder: Path) -> Path | None:
         if os.path.isfile(path):  # False, not an error, where the folder may not be read
             return path
     return None
+
+
+def images_with_keypoints(path: Path) -> set[str]:
+    """Return the names of the images of a database that have keypoints.
+
+    Raises:
+        InputError: if it is no COLMAP database, or cannot be read.
+    """
+    query = "SELECT name FROM images JOIN keypoints USING (image_id) WHERE rows > 0"
+    return {name for (name,) in readonly_rows(path, "keypoints", {("image_id", "rows"): query})}
 
 
 @contextmanager
@@ -151,6 +167,11 @@ class MatchDatabase:
     def forget_matches(self) -> None:
         """Give back the memory of all matches; from now on they are read each time they are needed."""
         self._sorted, self._kept = None, {}
+
+    def clear_matches(self) -> None:
+        """Give back the memory of the matches, if they are many, until they are needed again."""
+        if self._sorted is not None and self.num_matches > MOST_BESIDE_TRACKS:
+            self._sorted.clear()
 
     def turned(self, model: PosedModel) -> "MatchDatabase":
         """Return the same matches for a model of the same images, in the same order, with other rotations.

@@ -84,6 +84,16 @@ def copy_without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Rec
     return copy
 
 
+def copy_without_keypoints(
+    reconstruction: pycolmap.Reconstruction, image_ids: Collection[int]
+) -> pycolmap.Reconstruction:
+    """Return a copy without 3D points, and without the points2D of some images, by their ids."""
+    copy = copy_without_points(reconstruction)
+    for image_id in image_ids:
+        copy.image(image_id).points2D.clear()
+    return pycolmap.Reconstruction(copy)  # a list that is cleared keeps its memory, its copy does not
+
+
 def turn_model(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
     """Return the model turned about the origin: cameras and points, x -> axes x."""
     copy = pycolmap.Reconstruction(reconstruction)

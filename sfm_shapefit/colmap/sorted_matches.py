@@ -19,6 +19,10 @@ MATCH_BYTES = 8
 MOST_MATCHES = 64_000_000
 """Of a database with more, in 0.5 GB, none is kept: all are read from the file each time."""
 
+MOST_BESIDE_TRACKS = 16_000_000
+"""Of a database with more, none is kept while points are made of them: to read 30 million again takes a
+twentieth of the time of a run, and to keep them an eighth of its memory."""
+
 
 class SortedMatches:
     """The matches of the pairs of a database as far as they were read, by the rows that hold them."""
@@ -35,8 +39,13 @@ class SortedMatches:
         self._rowids, self._swapped = rowids[order], swapped[order]
         ends = np.cumsum(counts)
         self._starts = (ends - counts)[order]
-        self._lengths = np.full(len(rowids), -1)
-        self._keypoints = np.empty((int(ends[-1]) if len(ends) else 0, 2), dtype=np.uint32)
+        self._size = int(ends[-1]) if len(ends) else 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Give back the memory of the matches until they are read again."""
+        self._lengths = np.full(len(self._rowids), -1)
+        self._keypoints = np.empty((self._size, 2), dtype=np.uint32)
 
     def places(self, rowids: IntArray, swapped: BoolArray) -> IntArray:
         """Return the places (m,) of pairs by their rows, -1 for a pair that is not here in that order."""

@@ -44,6 +44,7 @@ from sfm_shapefit.colmap.structure import Advance, filter_in_place
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.colmap.tracks import TrackSource
 from sfm_shapefit.executors import answers
+from sfm_shapefit.heap import hand_back_memory
 
 # Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
 _TRACKS_A_BLOCK = 20_000
@@ -63,8 +64,6 @@ def triangulate(
     options: StructureOptions | None = None,
     advance: Advance | None = None,
     executor: Executor | None = None,
-    *,
-    in_place: bool = False,
 ) -> pycolmap.Reconstruction:
     """Return a copy of `seed` whose 3D points are triangulated at its poses; old points are dropped.
 
@@ -74,7 +73,6 @@ def triangulate(
         options: filters; the defaults if None.
         advance: called with the images, or tracks, that are done and their number.
         executor: shares out the tracks among its workers, with the same answer to the bit.
-        in_place: return `seed` itself, which must be without points: a copy of a large model takes gigabytes.
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
@@ -84,14 +82,27 @@ def triangulate(
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
-    structure = seed if in_place else copy_without_points(seed)
+    structure, options = copy_without_points(seed), options or StructureOptions()
+    triangulate_in_place(structure, tracks, options, advance or (lambda _done, _total: None), executor)
+    filter_in_place(structure, options)
+    return structure
+
+
+def triangulate_in_place(
+    structure: pycolmap.Reconstruction,
+    tracks: TrackSource,
+    options: StructureOptions,
+    advance: Advance,
+    executor: Executor | None = None,
+) -> None:
+    """Add points to a model of our own that has none, as `triangulate` does, and filter none of them.
+
+    A copy of a large model takes gigabytes, and so do the tracks, which the filter does not need any more.
+    """
     if isinstance(tracks, MatchedKeypoints):
         _triangulate_matches(structure, tracks, options, advance, executor)
     else:
         _triangulate_tracks(structure, tracks, options, advance, executor)
-    filter_in_place(structure, options)
-    return structure
 
 
 def _triangulate_matches(
@@ -118,6 +129,7 @@ def _triangulate_matches(
     is_left = np.ones(len(partners), dtype=np.bool_)
     for share in _JOINING_SHARES:
         matched, partners = matched.among(is_left), partners[is_left]
+        hand_back_memory()  # before the rays of all keypoints take some
         joined = matched.join_rows(poses, share * limits.max_error_px)
         if share < max(_JOINING_SHARES):  # two keypoints may find a third one in the next joining
             sizes = np.diff(joined.offsets)

@@ -19,6 +19,7 @@ from sfm_shapefit.colmap.adjusted import AdjustedPlacement, Uncertainty
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.free_sensors import NO_SENSORS, SensorSigma
 from sfm_shapefit.colmap.model import PosedModel, read_model, sensors_of
+from sfm_shapefit.colmap.point_colors import PointColors
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
     pull_cameras,
@@ -31,7 +32,13 @@ from sfm_shapefit.commands.stages.control_points import bring_to_control_points,
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.gravity import turn_model_upright
-from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
+from sfm_shapefit.commands.stages.inputs import (
+    MatchSource,
+    choose_inputs,
+    open_source,
+    read_left_out,
+    without_structure,
+)
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
@@ -124,8 +131,11 @@ def locate(
         priors_known = read_priors(model, inputs, options, priors)
         control = read_control(model, options)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
+        model, colors = without_structure(model, inputs)
     with open_source(model, inputs, options) as opened:
-        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control)
+        known = Locating(
+            inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control, colors=colors
+        )
         return locate_source(opened, known, options, clock)
 
 
@@ -151,6 +161,8 @@ class Locating(NamedTuple):
     """Ground control points of the images."""
     gravity: Gravity | None = None
     """Of the images, which turns the model upright."""
+    colors: PointColors | None = None
+    """Of the points that the input had; none if None."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -176,10 +188,10 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement = judge(located.placement)
         located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
-        further = place_further_pieces(source, placement, options, judge)
+        further = place_further_pieces(source, placement, options, judge, known.colors)
     placement = placement.without_error_samples()  # all is placed
     located = located._replace(placement=placement)
-    seeded = build_seeded_model(source, located, options, clock, known.executor)
+    seeded = build_seeded_model(source, located, options, clock, known.colors, known.executor)
     seeded, control_points, of_control = bring_to_control_points(seeded, source.model, known.control, options)
     seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:

@@ -918,3 +918,25 @@ def test_matches_that_are_forgotten_are_read_again(path, model):
         (again,) = database.iter_matches(1)
     np.testing.assert_array_equal(again.keypoints, whole.keypoints)
     np.testing.assert_array_equal(again.rays_i, whole.rays_i)
+
+
+def test_many_matches_are_cleared_and_read_again_for_all_that_share_them_and_few_are_kept(
+    path, model, monkeypatch
+):
+    with open_database(path, model) as database:
+        other = database.turned(model)
+        (whole,) = database.iter_keypoints(1)
+        reads, read = [], type(database)._read_matches
+        monkeypatch.setattr(type(database), "_read_matches", lambda *a: reads.append(a) or read(*a))
+        database.clear_matches()
+        next(database.iter_keypoints(1))
+        assert not reads
+        monkeypatch.setattr("sfm_shapefit.colmap.database.MOST_BESIDE_TRACKS", database.num_matches - 1)
+        before = whole.keypoints.copy()
+        database.clear_matches()
+        np.testing.assert_array_equal(whole.keypoints, before)  # what was yielded stays
+        (again,), (shared,) = database.iter_keypoints(1), other.iter_keypoints(1)
+        assert len(reads) == 1
+    for found in (again, shared):
+        np.testing.assert_array_equal(found.keypoints, before)
+        np.testing.assert_array_equal(found.offsets, whole.offsets)

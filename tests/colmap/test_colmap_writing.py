@@ -19,12 +19,13 @@ from sfm_shapefit.colmap.adjustment import lens_of
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.point_colors import color_points, read_colors
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import color_points, filter_points
+from sfm_shapefit.colmap.structure import filter_in_place, filter_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.colmap.tracks import collect_matches
-from sfm_shapefit.colmap.triangulation import triangulate
+from sfm_shapefit.colmap.triangulation import triangulate, triangulate_in_place
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
@@ -155,7 +156,7 @@ def test_the_input_of_every_stage_stays_as_it_was():
     for tracks in (matches, original):
         structure = triangulate(seed, tracks)
         structure_before = dump(structure)
-        color_points(structure, original)
+        color_points(structure, read_colors(original))
         filter_points(structure, StructureOptions(max_reprojection_error_px=0.1))
         assert dump(structure) == structure_before
         bundle_adjust(seed, tracks)
@@ -208,7 +209,7 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
 @SOURCES
 def test_exact_data_give_every_point_back_with_its_color(source):
     original, points = ring_model()
-    structure = color_points(triangulate(*seeded_with(source, original)), original)
+    structure = color_points(triangulate(*seeded_with(source, original)), read_colors(original))
     assert structure.num_points3D() == len(points)
     for point in structure.points3D.values():
         truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
@@ -268,15 +269,19 @@ def test_tracks_of_matches_shared_out_to_workers_give_the_same_bits(monkeypatch)
 
 @SOURCES
 def test_the_same_gives_the_same_bits_again_and_in_place(source):
+    options = StructureOptions()
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)
 
     def run(in_place=False):
         seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
         adjusted = dump(bundle_adjust(seed, tracks).reconstruction)
-        structure = triangulate(seed, tracks, in_place=in_place)
-        assert (structure is seed) == in_place == (seed.num_points3D() > 0)
-        return dump(color_points(structure, original)), adjusted
+        if in_place:
+            triangulate_in_place(seed, tracks, options, lambda *_done: None)
+            filter_in_place(seed, options)
+        structure = seed if in_place else triangulate(seed, tracks, options)
+        assert in_place == (seed.num_points3D() > 0)
+        return dump(color_points(structure, read_colors(original))), adjusted
 
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
@@ -418,9 +423,9 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
     seed, matches = seeded(original)
     black = triangulate(seed, matches)
-    structure = color_points(black, original)
+    structure = color_points(black, read_colors(original))
     assert not any(point.color.any() for point in black.points3D.values())
-    assert color_points(black, original, in_place=True) is black
+    assert color_points(black, read_colors(original), in_place=True) is black
     assert all((p.color == structure.point3D(k).color).all() for k, p in black.points3D.items())
     assert structure.num_points3D() == 120
     for point in structure.points3D.values():
@@ -433,12 +438,12 @@ def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_the
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
         seed_and_matches = seeded(original, keypoints={k: moved[k] for k in changed})
-        structure = color_points(triangulate(*seed_and_matches), original)
+        structure = color_points(triangulate(*seed_and_matches), read_colors(original))
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
     for point in original.points3D.values():
         point.color = np.zeros(3, dtype=np.uint8)
-    assert color_points(structure, original) is structure  # which costs no copy
+    assert color_points(structure, read_colors(original)) is structure  # which costs no copy
     assert all(point.color.any() for point in structure.points3D.values())
 
 
@@ -631,7 +636,7 @@ def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
     placed = np.arange(NUM_IMAGES) != unplaced
     seed, matches = seeded(original, ring_centers() + 0.01, placed)
     with atomic_folder(tmp_path / "out") as partial:
-        write_model(color_points(triangulate(seed, matches), original), partial)
+        write_model(color_points(triangulate(seed, matches), read_colors(original)), partial)
     (tmp_path / "adjusted").mkdir()
 
     analysis = colmap("model_analyzer", "--path", tmp_path / "out")

@@ -12,6 +12,7 @@ import sfm_shapefit
 from scripts.make_data import SCENES  # the one place that knows how a bundled scene was made
 from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.check import check_model_files
+from sfm_shapefit.colmap.model import points2d_xy
 from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
@@ -97,6 +98,21 @@ def test_tracks_serve_where_there_is_no_database_and_points_keep_their_colors():
     truth = pycolmap.Reconstruction(FACADE / "sparse" / "0")
     for point_id, point in found.reconstruction.points3D.items():
         np.testing.assert_array_equal(point.color, truth.point3D(point_id).color)
+
+
+def test_points_of_a_databases_matches_have_the_colors_of_the_inputs_points():
+    truth = pycolmap.Reconstruction(RING / "sparse" / "0")
+    for point_id, point in truth.points3D.items():
+        point.color = np.array([point_id % 200 + 1, 7, 99], dtype=np.uint8)
+    for image in truth.images.values():
+        for point2D in image.points2D:
+            point2D.xy = point2D.xy.astype(np.float32)  # as a database stores them, and a mapper reads them
+    found = sfm_shapefit.locate(truth, RING / "database.db").reconstruction
+    assert found.num_points3D() > 300
+    for point in found.points3D.values():
+        elements = [(e.image_id, e.point2D_idx) for e in point.track.elements]
+        (seen,) = {truth.image(i).point2D(k).point3D_id for i, k in elements}  # matches have no errors
+        np.testing.assert_array_equal(point.color, truth.point3D(seen).color)
 
 
 def test_relative_poses_serve_when_asked_for(tmp_path):
@@ -277,6 +293,7 @@ def test_images_that_are_not_in_the_database_or_have_no_rotation_are_named_and_t
     model.image(3).name = "elsewhere.jpg"
     model.deregister_frame(model.image(5).frame_id)
     poses = {i: image.cam_from_world().matrix() for i, image in model.images.items() if image.has_pose}
+    before = {i: points2d_xy(image) for i, image in model.images.items()}
     num_points = model.num_points3D()
     found = sfm_shapefit.locate(model, RING / "database.db")
     assert any("elsewhere.jpg" in warning for warning in found.warnings)
@@ -285,6 +302,9 @@ def test_images_that_are_not_in_the_database_or_have_no_rotation_are_named_and_t
     assert reasons["elsewhere.jpg"] == "no matches with any posed image"
     assert reasons["0005.jpg"] == "the input has no rotation for it"
     assert model.num_points3D() == num_points
+    for image_id, xy in before.items():
+        np.testing.assert_array_equal(points2d_xy(model.image(image_id)), xy)
+    np.testing.assert_array_equal(points2d_xy(found.reconstruction.image(3)), before[3])  # of no database
     for image_id, matrix in poses.items():
         np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
 

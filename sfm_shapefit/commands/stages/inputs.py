@@ -9,8 +9,15 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
+from sfm_shapefit.colmap.database import (
+    MatchDatabase,
+    find_database,
+    images_with_keypoints,
+    open_database,
+)
 from sfm_shapefit.colmap.model import PosedModel, track_matches
+from sfm_shapefit.colmap.point_colors import PointColors, read_colors
+from sfm_shapefit.colmap.seed import copy_without_keypoints
 from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.directions.matches import KeypointMatches, MatchBatch
 from sfm_shapefit.errors import InputError
@@ -122,6 +129,20 @@ def open_source(
             work = replace(bare, has_points=options.uses_points(model.num_images))
             source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
         yield source
+
+
+def without_structure(model: PosedModel, inputs: Inputs) -> tuple[PosedModel, PointColors | None]:
+    """Return a model without the points and keypoints that its matches make up for, and the points' colors.
+
+    With matches of a database nothing else of the points serves, and its keypoints replace the model's. Of
+    10,000 images both take 0.5 GB, which would be held to the end. Where tracks serve the model stays whole.
+    """
+    if inputs.database is None:
+        return model, None
+    names = images_with_keypoints(inputs.database)
+    replaced = [i for i, name in zip(model.image_ids.tolist(), model.names, strict=True) if name in names]
+    bare = copy_without_keypoints(model.reconstruction, replaced)
+    return replace(model, reconstruction=bare), read_colors(model.reconstruction)
 
 
 def read_left_out(inputs: Inputs, names: Collection[str], options: LocateOptions) -> Inputs:

@@ -1,7 +1,7 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,7 +12,9 @@ from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.adjusted import Adjusted
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
+from sfm_shapefit.colmap.database import MatchDatabase
 from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.colmap.point_colors import PointColors, color_points
 from sfm_shapefit.colmap.point_support import (
     ObservationShares,
     count_observations,
@@ -20,12 +22,13 @@ from sfm_shapefit.colmap.point_support import (
     images_without_support,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
-from sfm_shapefit.colmap.structure import color_points
+from sfm_shapefit.colmap.structure import filter_in_place
 from sfm_shapefit.colmap.tracks import TrackSource, collect_matches
-from sfm_shapefit.colmap.triangulation import triangulate
+from sfm_shapefit.colmap.triangulation import triangulate_in_place
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
+from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.geometry import Similarity
 from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import LocateOptions
@@ -95,12 +98,14 @@ def build_seeded_model(
     located: Located,
     options: LocateOptions,
     clock: Clock,
+    colors: PointColors | None = None,
     executor: Executor | None = None,
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
-    Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
-    executor shares out the tracks that are triangulated where nothing is adjusted.
+    Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. Points
+    from matches take the colors of the input's, if it had any. An executor shares out the tracks that are
+    triangulated where nothing is adjusted.
     """
     adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
@@ -109,7 +114,10 @@ def build_seeded_model(
         tracks = read_tracks(source, located, seed, clock.advance)
     if not options.bundle_adjust:
         with clock("triangulation"):
-            seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
+            triangulate_in_place(seed, tracks, options, clock.advance, executor)
+            del tracks
+            filter_in_place(seed, options)
+            seeded = seed
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
             adjusted = bundle_adjust(
@@ -121,7 +129,7 @@ def build_seeded_model(
                 given=located.given,
             )
             seeded = adjusted.reconstruction
-    del tracks
+            del tracks
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
@@ -134,7 +142,7 @@ def build_seeded_model(
                 seeded.deregister_frame(frame)
         shares = counts.subset(np.isin(counts.image_ids, list(seeded.reg_image_ids()))).shares()
         with clock("colors"):
-            seeded = color_points(seeded, source.model.reconstruction, in_place=True)
+            seeded = seeded if colors is None else color_points(seeded, colors, in_place=True)
     if poor:
         lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
         located = located._replace(kept=located.kept & ~lost)
@@ -193,6 +201,7 @@ def place_further_pieces(
     placement: Placement,
     options: LocateOptions,
     judge: Callable[[Placement], Placement],
+    colors: PointColors | None = None,
 ) -> tuple[FurtherPiece, ...]:
     """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own.
 
@@ -202,7 +211,7 @@ def place_further_pieces(
     for further in map(judge, place_further(placement, options)):
         kept = select_trusted(further, options.min_trust)
         gauge = unit_gauge(further.locations[kept])
-        seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
+        seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock(), colors)
         pieces.append(
             FurtherPiece(
                 placement=further.without_error_samples(),
@@ -240,10 +249,17 @@ def read_tracks(
     if source.database is None:
         return model.reconstruction
     source.database.forget_rays()
+    hand_back_memory()
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
-    counted = source.counted(matches, advance)
+    counted = _clear_after(source.database, source.counted(matches, advance))
     tracks = collect_matches(seed, model.image_ids, counted, source.database.num_matches)
     source.database.forget_rays()  # of matches that are too many to be kept, and were read again
     return tracks
+
+
+def _clear_after(database: MatchDatabase, matches: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
+    """Yield matches, and clear those that the database keeps as soon as all were yielded."""
+    yield from matches
+    database.clear_matches()
