@@ -140,7 +140,23 @@ class GroupedCommand(TyperCommand):
             flag, equals, value = arg.partition("=")
             present = _EARLIER_NAMES.get(flag, flag)
             renamed.append(present + equals + value if flag not in known and present in known else arg)
-        return super().parse_args(ctx, _gather_values(renamed))
+        if "--database" in known:
+            ctx.allow_extra_args = True  # so that they can be looked at
+        extra = super().parse_args(ctx, _gather_values(renamed))
+        if extra and "--database" in known and not ctx.resilient_parsing:
+            _refuse_extra(ctx, extra)
+        return extra
+
+
+def _refuse_extra(ctx: Any, extra: Sequence[str]) -> None:
+    """Refuse more arguments than a command has; say where a database belongs, if one of them is that."""
+    from sfm_shapefit.formats.lines import is_database
+
+    paths = [value for value in ctx.params.values() if isinstance(value, Path)]
+    for path in (*paths, *map(Path, extra)):
+        if is_database(path) and path != ctx.params.get("database"):
+            ctx.fail(f"{path} is a database, which goes by --database {path}")
+    ctx.fail(f"Got unexpected extra argument(s) ({' '.join(extra)})")
 
 
 def takes(
@@ -251,7 +267,7 @@ def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str
 
     refuse_irregular_file(path)
     try:
-        read = tomllib.loads(path.read_text(encoding="utf-8"))
+        read = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:

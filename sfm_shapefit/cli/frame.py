@@ -110,7 +110,10 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     """
     from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
     from sfm_shapefit.errors import InputError
+    from sfm_shapefit.formats.lines import is_database
 
+    if order == "MODEL OUT" and is_database(target):
+        raise InputError(f"{target} is a database, which goes by --database; the order is {order}")
     ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
     is_model = any((target / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
     if (is_model and not ours) or (target.is_file() and not source.is_file()):

@@ -60,7 +60,7 @@ def refuse_database(path: Path) -> None:
 
 
 def text_of(file: Path) -> str:
-    """Return what an ordinary text file holds.
+    """Return what an ordinary text file holds, without the byte order mark that editors of Windows put first.
 
     Raises:
         InputError: if it is none, is missing, cannot be read, or is no UTF-8.
@@ -68,7 +68,7 @@ def text_of(file: Path) -> str:
     refuse_irregular_file(file)
     refuse_database(file)
     try:
-        return file.read_text(encoding="utf-8")
+        return file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{file} does not exist") from None
     except (OSError, ValueError) as error:
@@ -92,7 +92,7 @@ def first_words(file: Path) -> list[str]:
     if not file.is_file():  # a pipe or a device would be read for ever
         return []
     try:
-        with file.open(encoding="utf-8") as stream:
+        with file.open(encoding="utf-8-sig") as stream:
             return next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
     except (OSError, ValueError):
         return []

@@ -437,6 +437,26 @@ def test_a_database_in_the_place_of_a_model_is_told_which_command_takes_it(comma
     assert "--database" in said
 
 
+def test_a_database_among_the_arguments_is_told_to_go_by_its_flag(tmp_path):
+    database, out = RING / "database.db", tmp_path / "out"
+    for words in ([database, RING_MODEL, out], [RING_MODEL, database, out], [RING_MODEL, out, database]):
+        done = run("locate", *words)
+        assert done.exit_code == 2
+        assert "is a database" in done.stderr
+        assert "--database" in done.stderr
+    assert "goes by --database" in run_refused("locate", RING_MODEL, database)
+    assert "unexpected extra argument" in run("locate", RING_MODEL, out, "more").stderr
+    assert not out.exists()
+
+
+def test_options_and_names_may_begin_with_the_mark_of_a_windows_editor(tmp_path):
+    for name, flag in (("names.txt", "--fix"), ("options.toml", "--config")):
+        file = tmp_path / name
+        file.write_bytes(b"\xef\xbb\xbf" + (BUNDLED / name).read_bytes().replace(b"\n", b"\r\n"))
+        done = run("locate", RING_MODEL, tmp_path / flag, flag, file, "--no-report", "--no-adjust")
+        assert done.exit_code == 0, done.stderr
+
+
 def test_a_file_that_is_missing_is_said_to_be_missing(tmp_path):
     for arguments in (
         ("place", "missing.txt", tmp_path / "out"),
