@@ -106,7 +106,9 @@ class OutputFlags(Settings):
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")
-    verbose: bool = option(False, "Let pycolmap's messages through, and list seconds per stage.")
+    verbose: bool = option(
+        False, "Show all there is to say, with the seconds of each stage, and pycolmap's messages."
+    )
 
 
 class GroupedCommand(TyperCommand):

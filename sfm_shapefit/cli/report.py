@@ -21,7 +21,12 @@ from sfm_shapefit.cli.root import app
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
 
-Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or place wrote.")]
+Output = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="OUT", help="A folder that locate or place wrote, or one model of map, such as out/0."
+    ),
+]
 
 
 @app.command(
