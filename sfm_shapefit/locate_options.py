@@ -132,8 +132,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     )
     max_memory_mb: int = option(
         0,
-        "Peak memory in MB to stay below, 0 for no limit; what is given up for it is said. `inspect` forecasts it. If "
-        "nothing is enough, the run is refused with the number needed.",
+        "Peak memory in MB to stay below, 0 for no limit; what is given up for it is said, and `inspect` "
+        "forecasts it. If nothing is enough, the run is refused with the number needed.",
         also="max_memory",
     )
 
