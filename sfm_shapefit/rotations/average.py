@@ -39,7 +39,7 @@ from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import cap_information, residual_squares
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenvalues, plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
-from sfm_shapefit.rotations.dual_certificate import certify_rotations
+from sfm_shapefit.rotations.dual_certificate import DualCertificate, certify_rotations
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.viewgraph import connected_components
 
@@ -155,6 +155,7 @@ def _choose(
     rotations[registered] = Rotation.from_quat(best.turns).as_matrix()
     sigmas[registered] = np.degrees(estimate_sigmas(best.given, best.system, best.last))
     both = registered[given.pairs].all(axis=1)
+    certificate = _certify(best)
     return AveragedRotations(
         rotations=rotations,
         registered=registered,
@@ -164,7 +165,8 @@ def _choose(
         share=float(votes[chosen_agree].sum() / votes[both].sum()),
         num_pairs=int(np.sum(~np.isnan(best.last.distances))),
         num_tried=num_tried,
-        certified=_certify(best),
+        certified=None if certificate is None else certificate.certified,
+        certainty_estimated=certificate is not None and certificate.certified and not certificate.proved,
     )
 
 
@@ -219,8 +221,8 @@ def _shares_of_cameras(given: AveragingPairs, votes: FloatArray, agree: BoolArra
         )
 
 
-def _certify(answer: _Answer) -> bool | None:
-    """Return whether the answer is optimal for the pairs that are kept; None if that is not checked."""
+def _certify(answer: _Answer) -> DualCertificate | None:
+    """Return what shows the answer to be optimal for the pairs that are kept; None if that is not checked."""
     given, system = answer.given, answer.system
     # Pairs that are left out have the weight 0.
     weights = mean_eigenvalues(answer.last.blocks)
@@ -234,8 +236,7 @@ def _certify(answer: _Answer) -> bool | None:
         inside[members] = True
         weights = weights[kept & inside[given.pairs].all(axis=1)]
         given, system = part, plan_system(len(members), part.pairs, weights, system.threads)
-    found = certify_rotations(system, given.measured, weights, np.ascontiguousarray(answer.turns[members]))
-    return None if found is None else found.certified
+    return certify_rotations(system, given.measured, weights, np.ascontiguousarray(answer.turns[members]))
 
 
 def _alone() -> AveragedRotations:

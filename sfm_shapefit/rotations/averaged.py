@@ -44,6 +44,8 @@ class AveragedRotations(Displayed):
     certified: bool | None = None
     """Whether no rotations fit the kept pairs, with their final weights, better than those next to these, see
     `rotations.dual_certificate`. It does not say that these are the right pairs. None if not checked."""
+    certainty_estimated: bool = False
+    """Whether `certified` rests on an estimated eigenvalue, as on expanders, and is thus no proof."""
 
     @property
     def unsettled(self) -> BoolArray:
@@ -77,6 +79,10 @@ class AveragedRotations(Displayed):
         )
         if self.certified is None:
             return text
+        if self.certified and self.certainty_estimated:
+            return (
+                f"{text}; by an estimated eigenvalue, which is no proof, the best for the pairs that are kept"
+            )
         proof = "proved to be the best for" if self.certified else "not proved to be the best for"
         return f"{text}; {proof} the pairs that are kept"
 

@@ -55,10 +55,13 @@ _SEED = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DualCertificate:
-    """What is proved of the kept pairs."""
+    """What is shown of the kept pairs."""
 
     certified: bool
-    """Whether no rotations cost less than `lower_bound`."""
+    """Whether no rotations cost less than `lower_bound`, proved or estimated."""
+    proved: bool
+    """Whether that is proved, by Cholesky. A Lanczos value is an upper bound of the smallest eigenvalue,
+    so what rests on it is an estimate."""
     cost: float
     """f at the stationary point next to the averaged rotations."""
     lower_bound: float
@@ -96,6 +99,7 @@ def certify_rotations(
     moved = (Rotation.from_quat(polished).inv() * Rotation.from_quat(turns)).magnitude()
     return DualCertificate(
         certified=certified,
+        proved=certified and affordable,
         cost=cost,
         lower_bound=cost - 3 * n * shift if certified else -np.inf,
         distance_deg=float(np.degrees(moved.max())),
@@ -115,7 +119,7 @@ def _polish(
 
 
 def _least_eigenvalue(pairs: IntArray, blocks: FloatArray, diagonal: FloatArray) -> float:
-    """Return a lower bound of the smallest eigenvalue of S by Lanczos steps, -inf if none is found.
+    """Estimate a lower bound of the smallest eigenvalue of S by Lanczos steps, -inf if none is found.
 
     m comes out up to a hundredth too large, which the bound, asked for as a power of ten, does not feel.
     """

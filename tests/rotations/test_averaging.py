@@ -329,6 +329,18 @@ def test_the_answer_shows_itself_in_one_line_and_in_plain_values():
     assert dual_certificate.__doc__ is not None
 
 
+def test_what_rests_on_an_estimated_eigenvalue_is_not_called_proved(monkeypatch):
+    def by_lanczos(system, *arrays):
+        system.is_expander, system.plan = True, None
+        return certify_rotations(system, *arrays)
+
+    monkeypatch.setattr("sfm_shapefit.rotations.average.certify_rotations", by_lanczos)
+    answer = average(made("box", wrong_share=0.0))
+    assert answer.certified
+    assert "which is no proof" in answer.statement
+    assert "proved" not in answer.statement
+
+
 @pytest.mark.parametrize("weight", [0.0, 1e-18])
 def test_images_that_hang_on_pairs_of_no_weight_have_no_sigma(weight):
     pairs = np.array([(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4), (2, 5), (4, 5)])
