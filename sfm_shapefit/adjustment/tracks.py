@@ -48,13 +48,16 @@ class JoinedRows(NamedTuple):
             self.rows[np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])],
         )
 
+    def of_points(self, points_seen: IntArray) -> "JoinedRows":
+        """Return the tracks of points, one each: what rows (m,) see, -1 for those to be left out."""
+        order = np.argsort(points_seen, kind="stable")[np.sum(points_seen < 0) :]
+        offsets = np.append(0, np.cumsum(np.bincount(points_seen[order]))).astype(np.int64)
+        return JoinedRows(offsets, self.rows[order])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservedTracks:
-    """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera.
-
-    It joins under `join` itself, so that it may stand for `MatchedKeypoints`: what tracks it has are known.
-    """
+    """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera."""
 
     offsets: IntArray
     """(t + 1,)"""
@@ -82,7 +85,18 @@ class ObservedTracks:
 
     def subset(self, chosen: IntArray) -> "ObservedTracks":
         """Return the given tracks, in that order."""
-        joined = JoinedRows(self.offsets, np.arange(len(self.cameras))).subset(chosen)
+        return self._of_rows(self._by_rows().subset(chosen), self.ids[chosen])
+
+    def of_points(self, points_seen: IntArray) -> "ObservedTracks":
+        """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
+        joined = self._by_rows().of_points(points_seen)
+        return self._of_rows(joined, np.arange(len(joined.offsets) - 1))
+
+    def _by_rows(self) -> JoinedRows:
+        return JoinedRows(self.offsets, np.arange(len(self.cameras)))
+
+    def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
+        """Return tracks of these observations."""
         rows = joined.rows
         return replace(
             self,
@@ -91,25 +105,7 @@ class ObservedTracks:
             keypoints=self.keypoints[rows],
             pixels=self.pixels[rows],
             on_plane=self.on_plane[rows],
-            ids=self.ids[chosen],
-        )
-
-    def join(self, _poses: CameraPoses, _limit_px: float) -> "ObservedTracks":
-        """Return itself: these tracks do not depend on poses."""
-        return self
-
-    def of_points(self, points_seen: IntArray) -> "ObservedTracks":
-        """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
-        rows = np.argsort(points_seen, kind="stable")[np.sum(points_seen < 0) :]
-        offsets = np.concatenate([[0], np.cumsum(np.bincount(points_seen[rows]))]).astype(np.int64)
-        return replace(
-            self,
-            offsets=offsets,
-            cameras=self.cameras[rows],
-            keypoints=self.keypoints[rows],
-            pixels=self.pixels[rows],
-            on_plane=self.on_plane[rows],
-            ids=np.arange(len(offsets) - 1),
+            ids=ids,
         )
 
 
@@ -150,7 +146,7 @@ class MatchedKeypoints:
             matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
         )
 
-    def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
+    def join(self, poses: CameraPoses, limit_px: float) -> JoinedRows:
         """Return the connected components under the matches that agree with the poses.
 
         A wrong match would join two tracks; nearly all wrong ones miss their epipolar line.
@@ -159,10 +155,6 @@ class MatchedKeypoints:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
         """
-        return self.observed(self.join_rows(poses, limit_px))
-
-    def join_rows(self, poses: CameraPoses, limit_px: float) -> "JoinedRows":
-        """Return the same by the rows of the keypoints, which take a sixth of the memory."""
         parents = np.arange(len(self.cameras))
         given = self._rays(poses), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
@@ -174,7 +166,7 @@ class MatchedKeypoints:
         rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
         return JoinedRows(np.append(0, np.cumsum(lengths)), rows)
 
-    def observed(self, joined: "JoinedRows") -> ObservedTracks:
+    def observed(self, joined: JoinedRows) -> ObservedTracks:
         """Return tracks that are known by their rows."""
         rows = joined.rows
         return ObservedTracks(

@@ -15,12 +15,13 @@ for the middle point.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.tracks import CameraPoses, ObservedTracks
+from sfm_shapefit.adjustment.tracks import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
 
@@ -45,8 +46,8 @@ class PointLimits:
     """Between the rays of two of its observations."""
     min_length: int
     """Its fewest observations."""
-    most_points: int = 3
-    """So many points a track may be of."""
+    most_points: int = 50
+    """So many points a track may be of: wrong matches join true tracks to long chains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,6 +94,50 @@ def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: Point
     for begin, end in zip([0, *cuts], [*cuts, tracks.num_tracks], strict=True):
         count = _triangulate(begin, end, count, given, points, track_of, seen)
     return TriangulatedPoints(points=points[:count], tracks=track_of[:count], points_seen=seen)
+
+
+def joining_limits_px(threshold_px: float, widest_px: float) -> Iterator[float]:
+    """Yield the errors that matches may have to join tracks: half the threshold, and twice as much each time.
+
+    Where a twentieth of the matches is wrong, those within 4 px join half of all observations of a ring of
+    300 images to chains of many points, and within 16 px all but a twentieth. So what agrees best is joined
+    first, and what no point was found for is joined again.
+    """
+    limit_px = 0.5 * threshold_px
+    while limit_px <= widest_px:
+        yield limit_px
+        limit_px *= 2.0
+
+
+def triangulate_matches(
+    matched: MatchedKeypoints, poses: CameraPoses, limits: PointLimits, threshold_px: float
+) -> tuple[ObservedTracks, TriangulatedPoints]:
+    """Return the points of matches, and a track for each of what it is seen by.
+
+    Args:
+        matched: keypoints and their matches.
+        poses: of their cameras.
+        limits: what a point must satisfy.
+        threshold_px: the pixel threshold; the widest error of a match is `limits.max_error_px`.
+    """
+    left, rows = matched, np.arange(len(matched.cameras))
+    points, seen_rows, lengths = [], [], []
+    for limit_px in joining_limits_px(threshold_px, limits.max_error_px):
+        joined = left.join(poses, limit_px)
+        found = triangulate_tracks(left.observed(joined), poses, limits)
+        of_points = joined.of_points(found.points_seen)
+        points.append(found.points)
+        seen_rows.append(rows[of_points.rows])
+        lengths.append(np.diff(of_points.offsets))
+        is_left = np.ones(len(rows), dtype=np.bool_)
+        is_left[of_points.rows] = False
+        left, rows = left.among(is_left), rows[is_left]
+    all_lengths = np.concatenate(lengths)
+    tracks = JoinedRows(np.append(0, np.cumsum(all_lengths)), np.concatenate(seen_rows))
+    every = np.arange(len(all_lengths))
+    return matched.observed(tracks), TriangulatedPoints(
+        points=np.concatenate(points), tracks=every, points_seen=np.repeat(every, all_lengths)
+    )
 
 
 @inner_kernel

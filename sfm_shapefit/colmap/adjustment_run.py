@@ -47,7 +47,12 @@ from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
-from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
+from sfm_shapefit.adjustment.triangulation import (
+    PointLimits,
+    TriangulatedPoints,
+    triangulate_matches,
+    triangulate_tracks,
+)
 from sfm_shapefit.colmap.adjusted import RefinedLenses, Uncertainty
 from sfm_shapefit.colmap.adjustment import add_points, read_frames, set_poses
 from sfm_shapefit.colmap.ceres_adjustment import refuse_without_points
@@ -163,9 +168,9 @@ class AdjustmentRun:
             min_length=self.checked_length if checked else self.options.min_track_length,
         )
         poses = self.frames.poses()
-        tracks = self.source.join(poses, limits.max_error_px)
-        found = triangulate_tracks(tracks, poses, limits)
-        return tracks, found
+        if isinstance(self.source, ObservedTracks):
+            return self.source, triangulate_tracks(self.source, poses, limits)
+        return triangulate_matches(self.source, poses, limits, self.options.max_reprojection_error_px)
 
     def problem_of_all(
         self, *, checked: bool = False

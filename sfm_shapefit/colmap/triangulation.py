@@ -35,7 +35,12 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment.tracks import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
-from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
+from sfm_shapefit.adjustment.triangulation import (
+    PointLimits,
+    TriangulatedPoints,
+    joining_limits_px,
+    triangulate_tracks,
+)
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import add_points, read_frames
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
@@ -48,10 +53,6 @@ from sfm_shapefit.heap import hand_back_memory
 
 # Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
 _TRACKS_A_BLOCK = 20_000
-# Of tracks: the shares of the pixel threshold that a match may miss by, one after the other, and the points
-# that a track may be of. Where a fifth of the matches is wrong, those within the whole threshold join a third
-# of all observations to long chains; so what is within half of it is joined first, and then what is left.
-_JOINING_SHARES, _MOST_POINTS = (0.5, 1.0), 50
 # Of another model, so many tracks are about half a second of work.
 _TRACKS_A_TASK = 1000
 # It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
@@ -122,16 +123,16 @@ def _triangulate_matches(
         max_error_px=options.max_reprojection_error_px,
         min_angle_deg=options.min_triangulation_angle_deg,
         min_length=options.min_track_length,
-        most_points=_MOST_POINTS,
     )
+    joining_limits = tuple(joining_limits_px(limits.max_error_px, limits.max_error_px))
     poses, partners = frames.poses(), matched.count_partners()
     fewest = options.fewest_views(len(frames.image_ids))
     is_left = np.ones(len(partners), dtype=np.bool_)
-    for share in _JOINING_SHARES:
+    for limit_px in joining_limits:
         matched, partners = matched.among(is_left), partners[is_left]
         hand_back_memory()  # before the rays of all keypoints take some
-        joined = matched.join_rows(poses, share * limits.max_error_px)
-        if share < max(_JOINING_SHARES):  # two keypoints may find a third one in the next joining
+        joined = matched.join(poses, limit_px)
+        if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining
             sizes = np.diff(joined.offsets)
         else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
@@ -141,7 +142,7 @@ def _triangulate_matches(
             add_points(structure, frames, task.tracks, found)
             is_left[task.rows[found.points_seen >= 0]] = False
             done += task.tracks.num_tracks
-            if share == _JOINING_SHARES[0]:  # nearly all tracks
+            if limit_px == joining_limits[0]:  # nearly all tracks
                 advance(done, len(chosen))
 
 

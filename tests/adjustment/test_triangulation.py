@@ -9,7 +9,12 @@ import pytest
 from sfm_shapefit.adjustment import adjust, choose_loss_scale_px, triangulation
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
-from sfm_shapefit.adjustment.triangulation import PointLimits, triangulate_tracks
+from sfm_shapefit.adjustment.triangulation import (
+    PointLimits,
+    joining_limits_px,
+    triangulate_matches,
+    triangulate_tracks,
+)
 from tests.adjustment.made import disturb, ring_problem
 
 LIMITS = PointLimits(max_error_px=4.0, min_angle_deg=1.5, min_length=3)
@@ -175,13 +180,44 @@ def test_wrong_matches_do_not_join_tracks():
     rng = np.random.default_rng(5)
     wrong = rng.integers(0, len(tracks.cameras), (400, 2))
     found = matched(tracks, wrong[tracks.cameras[wrong[:, 0]] != tracks.cameras[wrong[:, 1]]])
-    joined = found.join(poses, 4.0)
+    joined = found.observed(found.join(poses, 4.0))
     mixed = [len(set(joined.keypoints[a:b])) > 1 for a, b in itertools.pairwise(joined.offsets)]
     assert np.mean(mixed) < 0.05
-    one = found.join(poses, 1e9)  # without the check, most are one track
+    one = found.observed(found.join(poses, 1e9))  # without the check, most are one track
     assert one.lengths().max() > 0.5 * len(tracks.cameras)
     placed = triangulate_tracks(joined, poses, LIMITS)
     assert len(placed.points) >= 0.95 * np.sum(tracks.lengths() >= 3)
+
+
+def test_what_agrees_best_is_joined_first_so_that_wrong_matches_make_no_chains_of_all():
+    tracks, poses, points = made(noise_px=0.3, num_points=300)
+    rng = np.random.default_rng(5)
+    wrong = rng.integers(0, len(tracks.cameras), (3000, 2))
+    found = matched(tracks, wrong[tracks.cameras[wrong[:, 0]] != tracks.cameras[wrong[:, 1]]])
+    wide = replace(LIMITS, max_error_px=16.0)
+    at_once = triangulate_tracks(found.observed(found.join(poses, 16.0)), poses, wide)
+    joined, in_turn = triangulate_matches(found, poses, wide, 4.0)
+    long = tracks.lengths() >= 3
+    of_long = np.sum(tracks.lengths()[long])
+    assert np.sum(at_once.points_seen >= 0) < 0.8 * of_long
+    assert np.sum(in_turn.points_seen >= 0) > 0.95 * of_long
+    # each track is of one point, and nearly all are of one keypoint of the problem, at its place
+    np.testing.assert_array_equal(in_turn.points_seen, np.repeat(in_turn.tracks, joined.lengths()))
+    assert len(set(zip(joined.cameras, joined.keypoints, strict=True))) == len(joined.cameras)
+    pure = [
+        k
+        for k, (a, b) in enumerate(itertools.pairwise(joined.offsets))
+        if len(set(joined.keypoints[a:b])) == 1
+    ]
+    assert len(pure) > 0.9 * np.sum(long)
+    truth = points[joined.keypoints[joined.offsets[pure]]]
+    distances = np.linalg.norm(in_turn.points[pure] - truth, axis=1)
+    assert np.median(distances) < 0.01 * np.ptp(points, axis=0).max()
+
+
+@pytest.mark.parametrize(("widest_px", "expected"), [(4.0, [2.0, 4.0]), (16.0, [2.0, 4.0, 8.0, 16.0])])
+def test_matches_join_within_half_the_threshold_and_then_within_twice_as_much(widest_px, expected):
+    assert list(joining_limits_px(4.0, widest_px)) == expected
 
 
 def test_thin_tracks_give_every_image_its_share_and_do_not_depend_on_the_order():
