@@ -31,7 +31,7 @@ Database = Annotated[
     typer.Option(
         "--database",
         "--database_path",
-        help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
+        help="COLMAP database; by default database.db in the model folder, its parent or grandparent.",
     ),
 ]
 PriorsFile = Annotated[
