@@ -15,7 +15,9 @@ away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment
 
 What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
 one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
-right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance.
+right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance. A frame beyond ten
+of them is wrong, and must not be held: then all others pull too, by what holding them would leave open, or by
+their chance if that is more.
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
@@ -46,6 +48,8 @@ _MEDIAN_LENGTH = 1.1774
 _MEDIAN_SQUARE = 0.7887
 # An agreement of so many times its chance is three standard deviations beyond 0.
 _CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
+# And one of so many times is ten, which is no chance: products of normal errors have long tails.
+_CERTAIN = 10.0 * 2.0 / np.sqrt(3.0)
 # Of a normal error in space, the mean square is once in 300 times larger than so many variances per axis.
 _RARE = 4.6
 
@@ -138,8 +142,11 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     is_chance = np.median(agreement) <= np.median(chance)
     variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
     open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
+    expected = np.maximum(chance, np.median(chance))
+    if is_chance and (agreement > np.maximum(_CERTAIN * expected, _RARE * open_variance)).any():
+        variance = open_variance = max(open_variance, float(np.median(chance)))
     variances = np.full(problem.num_frames, open_variance)
-    clear = agreement > np.maximum(_CLEAR * np.maximum(chance, np.median(chance)), _RARE * open_variance)
+    clear = agreement > np.maximum(_CLEAR * expected, _RARE * open_variance)
     variances[known] = np.where(clear, agreement, variances[known])
     return RotationErrors(
         sigma_rad=float(np.sqrt(variance)),

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.adjustment.tracks import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
 
 # Observations between which Python can be interrupted: about 0.1 s.
@@ -32,6 +32,8 @@ _PAIRS = 15
 _STEPS = 5
 # Of the distance of a point that a step may go before the steps end.
 _STILL = 1e-9
+# Keypoints of a track for each of its images, from which it is a chain of several points.
+_CHAIN = 1.5
 # Of so many rays one makes the widest angle with another, nearly always.
 _WIDE_AMONG = 64
 
@@ -99,9 +101,7 @@ def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: Point
 def joining_limits_px(threshold_px: float, widest_px: float) -> Iterator[float]:
     """Yield the errors that matches may have to join tracks: half the threshold, and twice as much each time.
 
-    Where a twentieth of the matches is wrong, those within 4 px join half of all observations of a ring of
-    300 images to chains of many points, and within 16 px all but a twentieth. So what agrees best is joined
-    first, and what no point was found for is joined again.
+    What agrees best is joined first, and what no point was found for is joined again.
     """
     limit_px = 0.5 * threshold_px
     while limit_px <= widest_px:
@@ -114,30 +114,50 @@ def triangulate_matches(
 ) -> tuple[ObservedTracks, TriangulatedPoints]:
     """Return the points of matches, and a track for each of what it is seen by.
 
+    Where a twentieth of the matches is wrong, those within 4 px join half of all observations of a ring of
+    300 images to chains of many points, and those within 16 px all but a twentieth. The keypoints of chains,
+    and only these, are joined anew: what agrees best first.
+
     Args:
         matched: keypoints and their matches.
         poses: of their cameras.
         limits: what a point must satisfy.
         threshold_px: the pixel threshold; the widest error of a match is `limits.max_error_px`.
     """
-    left, rows = matched, np.arange(len(matched.cameras))
-    points, seen_rows, lengths = [], [], []
-    for limit_px in joining_limits_px(threshold_px, limits.max_error_px):
-        joined = left.join(poses, limit_px)
-        found = triangulate_tracks(left.observed(joined), poses, limits)
-        of_points = joined.of_points(found.points_seen)
-        points.append(found.points)
-        seen_rows.append(rows[of_points.rows])
-        lengths.append(np.diff(of_points.offsets))
-        is_left = np.ones(len(rows), dtype=np.bool_)
-        is_left[of_points.rows] = False
-        left, rows = left.among(is_left), rows[is_left]
-    all_lengths = np.concatenate(lengths)
-    tracks = JoinedRows(np.append(0, np.cumsum(all_lengths)), np.concatenate(seen_rows))
-    every = np.arange(len(all_lengths))
+    joined = matched.join(poses, limits.max_error_px)
+    is_chain = np.diff(joined.offsets) > _CHAIN * _count_images(joined, poses.images[matched.cameras])
+    is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
+    is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
+    parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), poses, limits)]
+    for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
+        rows, left = np.flatnonzero(is_left), matched.among(is_left)
+        points, seen = _triangulate_joined(left, left.join(poses, limit_px), poses, limits)
+        parts.append((points, JoinedRows(seen.offsets, rows[seen.rows])))
+        is_left[rows[seen.rows]] = False
+    lengths = np.concatenate([np.diff(seen.offsets) for _, seen in parts])
+    tracks = JoinedRows(np.append(0, np.cumsum(lengths)), np.concatenate([seen.rows for _, seen in parts]))
+    every = np.arange(len(lengths))
     return matched.observed(tracks), TriangulatedPoints(
-        points=np.concatenate(points), tracks=every, points_seen=np.repeat(every, all_lengths)
+        points=np.concatenate([points for points, _ in parts]),
+        tracks=every,
+        points_seen=np.repeat(every, lengths),
     )
+
+
+def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
+    """Return how many images the keypoints of each track are of, whose own images (K,) ascend."""
+    own, is_new = images[joined.rows], np.ones(len(joined.rows), dtype=np.int64)
+    is_new[1:] = own[1:] != own[:-1]
+    is_new[joined.offsets[:-1]] = 1
+    return np.asarray(np.add.reduceat(is_new, joined.offsets[:-1])) if len(own) else np.zeros(0, np.int64)
+
+
+def _triangulate_joined(
+    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits
+) -> tuple[FloatArray, JoinedRows]:
+    """Return the points (k, 3) of joined keypoints, and the rows that see each."""
+    found = triangulate_tracks(matched.observed(joined), poses, limits)
+    return found.points, joined.of_points(found.points_seen)
 
 
 @inner_kernel

@@ -362,7 +362,8 @@ def _judge_as_placed(
         for members in together[:, None] if label == 0 else [together]:
             if len(members) == 0:
                 continue
-            part = np.isin(np.arange(len(done)), members)
+            part = np.zeros_like(done)
+            part[members] = True
             own = case.subset(touching.rows_of(members))
             verdicts.note(members, _judge(own, part, largest & ~part, least_rad))
 
