@@ -9,15 +9,16 @@ each half turns the frames by itself (common turns of all frames taken off):
     agreement   d_f^1 . d_f^2 / 3        has the mean |e_f|^2 / 3 = sigma^2, whatever the noise is
     chance      |d_f^1 - d_f^2|^2 / 12   has the mean of |n_f|^2 / 3 for all points together
 
-Noise that neighboring keypoints share is in both, other than in a covariance from residuals. If the median
+Noise that neighboring keypoints share is in both, other than in a covariance from residuals. While the median
 agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
-away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it.
+away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it. The
+frames of a scene turn together, so that a median over them is uncertain itself: of 24 draws of halves from
+two scenes with rotations that are right, four exceed the chance, and none twice the chance, the limit.
 
 What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
 one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
 right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance. A frame beyond ten
-of them is wrong, and must not be held: then all others pull too, by what holding them would leave open, or by
-their chance if that is more.
+of them is wrong, and must not be held: then the others, instead of being held, pull by a tenth of the chance.
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
@@ -46,6 +47,10 @@ _LEAST_REDUNDANCY = 0.1
 _MEDIAN_LENGTH = 1.1774
 # Of a normal error in space, the median square over the mean.
 _MEDIAN_SQUARE = 0.7887
+# Rotations are held while the median agreement is at most so many times the median chance.
+_HELD = 2.0
+# Rotations that would be held but for others pull by this share of the chance.
+_NEARLY_HELD = 0.1
 # An agreement of so many times its chance is three standard deviations beyond 0.
 _CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
 # And one of so many times is ten, which is no chance: products of normal errors have long tails.
@@ -66,6 +71,8 @@ class RotationWeight(NamedTuple):
     frame_sigmas_rad: FloatArray | None = None
     """(n,) the same for each frame: by these they pull, or may be wrong although they are held. None: as
     above for all, and held ones are right."""
+    open_sigmas_rad: FloatArray | None = None
+    """(n,) of frames that pull harder than they are known, as if they were held: by what they may be wrong."""
 
     def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
         """Return the problem with the pull of the given rotations (n, 3, 3)."""
@@ -85,7 +92,8 @@ class RotationWeight(NamedTuple):
 
     def open_rad(self) -> float | FloatArray:
         """Return the standard deviation per axis of the errors of held rotations, or one per frame."""
-        return self.frame_sigmas_rad if self.hold and self.frame_sigmas_rad is not None else 0.0
+        sigmas = self.frame_sigmas_rad if self.hold else self.open_sigmas_rad
+        return 0.0 if sigmas is None else sigmas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,15 +107,28 @@ class RotationErrors:
     frame_sigmas_rad: FloatArray
     """(n,) of the errors of each frame's rotation: the same, the median where chance explains it, or what the
     halves clearly say of the frame."""
+    are_wrong: BoolArray
+    """(n,) the frames that are wrong beyond all chance."""
     noise_px: float
     """Of an observation, from the median of all errors with free rotations."""
     num_frames: int
     """Frames that say anything."""
 
     def weight(self) -> RotationWeight:
-        """Return how to treat the rotations: held, if freeing them would bring more noise than it takes."""
-        hold = self.sigma_rad == 0.0
-        return RotationWeight(hold, self.sigma_rad or None, self.noise_px, self.frame_sigmas_rad)
+        """Return how to treat the rotations: held, if freeing them would bring more noise than it takes.
+
+        Where others are wrong, those pull so hard that they are nearly held.
+        """
+        hold, sigmas = self.sigma_rad == 0.0, self.frame_sigmas_rad
+        if not hold or not self.are_wrong.any():
+            return RotationWeight(hold, self.sigma_rad or None, self.noise_px, sigmas)
+        sigma_rad = _NEARLY_HELD * self.chance_rad
+        return RotationWeight(
+            sigma_rad=sigma_rad,
+            noise_px=self.noise_px,
+            frame_sigmas_rad=np.where(self.are_wrong, sigmas, sigma_rad),
+            open_sigmas_rad=np.where(self.are_wrong, 0.0, sigmas),
+        )
 
 
 def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOptions) -> RotationErrors:
@@ -134,24 +155,25 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
             sigma_rad=0.0,
             chance_rad=0.0,
             frame_sigmas_rad=np.zeros(problem.num_frames),
+            are_wrong=np.zeros(problem.num_frames, dtype=np.bool_),
             noise_px=noise_px,
             num_frames=len(first),
         )
     agreement = np.einsum("fa,fa->f", first, second) / 3.0
     chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
-    is_chance = np.median(agreement) <= np.median(chance)
+    is_chance = np.median(agreement) <= _HELD * np.median(chance)
     variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
     open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
-    expected = np.maximum(chance, np.median(chance))
-    if is_chance and (agreement > np.maximum(_CERTAIN * expected, _RARE * open_variance)).any():
-        variance = open_variance = max(open_variance, float(np.median(chance)))
-    variances = np.full(problem.num_frames, open_variance)
-    clear = agreement > np.maximum(_CLEAR * expected, _RARE * open_variance)
-    variances[known] = np.where(clear, agreement, variances[known])
+    expected, rare = np.maximum(chance, np.median(chance)), _RARE * open_variance
+    variances, are_wrong = np.full(problem.num_frames, open_variance), np.zeros_like(known)
+    is_clear = agreement > np.maximum(_CLEAR * expected, rare)
+    variances[known] = np.where(is_clear, agreement, variances[known])
+    are_wrong[known] = agreement > np.maximum(_CERTAIN * expected, rare)
     return RotationErrors(
         sigma_rad=float(np.sqrt(variance)),
         chance_rad=float(np.sqrt(np.median(chance))),
         frame_sigmas_rad=np.sqrt(variances),
+        are_wrong=are_wrong,
         noise_px=noise_px,
         num_frames=len(first),
     )

@@ -11,6 +11,7 @@ from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.free_sensors import SensorSigma
+from sfm_shapefit.wording import counted
 
 
 class RefinedLenses(NamedTuple):
@@ -90,6 +91,12 @@ class AdjustedPlacement:
         chance = f"{math.degrees(self.errors.chance_rad):.2g} deg"
         if self.weight.hold:
             return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
+        if self.errors.sigma_rad == 0.0:
+            freed = counted(int(self.errors.are_wrong.sum()), "rotation")
+            return (
+                f"centers and points adjusted, {freed} freed that the matches clearly put off, the others "
+                f"nearly held: they would turn by chance ({chance})"
+            )
         sigma_deg = math.degrees(self.errors.sigma_rad)
         return (
             f"centers, points and rotations adjusted: the matches put the given rotations off by "

@@ -108,7 +108,11 @@ class GivenPoses(NamedTuple):
         if sigmas is None:
             return self.weight
         known = dict(zip(self.weight_frames, sigmas.tolist(), strict=True))
-        return self.weight._replace(frame_sigmas_rad=np.array([known.get(i, usual) for i in frame_ids]))
+        of_frames, left_open = np.array([known.get(i, usual) for i in frame_ids]), self.weight.open_sigmas_rad
+        if left_open is not None:
+            known = dict(zip(self.weight_frames, left_open.tolist(), strict=True))
+            left_open = np.array([known.get(i, 0.0) for i in frame_ids])
+        return self.weight._replace(frame_sigmas_rad=of_frames, open_sigmas_rad=left_open)
 
 
 class AdjustmentRun:
