@@ -9,11 +9,12 @@ each half turns the frames by itself (common turns of all frames taken off):
     agreement   d_f^1 . d_f^2 / 3        has the mean |e_f|^2 / 3 = sigma^2, whatever the noise is
     chance      |d_f^1 - d_f^2|^2 / 12   has the mean of |n_f|^2 / 3 for all points together
 
-Noise that neighboring keypoints share is in both, other than in a covariance from residuals. While the median
+Noise that neighboring keypoints share is in both, other than in a covariance from residuals. If the median
 agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
 away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it. The
-frames of a scene turn together, so that a median over them is uncertain itself: of 24 draws of halves from
-two scenes with rotations that are right, four exceed the chance, and none twice the chance, the limit.
+frames of a scene turn together, so that a median over them is uncertain itself: of 12 draws of halves from
+two scenes with rotations that are right, two exceed the chance, by up to 1.5 times. Where it is between half
+and three times the chance, agreement and chance are the means of three draws.
 
 What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
 one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
@@ -47,8 +48,8 @@ _LEAST_REDUNDANCY = 0.1
 _MEDIAN_LENGTH = 1.1774
 # Of a normal error in space, the median square over the mean.
 _MEDIAN_SQUARE = 0.7887
-# Rotations are held while the median agreement is at most so many times the median chance.
-_HELD = 2.0
+# Median agreements over chance between which one draw of halves does not decide, and the draws then.
+_UNSURE, _DRAWS = (0.5, 3.0), 3
 # Rotations that would be held but for others pull by this share of the chance.
 _NEARLY_HELD = 0.1
 # An agreement of so many times its chance is three standard deviations beyond 0.
@@ -72,7 +73,7 @@ class RotationWeight(NamedTuple):
     """(n,) the same for each frame: by these they pull, or may be wrong although they are held. None: as
     above for all, and held ones are right."""
     open_sigmas_rad: FloatArray | None = None
-    """(n,) of frames that pull harder than they are known, as if they were held: by what they may be wrong."""
+    """(n,) of frames that pull as if they were held: by what they may be wrong. None: of none."""
 
     def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
         """Return the problem with the pull of the given rotations (n, 3, 3)."""
@@ -140,28 +141,25 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     """
     bare = replace(problem, rotation_prior=None)
     free = replace(options, hold_rotations=False, cost_tolerance=_FALL)
-    is_first = np.random.default_rng(0).permutation(problem.num_points) % 2 == 0
-    halves = [bare.of_points(half) for half in (is_first, ~is_first)]
-    ends = [adjust(half, free).problem for half in halves]
-    seen = np.min([_count_observations(half) for half in halves], axis=0)
-    known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
-    first, second = (_turns(bare, end.rotations)[known] for end in ends)
-    errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
+    draws = [_draw_halves(bare, free, 0)]
+    if draws[0].known.any() and _UNSURE[0] < draws[0].ratio() < _UNSURE[1]:
+        draws += [_draw_halves(bare, free, seed) for seed in range(1, _DRAWS)]
+    known = np.all([draw.known for draw in draws], axis=0)
     unknowns = 3 * problem.num_points + 2 * 6 * problem.num_frames
     redundancy = max(1.0 - unknowns / max(2 * problem.num_observations, 1), _LEAST_REDUNDANCY)
-    noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH / np.sqrt(redundancy)
-    if len(first) < _FEWEST_FRAMES:
+    noise_px = draws[0].median_error_px / _MEDIAN_LENGTH / np.sqrt(redundancy)
+    if np.sum(known) < _FEWEST_FRAMES:
         return RotationErrors(
             sigma_rad=0.0,
             chance_rad=0.0,
             frame_sigmas_rad=np.zeros(problem.num_frames),
             are_wrong=np.zeros(problem.num_frames, dtype=np.bool_),
             noise_px=noise_px,
-            num_frames=len(first),
+            num_frames=int(np.sum(known)),
         )
-    agreement = np.einsum("fa,fa->f", first, second) / 3.0
-    chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
-    is_chance = np.median(agreement) <= _HELD * np.median(chance)
+    agreement = np.mean([draw.agreement[known] for draw in draws], axis=0)
+    chance = np.mean([draw.chance[known] for draw in draws], axis=0)
+    is_chance = np.median(agreement) <= np.median(chance)
     variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
     open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
     expected, rare = np.maximum(chance, np.median(chance)), _RARE * open_variance
@@ -175,8 +173,42 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
         frame_sigmas_rad=np.sqrt(variances),
         are_wrong=are_wrong,
         noise_px=noise_px,
-        num_frames=len(first),
+        num_frames=len(agreement),
     )
+
+
+class _Halves(NamedTuple):
+    """What two halves of the points make of the rotations."""
+
+    known: BoolArray
+    """(n,) the frames of which they say anything."""
+    agreement: FloatArray
+    """(n,) of the two halves' turns; the mean square per axis of a frame's error, whatever the noise."""
+    chance: FloatArray
+    """(n,) the variance per axis of what noise turns the frame by, all points together."""
+    median_error_px: float
+    """Of all observations."""
+
+    def ratio(self) -> float:
+        """Return the median agreement of the frames over their median chance."""
+        least = np.finfo(np.float64).tiny
+        return float(np.median(self.agreement[self.known]) / max(np.median(self.chance[self.known]), least))
+
+
+def _draw_halves(problem: AdjustmentProblem, options: AdjustmentOptions, seed: int) -> _Halves:
+    """Draw the points into two halves, and return what each by itself makes of the rotations."""
+    is_first = np.random.default_rng(seed).permutation(problem.num_points) % 2 == 0
+    halves = [problem.of_points(half) for half in (is_first, ~is_first)]
+    ends = [adjust(half, options).problem for half in halves]
+    seen = np.min([_count_observations(half) for half in halves], axis=0)
+    known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
+    errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
+    agreement, chance = np.zeros(problem.num_frames), np.zeros(problem.num_frames)
+    if known.any():
+        first, second = (_turns(problem, end.rotations)[known] for end in ends)
+        agreement[known] = np.einsum("fa,fa->f", first, second) / 3.0
+        chance[known] = np.einsum("fa,fa->f", first - second, first - second) / 12.0
+    return _Halves(known, agreement, chance, float(np.median(errors_px[np.isfinite(errors_px)])))
 
 
 def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
