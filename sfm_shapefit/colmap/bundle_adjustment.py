@@ -176,9 +176,9 @@ def adjust_placement(
     run.weight = weight
     is_repeated = bool(weight.singled_out(problem.num_frames).any())
     adjusted = run.adjust_placed(problem, FIRST_FALL if is_repeated else LAST_FALL)
-    if is_repeated:
-        # A frame whose rotation was far off has had few of its tracks; where it stands now it has all.
-        adjusted = run.adjust_placed(run.problem_of_all(checked=True)[2], LAST_FALL)
+    # A frame whose rotation was far off has had few of its tracks; where it stands now it has more, then all.
+    for fall in (FIRST_FALL, LAST_FALL) if is_repeated else ():
+        adjusted = run.adjust_placed(run.problem_of_all(checked=True)[2], fall)
     return AdjustedPlacement(
         reconstruction=run.posed(seed),
         weight=weight,
