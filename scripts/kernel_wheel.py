@@ -1,7 +1,7 @@
 """Build a wheel that carries compiled kernels: `python scripts/kernel_wheel.py dist`.
 
 The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources what is not compiled in this
-checkout, and what it kept becomes the package's folder `_kernels`, see `sfm_shapefit.kernel_cache`. Machine
+checkout, and what it kept becomes the package's folder `_kernels`, see `base/kernel_cache`. Machine
 code and its wrapping depend on the minor versions of Python and numba, so the wheel requires those, and runs
 where numba's own wheel does.
 """
@@ -18,7 +18,7 @@ import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 
-from sfm_shapefit.kernel_cache import RUNTIME, stamp_of
+from sfm_shapefit.base.kernel_cache import RUNTIME, stamp_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -41,7 +41,7 @@ def build(out: Path) -> Path:
         unpacked = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
         _copy_kernels(ROOT / "sfm_shapefit", tree / "sfm_shapefit")
         _run("-m", "sfm_shapefit", "warm-up", **unpacked)
-        made_for = _run("-c", "from sfm_shapefit.kernel_cache import here; print(here())", **unpacked)
+        made_for = _run("-c", "from sfm_shapefit.base.kernel_cache import here; print(here())", **unpacked)
         _carry_kernels(tree / "sfm_shapefit", made_for)
         (info,) = tree.glob("*.dist-info")
         tags = _adapt_metadata(info)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.formats.graph_text import graph_text
+from sfm_shapefit.files.graph_text import graph_text
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.synthetic import (
     RenderOptions,
     SceneOptions,
@@ -25,7 +26,6 @@ from sfm_shapefit.synthetic import (
 from sfm_shapefit.synthetic.models import image_name
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
-from sfm_shapefit.viewgraph import ViewGraph
 
 
 class BundledScene(NamedTuple):

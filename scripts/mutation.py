@@ -42,7 +42,7 @@ from cosmic_ray.operators.operator import Operator
 
 from harness.driver import Kept
 from harness.process import call, thread_environment
-from sfm_shapefit import jit
+from sfm_shapefit.base import jit
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sfm_shapefit"

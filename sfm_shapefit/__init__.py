@@ -23,51 +23,51 @@ from typing import Any as _Any
 
 if TYPE_CHECKING:
     from sfm_shapefit.adjustment.options import AdjustmentOptions
-    from sfm_shapefit.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.commands.adjust import AdjustedModel, bundle_adjust
-    from sfm_shapefit.commands.convert import convert
-    from sfm_shapefit.commands.evaluate import evaluate
-    from sfm_shapefit.commands.inspect import inspect
-    from sfm_shapefit.commands.locate import locate
-    from sfm_shapefit.commands.map import map_database
-    from sfm_shapefit.commands.relative_rotations import relative_rotations
-    from sfm_shapefit.commands.write import WriteOptions, write_map_result, write_result
-    from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
-    from sfm_shapefit.locate_options import LocateOptions, MapOptions
+    from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
+    from sfm_shapefit.facts.map_result import MapResult
+    from sfm_shapefit.facts.options import LocateOptions, MapOptions
+    from sfm_shapefit.facts.result import LocateResult
+    from sfm_shapefit.files.colmap.quiet import hear_pycolmap
+    from sfm_shapefit.graph.viewgraph import ViewGraph
+    from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
+    from sfm_shapefit.pipeline.convert import convert
+    from sfm_shapefit.pipeline.evaluate import evaluate
+    from sfm_shapefit.pipeline.inspect import inspect
+    from sfm_shapefit.pipeline.locate import locate
+    from sfm_shapefit.pipeline.map import map_database
+    from sfm_shapefit.pipeline.relative_rotations import relative_rotations
+    from sfm_shapefit.pipeline.write import WriteOptions, write_map_result, write_result
     from sfm_shapefit.placement.place import Placement, place
     from sfm_shapefit.refinement.options import PlacementOptions
-    from sfm_shapefit.results.map_result import MapResult
-    from sfm_shapefit.results.result import LocateResult
     from sfm_shapefit.rotations.average import average_rotations
     from sfm_shapefit.rotations.averaged import AveragedRotations
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
-    from sfm_shapefit.viewgraph import ViewGraph
 
 _HOMES = {
-    "colmap.quiet": ("hear_pycolmap",),
+    "files.colmap.quiet": ("hear_pycolmap",),
     "adjustment.options": ("AdjustmentOptions",),
-    "commands.adjust": ("AdjustedModel", "bundle_adjust"),
-    "commands.convert": ("convert",),
-    "commands.evaluate": ("evaluate",),
-    "commands.inspect": ("inspect",),
-    "commands.locate": ("locate",),
-    "commands.map": ("map_database",),
-    "commands.relative_rotations": ("relative_rotations",),
-    "commands.write": ("WriteOptions", "write_map_result", "write_result"),
-    "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "locate_options": ("LocateOptions", "MapOptions"),
+    "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
+    "pipeline.convert": ("convert",),
+    "pipeline.evaluate": ("evaluate",),
+    "pipeline.inspect": ("inspect",),
+    "pipeline.locate": ("locate",),
+    "pipeline.map": ("map_database",),
+    "pipeline.relative_rotations": ("relative_rotations",),
+    "pipeline.write": ("WriteOptions", "write_map_result", "write_result"),
+    "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
+    "facts.options": ("LocateOptions", "MapOptions"),
     "placement.place": ("Placement", "place"),
     "refinement.options": ("PlacementOptions",),
-    "results.map_result": ("MapResult",),
-    "results.result": ("LocateResult",),
+    "facts.map_result": ("MapResult",),
+    "facts.result": ("LocateResult",),
     "rotations.average": ("average_rotations",),
     "rotations.averaged": ("AveragedRotations",),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),
-    "viewgraph": ("ViewGraph",),
+    "graph.viewgraph": ("ViewGraph",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

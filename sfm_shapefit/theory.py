@@ -35,10 +35,10 @@ from typing import TypeVar
 import numpy as np
 from scipy.sparse import coo_array
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.jit import inner_kernel, kernel
-from sfm_shapefit.viewgraph import connected_components
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.graph.viewgraph import connected_components
 
 Part = TypeVar("Part")
 

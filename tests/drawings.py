@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.report.drawing import Points, Poses, build_drawing
-from sfm_shapefit.results.tables import CameraRow, PairRow
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 

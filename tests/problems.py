@@ -6,15 +6,15 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.measured import Evidence
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.measured import Evidence
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.splitting.engine import Goal
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
 from sfm_shapefit.solver.splitting.shapefit import AdmmResult, Splitting
-from sfm_shapefit.viewgraph import ViewGraph
 
 Floats = npt.NDArray[np.float64]
 

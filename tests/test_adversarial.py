@@ -9,13 +9,13 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions
-from sfm_shapefit.geometry import fit_similarity_l1, normalized
+from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
+from sfm_shapefit.facts.rows import camera_rows
+from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.results.rows import camera_rows
-from sfm_shapefit.results.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
 from tests.scenes import RING, copied, edit_database
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.base.test_jit import is_kernel
 from tests.program import run_python
-from tests.test_jit import is_kernel
 
 PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
@@ -147,6 +147,6 @@ def test_only_the_command_that_is_called_is_loaded():
 
 
 def test_what_draws_is_not_loaded_where_nothing_is_drawn():
-    done = run_python("-c", "import sys, sfm_shapefit.commands.write; print(*sys.modules)")
-    assert "sfm_shapefit.commands.write" in done.stdout
+    done = run_python("-c", "import sys, sfm_shapefit.pipeline.write; print(*sys.modules)")
+    assert "sfm_shapefit.pipeline.write" in done.stdout
     assert "sfm_shapefit.report" not in done.stdout

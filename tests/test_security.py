@@ -9,12 +9,12 @@ import tomllib
 
 import pytest
 
-from sfm_shapefit.colmap import sqlite_file
-from sfm_shapefit.colmap.check import check_model_files
-from sfm_shapefit.colmap.database import open_database
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.graph_text import read_graph
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap import sqlite_file
+from sfm_shapefit.files.colmap.check import check_model_files
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.graph_text import read_graph
 from tests.program import run, run_python
 from tests.scenes import RING, ROOT, copied, edit_database
 
@@ -77,7 +77,7 @@ def refuse(event, arguments):
         print(event, arguments, file=sys.stderr)
         sys.stderr.flush()
         raise SystemExit(99)
-import sfm_shapefit.commands
+import sfm_shapefit.pipeline
 sys.addaudithook(refuse)
 from sfm_shapefit.cli import main
 sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]

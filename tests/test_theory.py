@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import random_graph_problem
 from sfm_shapefit.theory import _least_sines, graph_typicality, recovery_conditions, well_distributed
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, shape_error
 
 

@@ -120,9 +120,9 @@ def measure_reordering(scene: Path, work: Path, seed: int, *, adjust: bool = Fal
 
     An adjustment ends at a tolerance, which another order of sums reaches elsewhere.
     """
-    from sfm_shapefit.commands.locate import locate
-    from sfm_shapefit.commands.write import write_result
-    from sfm_shapefit.locate_options import LocateOptions
+    from sfm_shapefit.facts.options import LocateOptions
+    from sfm_shapefit.pipeline.locate import locate
+    from sfm_shapefit.pipeline.write import write_result
 
     copy = reorder(scene, work / f"order{seed}", np.random.default_rng(seed))
     tables = []

@@ -2,7 +2,7 @@
 
 A binary model file is a sequence of little-endian fields, and a text file a sequence of words. Both are cut
 into fields here by a plain walk over a sound file, apart from the walkers of the package, which are what is
-under attack. Layouts: see `sfm_shapefit/colmap/check.py`.
+under attack. Layouts: see `sfm_shapefit/files/colmap/check.py`.
 """
 
 import re

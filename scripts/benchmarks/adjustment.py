@@ -162,7 +162,7 @@ def adjust_by_ceres(model: "pycolmap.Reconstruction", fall: float):
 
 def measure_apart(own: "pycolmap.Reconstruction", other: "pycolmap.Reconstruction") -> float:
     """Return the largest distance between the centers of two models after a similarity, of their extent."""
-    from sfm_shapefit.geometry import fit_similarity
+    from sfm_shapefit.base.geometry import fit_similarity
 
     images = sorted(own.reg_image_ids())
     a, b = (np.array([model.image(i).projection_center() for i in images]) for model in (own, other))

@@ -25,7 +25,7 @@ from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import AveragedRotations
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
     from sfm_shapefit.synthetic.rotation_graphs import RotationProblem
 
 FAMILIES = ("ring", "box", "expander", "community")
@@ -157,7 +157,7 @@ def solve_oracle(problem: "RotationProblem") -> "FloatArray":
 
 def errors_deg(rotations: "FloatArray", truth: "FloatArray") -> "FloatArray":
     """Return the angles to the truth after the best common rotation of the world, (n,)."""
-    from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+    from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 
     difference = rotations.transpose(0, 2, 1) @ truth
     return rotation_angles_deg(difference @ mean_rotation_l1(difference[:20_000]).T)
@@ -166,7 +166,7 @@ def errors_deg(rotations: "FloatArray", truth: "FloatArray") -> "FloatArray":
 def measure_real(folder: Path, averaging: Any) -> Real:
     """Average the rotations of a real set; to be called in a process of its own."""
     from sfm_shapefit import relative_rotations
-    from sfm_shapefit.commands.stages.averaging import average_consistently
+    from sfm_shapefit.rotations.trusted import average_consistently
 
     relative = relative_rotations(folder / "database.db")
     stored = np.load(folder / "viewgraph.npz", allow_pickle=True)

@@ -24,8 +24,8 @@ from harness.process import resident_memory_mb
 from harness.record import table_of
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.directions.matches import RayMatches
+    from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.scene.matches import RayMatches
 
 FOCAL_PX, WIDTH_PX, HEIGHT_PX, DEPTH = 1000.0, 1000.0, 750.0, 6.0
 MATCHES = 100
@@ -116,8 +116,8 @@ def make_pairs(case: Case, count: int, seed: int) -> "tuple[RayMatches, FloatArr
     """Return the matches of random pairs and their true directions (count, 3)."""
     import numpy as np
 
-    from sfm_shapefit.directions.matches import RayMatches
-    from sfm_shapefit.geometry import normalized
+    from sfm_shapefit.base.geometry import normalized
+    from sfm_shapefit.scene.matches import RayMatches
 
     rng = np.random.default_rng(seed)
     shape = (count, case.matches)
@@ -157,10 +157,10 @@ def measure_case(case: Case, count: int) -> Calibration:
     """Estimate `count` pairs of one kind and compare errors with covariances."""
     import numpy as np
 
-    from sfm_shapefit.directions.estimate import estimate_directions
-    from sfm_shapefit.directions.options import DirectionOptions
-    from sfm_shapefit.directions.pair_directions import DirectionStatus
-    from sfm_shapefit.geometry import angle_between_deg, tangent_bases
+    from sfm_shapefit.base.geometry import angle_between_deg, tangent_bases
+    from sfm_shapefit.pairs.estimate import estimate_directions
+    from sfm_shapefit.pairs.options import DirectionOptions
+    from sfm_shapefit.pairs.pair_directions import DirectionStatus
 
     matches, truth = make_pairs(case, count, seed=1)
     # Wrong matches are the case, not a reason for refusal; lists of 15 may lose some to the threshold.
@@ -179,7 +179,7 @@ def measure_case(case: Case, count: int) -> Calibration:
 
 def measure_batches(pairs: int, threads: int) -> Speed:
     """Estimate one batch, a tenth of whose matches is wrong, again and again; drawing it is not timed."""
-    from sfm_shapefit.directions.estimate import estimate_directions
+    from sfm_shapefit.pairs.estimate import estimate_directions
 
     matches, _ = make_pairs(Case(name="speed", wrong=0.1), BATCH, seed=2)
     estimate_directions(matches, threads=threads)

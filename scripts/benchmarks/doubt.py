@@ -36,9 +36,9 @@ from harness.metrics import Check, Quantity, number, verdict
 from harness.record import table_of
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray, IntArray
-    from sfm_shapefit.colmap.model import PosedModel
-    from sfm_shapefit.directions.pair_directions import PairDirections
+    from sfm_shapefit.base.arrays import FloatArray, IntArray
+    from sfm_shapefit.files.colmap.model import PosedModel
+    from sfm_shapefit.pairs.pair_directions import PairDirections
     from sfm_shapefit.placement.place import Placement
 
 SETS = {
@@ -141,7 +141,7 @@ def draw(name: str, repeats: int) -> Turned:
 
 def turn_cameras(scene: Scene, repeats: int) -> Turned:
     """Run a scene as it is, and with turned cameras."""
-    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import read_model
 
     model = read_model(scene.model)
     wrong = rotation_errors_deg(model, read_model(scene.truth)) > WRONG_DEG
@@ -183,11 +183,11 @@ def turn_cameras(scene: Scene, repeats: int) -> Turned:
 def judge(model: "PosedModel", scene: Scene) -> "tuple[PairDirections, Placement]":
     """Place the cameras of a model and judge them: `locate` without points."""
     from sfm_shapefit import LocateOptions
-    from sfm_shapefit.commands.stages.clock import Clock
-    from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras
-    from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
-    from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, measure_directions
-    from sfm_shapefit.commands.stages.rigs import find_rigid_parts, place_cameras
+    from sfm_shapefit.pipeline.clock import Clock
+    from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
+    from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+    from sfm_shapefit.pipeline.measure import add_evidence, build_graph, measure_directions
+    from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 
     options, clock = LocateOptions(threads=2), Clock()
     rigid = find_rigid_parts(model, options, has_priors=False)
@@ -211,7 +211,7 @@ def num_still_off(scene: Scene, changed: "PosedModel", cameras: "IntArray", leas
     """
     import pycolmap
 
-    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import read_model
 
     given, model = pycolmap.Reconstruction(scene.model), read_model(scene.model)
     turns = model.rotations.transpose(0, 2, 1) @ changed.rotations
@@ -271,7 +271,7 @@ def turn(
 
 def change_focal_lengths(scene: Scene) -> Focal:
     """Ask for focal lengths, where one camera has a wrong one and where none has."""
-    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import read_model
 
     model = read_model(scene.model)
     if model.has_rigs:
@@ -295,7 +295,7 @@ def change_focal_lengths(scene: Scene) -> Focal:
 
 def change_camera(model: "PosedModel", images: "IntArray", factor: float) -> "tuple[PosedModel, int]":
     """Return a model some of whose images have a camera of their own, of another focal length, and its id."""
-    from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras
+    from sfm_shapefit.files.colmap.model import from_posed_cameras, posed_cameras
 
     scene = posed_cameras(model)
     first = scene.cameras[int(scene.camera_of[images[0]])]
@@ -313,10 +313,10 @@ def change_camera(model: "PosedModel", images: "IntArray", factor: float) -> "tu
 def ask(model: "PosedModel", scene: Scene) -> Any:
     """Return the cameras whose matches prefer another focal length."""
     from sfm_shapefit import LocateOptions
-    from sfm_shapefit.commands.stages.clock import Clock
-    from sfm_shapefit.commands.stages.doubts import question_focal_lengths
-    from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
-    from sfm_shapefit.commands.stages.measure import measure_directions
+    from sfm_shapefit.pipeline.clock import Clock
+    from sfm_shapefit.pipeline.doubts import question_focal_lengths
+    from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+    from sfm_shapefit.pipeline.measure import measure_directions
 
     options = LocateOptions(threads=2)
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), options) as source:

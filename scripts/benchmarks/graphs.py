@@ -20,9 +20,9 @@ from harness.metrics import Check, Quantity, Trials, number, verdict
 from harness.record import table_of
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+    from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+    from sfm_shapefit.graph.viewgraph import ViewGraph
     from sfm_shapefit.synthetic import GraphProblem
-    from sfm_shapefit.viewgraph import ViewGraph
 
 MADRID = "1dsfm-Madrid_Metropolis"
 EXACT = 1e-9
@@ -166,7 +166,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     """Place one graph of a problem and compare with its truth."""
     import numpy as np
 
-    from sfm_shapefit.geometry import fit_similarity
+    from sfm_shapefit.base.geometry import fit_similarity
 
     one = draw_graph(problem, seed, data)
     run = ours.time_call(

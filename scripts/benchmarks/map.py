@@ -301,7 +301,7 @@ def _children_s() -> float:
 def measure_peer(mapper: str, min_matches: int, database: Path, truth: Path, threads: int) -> Outcome:
     """Run one mapper of pycolmap once, and compare its largest model with the truth; in its own process."""
     from peers.colmap import map_database
-    from sfm_shapefit.colmap.quiet import quiet_stderr
+    from sfm_shapefit.files.colmap.quiet import quiet_stderr
 
     start = time.perf_counter()
     with quiet_stderr():
@@ -332,8 +332,8 @@ def measure_rotations(database: Path, truth: Path) -> dict[str, float]:
     """Return the errors of the averaged rotations, of the images with truth; in its own process."""
     from benchmarks.averaging import errors_deg
     from sfm_shapefit import relative_rotations
-    from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.commands.stages.averaging import average_consistently
+    from sfm_shapefit.files.colmap.model import read_model
+    from sfm_shapefit.rotations.trusted import average_consistently
 
     relative, known = relative_rotations(database), read_model(truth)
     found = average_consistently(len(relative.names), relative)

@@ -30,7 +30,7 @@ from harness.record import table_of
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
     from sfm_shapefit.synthetic import RigScene
     from sfm_shapefit.synthetic.layouts import SceneCameras
 
@@ -150,7 +150,7 @@ def _best_mapping(scene: "RigScene", workspace: Path) -> Outcome:
 def _map(scene: "RigScene", workspace: Path, min_num_matches: int, refine_sensors: bool) -> Outcome:
     """Run global mapping on a copy of the database, whatever it may do to it."""
     from peers.colmap import map_database
-    from sfm_shapefit.colmap.quiet import quiet_log
+    from sfm_shapefit.files.colmap.quiet import quiet_log
 
     with quiet_log():
         try:
@@ -164,7 +164,7 @@ def _map(scene: "RigScene", workspace: Path, min_num_matches: int, refine_sensor
 
 def compare(scene: "SceneCameras", model: "pycolmap.Reconstruction", wall_s: float) -> Outcome:
     """Compare a model with the truth."""
-    from sfm_shapefit.geometry import fit_similarity
+    from sfm_shapefit.base.geometry import fit_similarity
 
     ids = sorted(i for i, image in model.images.items() if image.has_pose)
     centers = np.array([model.image(i).projection_center() for i in ids])

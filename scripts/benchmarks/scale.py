@@ -32,7 +32,7 @@ from harness.record import table, table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import SolverResult, ViewGraph
-    from sfm_shapefit.arrays import FloatArray, IntArray
+    from sfm_shapefit.base.arrays import FloatArray, IntArray
 
 CLOSE = 1e-4
 """Relative excess of the objective that counts as close."""

@@ -33,7 +33,7 @@ from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import SolverResult, ViewGraph
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
 
     Solution = tuple[FloatArray, FloatArray | None, int]
     """Locations, dual if the solver gives one, iterations."""

@@ -28,8 +28,8 @@ from harness.metrics import Check, Quantity, number, numbers, verdict
 from harness.record import table_of
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-    from sfm_shapefit.colmap.model import PosedModel
+    from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+    from sfm_shapefit.files.colmap.model import PosedModel
     from sfm_shapefit.placement.place import Placement
 
 SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30", "lego100")
@@ -159,7 +159,7 @@ def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
 
 def rank_graph(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
-    from sfm_shapefit.geometry import fit_similarity_l1
+    from sfm_shapefit.base.geometry import fit_similarity_l1
 
     placement = ours.place(view_graph(graph), covariance=graph.covariances)
     truth = graph.locations[placement.cameras]
@@ -171,7 +171,7 @@ def rank_graph(graph: Graph) -> tuple[float, int]:
 
 def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
     """Return directions with normal errors of known, varying size, and random ones where `wrong`."""
-    from sfm_shapefit.geometry import normalized, tangent_bases
+    from sfm_shapefit.base.geometry import normalized, tangent_bases
 
     rng = np.random.default_rng(1000 + seed)
     true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
@@ -219,7 +219,7 @@ def concentrate(seed: int) -> Graph:
 
 def turn_cameras(seed: int) -> Graph:
     """A tenth of the cameras are turned by 20 degrees, the directions of their pairs half as far."""
-    from sfm_shapefit.geometry import normalized
+    from sfm_shapefit.base.geometry import normalized
 
     graph = draw_graph("box", seed)
     axes = normalized(np.random.default_rng(3000 + seed).standard_normal(graph.locations.shape))
@@ -249,7 +249,7 @@ SPOILED: dict[str, Callable[[int], Graph]] = {
 def flag(folder: Path) -> Flagged:
     """Locate the cameras of a set and compare those left out with the wrong rotations."""
     import sfm_shapefit
-    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import read_model
 
     found = ours.locate(folder / "sparse" / "0", folder / "database.db")
     reference = next(folder / name for name in ("gt", "truth", "sparse/0") if (folder / name).is_dir())
@@ -269,7 +269,7 @@ def flag(folder: Path) -> Flagged:
 
 def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray":
     """Return the angle of each given rotation from the truth after the best common rotation, or NaN."""
-    from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+    from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 
     place_of = {name: k for k, name in enumerate(truth.names)}
     common = [k for k, name in enumerate(model.names) if name in place_of]

@@ -147,7 +147,7 @@ def turn_rotations(model: Path, sigma_deg: float, seed: int) -> Any:
     """Return a model whose rotations are off, its centers where they were."""
     import pycolmap
 
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
 
     reconstruction = pycolmap.Reconstruction(model)
     rng = np.random.default_rng(4000 + seed)

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import sfm_shapefit
-from sfm_shapefit.geometry import fit_similarity_l1
+from sfm_shapefit.base.geometry import fit_similarity_l1
 
 SCENE = Path(__file__).parents[2] / "data_synthetic" / "courtyard"
 INLIER, OUTLIER, CAMERA, POINT, GIVEN = "#2a9d5c", "#d1495b", "#1d3557", "#a0a0a0", "#6c757d"

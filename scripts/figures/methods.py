@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 
 from harness import ours
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.baselines import locate_least_squares, locate_lud
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic.graphs import GraphProblem
-from sfm_shapefit.viewgraph import ViewGraph
 
 # Exact recovery means an error below 1e-9.
 _TOL = 1e-12

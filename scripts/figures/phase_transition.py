@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from figures.trials import Cell, Results, problems, run_trials
 from harness import ours
 from harness.graphs import view_graph
-from sfm_shapefit.rigidity import is_parallel_rigid
+from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.synthetic.graphs import Corruption
 
 SEED = 0

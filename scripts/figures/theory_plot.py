@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from figures.methods import METHODS
 from harness.graphs import relative_error, view_graph
-from sfm_shapefit.errors import ShapeFitError
+from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.synthetic.graphs import GraphProblem, random_graph_problem
 from sfm_shapefit.theory import recovery_conditions
 

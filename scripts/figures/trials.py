@@ -19,10 +19,10 @@ from figures.methods import METHODS
 from harness.driver import Kept
 from harness.graphs import relative_error, to_unit_norm, view_graph
 from harness.process import thread_environment
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import ShapeFitError
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import ShapeFitError
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.synthetic.graphs import Corruption, GraphProblem, random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 
 NOT_RECOVERED = 1.0
 """The error of a problem that has no unique answer, as in the paper's black cells."""

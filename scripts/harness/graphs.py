@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.graph.viewgraph import ViewGraph
     from sfm_shapefit.synthetic import GraphProblem
-    from sfm_shapefit.viewgraph import ViewGraph
 
 SEED = 1
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from sfm_shapefit import LocateResult, SolverResult, ViewGraph
-    from sfm_shapefit.arrays import FloatArray, IntArray
+    from sfm_shapefit.base.arrays import FloatArray, IntArray
     from sfm_shapefit.placement.place import Placement
 
 
@@ -51,7 +51,7 @@ def place(
     **options: Any,
 ) -> "Placement":
     """Return the placement of the largest rigid piece: what the command does with a graph."""
-    from sfm_shapefit.measured import MeasuredGraph
+    from sfm_shapefit.graph.measured import MeasuredGraph
     from sfm_shapefit.placement.place import place as place_graph
     from sfm_shapefit.refinement.options import PlacementOptions
 
@@ -62,7 +62,7 @@ def place(
 
 def place_file(source: Path, **options: Any) -> Any:
     """Place a graph file: what the command gives, with `placement`, `statement` and `timings_s`."""
-    from sfm_shapefit.commands.place import place_graph_file
+    from sfm_shapefit.pipeline.place import place_graph_file
     from sfm_shapefit.refinement.options import PlacementOptions
 
     return place_graph_file(source, PlacementOptions(**options))
@@ -70,7 +70,7 @@ def place_file(source: Path, **options: Any) -> Any:
 
 def warns(placement: "Placement") -> bool:
     """Return whether the report of a placement carries a warning."""
-    from sfm_shapefit.results.warnings import quality_warnings
+    from sfm_shapefit.facts.warnings import quality_warnings
 
     return any(True for _ in quality_warnings(placement))
 
@@ -101,6 +101,6 @@ def map_database(database: Path, **options: Any) -> Any:
 
 def rigid_pieces(num_nodes: int, edges: "IntArray") -> "IntArray":
     """Return the parallel-rigid piece of each edge in space."""
-    from sfm_shapefit.rigidity import parallel_rigid_pieces
+    from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 
     return parallel_rigid_pieces(num_nodes, edges, 3)

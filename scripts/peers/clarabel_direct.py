@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.viewgraph import ViewGraph
+    from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.graph.viewgraph import ViewGraph
 
 
 def solve_direct(graph: "ViewGraph", tol: float) -> "tuple[FloatArray, FloatArray, int]":
@@ -26,7 +26,7 @@ def solve_direct(graph: "ViewGraph", tol: float) -> "tuple[FloatArray, FloatArra
     import clarabel
     from scipy.sparse import csc_array
 
-    from sfm_shapefit.geometry import tangent_bases
+    from sfm_shapefit.base.geometry import tangent_bases
     from sfm_shapefit.solver.program import scale_functional
 
     n, m, d = graph.num_nodes, graph.num_edges, graph.dimension

@@ -28,7 +28,7 @@ import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sfm_shapefit.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.quiet import quiet_log
 
 MIN_VIEWS = 3
 MAX_SPREAD_PX = 10.0

@@ -26,8 +26,8 @@ from harness.metrics import Check, numbers, ratio
 from harness.process import call, peak_memory_mb, reset_peak, thread_environment
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.viewgraph import ViewGraph
+    from sfm_shapefit.base.arrays import FloatArray
+    from sfm_shapefit.graph.viewgraph import ViewGraph
 
 WALL_PER_CPU = 30
 """Wall-clock limit over the limit of CPU time: ends what waits instead of computing."""

@@ -23,7 +23,7 @@ from peers.on_graphs import CONTENDERS as GRAPH_CONTENDERS
 from peers.on_graphs import Answer, ask
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
 
 EQUAL = 1.05
 """Differences below count as equal: the truth is no better."""
@@ -75,7 +75,7 @@ def measure_directions(folder: Path) -> Directions:
 def _solve(name: str, folder: Path, scene: Scene, directions: Directions | str) -> Answer:
     """Run a solver of bare graphs; to be called once per process."""
     from sfm_shapefit import ViewGraph
-    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import read_model
 
     if isinstance(directions, str):
         raise RuntimeError(directions)
@@ -94,7 +94,7 @@ def _locate(name: str, folder: Path, scene: Scene) -> Answer:
     if name in (SAME_DIRECTIONS, BY_DEFAULT):
         return _ours(name, folder, scene)
     from peers.colmap import SETTINGS, map_database, position
-    from sfm_shapefit.colmap.quiet import quiet_log
+    from sfm_shapefit.files.colmap.quiet import quiet_log
 
     database = folder / "database.db"
     reset_peak()
@@ -133,8 +133,8 @@ def _errors(centers: "dict[str, FloatArray]", folder: Path, scene: Scene) -> Err
     """Return the position errors of the cameras that a contender placed, by name."""
     import numpy as np
 
-    from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.evaluation import CameraPoses, evaluate_poses
+    from sfm_shapefit.files.colmap.model import read_model
+    from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
 
     truth = read_model(folder / scene.truth)
     if len(set(centers) & set(truth.names)) < 3:

@@ -25,10 +25,10 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
-from sfm_shapefit.settings import merge_options
 
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
 _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest

@@ -18,7 +18,7 @@ import numpy as np
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import NUM_VALUES, AdjustmentProblem, Lens, LensPrior
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 
 LARGEST_SIGMA = 0.02
 """Of a focal length, as a share of it: beyond, the observations do not tell it."""

@@ -18,8 +18,8 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import Values
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.laplacian.dense import one_blas_thread
 
 _DIMENSION = 7

@@ -34,8 +34,8 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import rotation_vectors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import mean_rotation_l1
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import mean_rotation_l1
 
 # A frame that sees fewer points in a half says nothing.
 _FEWEST_POINTS = 10

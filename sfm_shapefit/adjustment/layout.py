@@ -17,9 +17,9 @@ import numpy as np
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import NUM_VALUES, AdjustmentProblem
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import normalized, tangent_bases
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized, tangent_bases
+from sfm_shapefit.base.jit import kernel
 
 SLOTS = 6
 """Unknowns of a node at most."""

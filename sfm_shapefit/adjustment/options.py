@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from sfm_shapefit.settings import Settings, explained, option
+from sfm_shapefit.base.settings import Settings, explained, option
 
 LinearSolver = Literal["auto", "dense", "sparse"]
 

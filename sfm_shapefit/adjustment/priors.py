@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 
 _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
 

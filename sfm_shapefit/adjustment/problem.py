@@ -26,9 +26,9 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.scene.known_positions import KnownPositions
 
 _FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
 NUM_VALUES = 8

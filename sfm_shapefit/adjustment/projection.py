@@ -8,7 +8,7 @@ from typing import Any
 
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.problem import NUM_VALUES
-from sfm_shapefit.jit import inner_kernel
+from sfm_shapefit.base.jit import inner_kernel
 
 _LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
 

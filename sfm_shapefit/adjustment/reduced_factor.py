@@ -13,9 +13,9 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.schur import ReducedSystem
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,

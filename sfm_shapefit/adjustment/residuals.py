@@ -37,8 +37,8 @@ from sfm_shapefit.adjustment.projection import (
     miss,
     turn_to_frame,
 )
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
 
 CHUNKS = 4

@@ -17,8 +17,8 @@ import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.residuals import NormalEquations
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.jit import kernel, subtract_block
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.jit import kernel, subtract_block
 from sfm_shapefit.laplacian.operators import Workers
 
 _JOBS = 16  # ranges of nodes or points; a row is summed by one of them, so that their number does not matter

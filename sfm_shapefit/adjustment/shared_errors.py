@@ -43,9 +43,9 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.projection import SHIFT, differentiate, is_ahead, look, miss, turn_to_frame
 from sfm_shapefit.adjustment.residuals import kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.geometry import METRIC_SIGMA
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import METRIC_SIGMA
+from sfm_shapefit.base.jit import inner_kernel, kernel
 
 _MOST_GROUPS = 64
 _FEWEST_OF_A_GROUP = 8

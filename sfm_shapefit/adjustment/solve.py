@@ -28,12 +28,12 @@ from sfm_shapefit.adjustment.residuals import (
     sum_losses,
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
-from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.display import Displayed
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.heap import hand_back_memory
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
-from sfm_shapefit.settings import merge_options
 
 _LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
 _LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable

@@ -9,7 +9,7 @@ from sfm_shapefit.baselines.linf import locate_linf
 from sfm_shapefit.baselines.locators import FILTERS, LOCATORS, solve_baseline
 from sfm_shapefit.baselines.lud import locate_lud
 from sfm_shapefit.baselines.onedsfm import filter_1dsfm
-from sfm_shapefit.directions.triangles import filter_triangles
+from sfm_shapefit.pairs.triangles import filter_triangles
 
 __all__ = [
     "FILTERS",

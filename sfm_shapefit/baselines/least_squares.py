@@ -14,11 +14,11 @@ import numpy as np
 from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import splu
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.baselines.normalize import normalize_locations
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.viewgraph import ViewGraph
 
 _DENSE_UNKNOWNS = 600
 # This share of the mean diagonal is added to it, so that the singular matrix has a factor.

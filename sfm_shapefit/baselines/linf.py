@@ -13,10 +13,10 @@ import warnings
 import numpy as np
 from scipy.sparse import csr_array
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.baselines.normalize import normalize_locations
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 
 # More pairs would take many minutes.
 _MOST_PAIRS = 20_000

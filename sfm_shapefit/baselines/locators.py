@@ -9,16 +9,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, frozen
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.baselines.least_squares import locate_least_squares
 from sfm_shapefit.baselines.linf import locate_linf
 from sfm_shapefit.baselines.lud import locate_lud
 from sfm_shapefit.baselines.onedsfm import filter_1dsfm
-from sfm_shapefit.directions.triangles import filter_triangles
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.triangles import filter_triangles
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import normalize_locations, objective, projected_length
-from sfm_shapefit.viewgraph import ViewGraph
 
 LOCATORS: dict[str, Callable[[ViewGraph], FloatArray]] = {
     "least-squares": locate_least_squares,

@@ -5,10 +5,10 @@
 Source: Ozyesil and Singer, "Robust camera location estimation by convex programming", CVPR 2015, eq. 7.
 """
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.baselines.normalize import normalize_locations
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.splitting.lud import solve_lud
-from sfm_shapefit.viewgraph import ViewGraph
 
 # So many steps reach the optimum; as a start of a refinement 50 suffice.
 _STEPS = 5000

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import projected_length
-from sfm_shapefit.viewgraph import ViewGraph
 
 
 def normalize_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from sfm_shapefit.errors import ShapeFitError, UnsolvableError
-from sfm_shapefit.extras import MissingExtraError
+from sfm_shapefit.base.errors import ShapeFitError, UnsolvableError
+from sfm_shapefit.base.extras import MissingExtraError
 
 if TYPE_CHECKING:
-    from sfm_shapefit.commands.stages.clock import Progress
-    from sfm_shapefit.commands.warm_up import Tell
-    from sfm_shapefit.results.model_verdict import ModelVerdict
+    from sfm_shapefit.facts.grade import ModelVerdict
+    from sfm_shapefit.pipeline.clock import Progress
+    from sfm_shapefit.pipeline.warm_up import Tell
 
 Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
@@ -160,8 +160,8 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
     Bars are written to a copy of stderr, which nobody silences. They do not go with the messages that
     pycolmap writes between them, so there are none if those are wanted.
     """
-    from sfm_shapefit.commands.warm_up import compile_together
-    from sfm_shapefit.jit import on_compilation
+    from sfm_shapefit.base.jit import on_compilation
+    from sfm_shapefit.pipeline.warm_up import compile_together
 
     if verbose:
         with on_compilation(lambda: _say(_COMPILING)), compile_together(say_now_and_then(), _say):
@@ -260,7 +260,7 @@ def print_steps(steps: Iterable[str]) -> None:
 
 def print_json(summary: dict[str, Any]) -> None:
     """Print a summary as JSON on stdout; one that is no UTF-8 gets escapes, which mean the same."""
-    from sfm_shapefit.results.tables import dumps
+    from sfm_shapefit.facts.tables import dumps
 
     text = dumps(summary)
     try:

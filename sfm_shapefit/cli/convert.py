@@ -41,7 +41,7 @@ def convert_command(
     if target_format is not None and target_format not in _FORMATS:
         raise typer.BadParameter(f"--format must be one of {', '.join(_FORMATS)}, got {target_format!r}")
     with report_errors(target):
-        from sfm_shapefit.commands.convert import convert
+        from sfm_shapefit.pipeline.convert import convert
 
         written = convert(source, target, target_format=target_format, overwrite=overwrite)  # type: ignore[arg-type]
         if not quiet:

@@ -5,15 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.wording import rounded
 from sfm_shapefit.cli.console import SEE_JSON, Rows, print_json, print_table, report_errors, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.wording import rounded
 
 if TYPE_CHECKING:
-    from sfm_shapefit.evaluation import Evaluation, PositionEvaluation, Recall
-    from sfm_shapefit.pose_errors import ErrorSummary
+    from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, Recall
+    from sfm_shapefit.scene.pose_errors import ErrorSummary
 
 _ROUNDING = 1e-9
 """Errors in degrees, and in the extent, that are no more than rounding."""
@@ -61,8 +61,8 @@ def evaluate_command(
     source = one_path(model, input_path, "MODEL")
     truth = one_path(reference, None, "REF")
     with report_errors():
-        from sfm_shapefit.commands.evaluate import evaluate, evaluate_against_table
-        from sfm_shapefit.results.tables import write_records
+        from sfm_shapefit.facts.tables import write_records
+        from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
 
         errors: Evaluation | PositionEvaluation
         if truth.is_file() and truth.suffix.lower() in _TABLES:
@@ -84,7 +84,7 @@ def evaluate_command(
 
 def _rows_of(errors: "Evaluation | PositionEvaluation") -> Rows:
     """Return the errors against a model or known positions."""
-    from sfm_shapefit.evaluation import Evaluation
+    from sfm_shapefit.scene.evaluation import Evaluation
 
     return _evaluation_table(errors) if isinstance(errors, Evaluation) else _position_table(errors)
 

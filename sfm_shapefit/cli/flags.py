@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.executors import ExecutorKind
-from sfm_shapefit.settings import Settings, groups_of, option
+from sfm_shapefit.base.executors import ExecutorKind
+from sfm_shapefit.base.settings import Settings, groups_of, option
 
 Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -152,7 +152,7 @@ class GroupedCommand(TyperCommand):
 
 def _refuse_extra(ctx: Any, extra: Sequence[str]) -> None:
     """Refuse more arguments than a command has; say where a database belongs, if one of them is that."""
-    from sfm_shapefit.formats.lines import is_database
+    from sfm_shapefit.files.lines import is_database
 
     paths = [value for value in ctx.params.values() if isinstance(value, Path)]
     for path in (*paths, *map(Path, extra)):
@@ -265,7 +265,7 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
 
 def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options."""
-    from sfm_shapefit.formats.lines import refuse_irregular_file
+    from sfm_shapefit.files.lines import refuse_irregular_file
 
     refuse_irregular_file(path)
     try:

@@ -22,9 +22,9 @@ from sfm_shapefit.cli.console import (
 from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
 
 if TYPE_CHECKING:
-    from sfm_shapefit.commands.stages.clock import Progress
-    from sfm_shapefit.kernel_cache import CompileTime
-    from sfm_shapefit.results.model_verdict import ModelVerdict
+    from sfm_shapefit.base.kernel_cache import CompileTime
+    from sfm_shapefit.facts.grade import ModelVerdict
+    from sfm_shapefit.pipeline.clock import Progress
 
 
 _NOTICED_S = 1.0
@@ -108,9 +108,9 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     Raises:
         InputError: if OUT is a model that no command of this program wrote, a database or another file.
     """
-    from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
-    from sfm_shapefit.errors import InputError
-    from sfm_shapefit.formats.lines import is_database
+    from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
+    from sfm_shapefit.base.errors import InputError
+    from sfm_shapefit.files.lines import is_database
 
     if order == "MODEL OUT" and is_database(target):
         raise InputError(f"{target} is a database, which goes by --database; the order is {order}")
@@ -140,7 +140,7 @@ def command_run(
     """
     started = time.perf_counter()
     with report_errors(target):
-        from sfm_shapefit.atomic_folder import claimed_output
+        from sfm_shapefit.base.atomic_folder import claimed_output
 
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
@@ -159,8 +159,8 @@ def command_run(
         if inputs[0] is not None:
             refuse_swapped(inputs[0], target, order)
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
-            from sfm_shapefit.colmap.quiet import hear_pycolmap
-            from sfm_shapefit.kernel_cache import measure_compilation
+            from sfm_shapefit.base.kernel_cache import measure_compilation
+            from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 
             catch_termination()
             with (

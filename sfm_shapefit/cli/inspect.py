@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import (
     NAMES_SHOWN,
     SEE_JSON,
@@ -20,12 +22,10 @@ from sfm_shapefit.cli.console import (
 )
 from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.wording import counted
+from sfm_shapefit.facts.options import LocateOptions
 
 if TYPE_CHECKING:
-    from sfm_shapefit.commands.inspect import Inspection
+    from sfm_shapefit.pipeline.inspect import Inspection
 
 _INSPECTED = (
     "directions",
@@ -68,7 +68,7 @@ def inspect_command(
     with report_errors():
         options = read_options(LocateOptions, given)
 
-        from sfm_shapefit.commands.inspect import inspect as inspect_model
+        from sfm_shapefit.pipeline.inspect import inspect as inspect_model
 
         catch_termination()
         with show_progress(not as_json) as progress:
@@ -87,7 +87,7 @@ def inspect_command(
 
 def _is_graph(source: Path) -> bool:
     """Tell a bare graph's file from a model, which may be another program's file."""
-    from sfm_shapefit.formats.models import is_model_file
+    from sfm_shapefit.files.models import is_model_file
 
     return source.is_file() and not is_model_file(source)
 

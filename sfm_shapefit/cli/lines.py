@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import OutputFlags
-from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
-    from sfm_shapefit.colmap.adjusted import Adjusted
+    from sfm_shapefit.adjustment.adjusted import Adjusted
 
 
 def further_piece_rows(facts: dict[str, Any]) -> Rows:
@@ -27,7 +27,7 @@ def further_piece_rows(facts: dict[str, Any]) -> Rows:
 
 def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     """Return a row on cameras whose intrinsics were in doubt, if there are any."""
-    from sfm_shapefit.results.intrinsics import describe_intrinsics
+    from sfm_shapefit.facts.intrinsics import describe_intrinsics
 
     lines = describe_intrinsics(facts["intrinsics"])
     return [("intrinsics", shorten(lines))] if lines else []
@@ -35,7 +35,7 @@ def intrinsics_rows(facts: dict[str, Any]) -> Rows:
 
 def rig_rows(facts: dict[str, Any]) -> Rows:
     """Return a row on sensors that were refined in their rigs, if there are any."""
-    from sfm_shapefit.results.rigs import describe_rigs
+    from sfm_shapefit.facts.rigs import describe_rigs
 
     lines = describe_rigs(facts["refined_rigs"])
     return [("rigs", shorten(lines))] if lines else []
@@ -43,7 +43,7 @@ def rig_rows(facts: dict[str, Any]) -> Rows:
 
 def control_point_rows(facts: dict[str, Any]) -> Rows:
     """Return a row on ground control points and their residuals, if there are any."""
-    from sfm_shapefit.results.control_points import describe_control_points
+    from sfm_shapefit.facts.control_points import describe_control_points
 
     said = describe_control_points(facts["control_points"])
     return [("control points", said)] if said else []
@@ -51,7 +51,7 @@ def control_point_rows(facts: dict[str, Any]) -> Rows:
 
 def scene_rows(facts: dict[str, Any]) -> Rows:
     """Return rows on straight drives, loops of videos, and doubtful pairs, if there are any."""
-    from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
+    from sfm_shapefit.facts.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
     said = {
         "straight": describe_line(facts["line_sigma"]),

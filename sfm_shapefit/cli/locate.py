@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
     Database,
@@ -32,11 +33,10 @@ from sfm_shapefit.cli.lines import (
     scene_rows,
 )
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.wording import counted
+from sfm_shapefit.facts.options import LocateOptions
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results.result import LocateResult
+    from sfm_shapefit.facts.result import LocateResult
 
 
 @app.command(
@@ -62,9 +62,9 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with command_run(LocateOptions, given, target, [source, database, priors]) as run:
-        from sfm_shapefit.commands.locate import locate
-        from sfm_shapefit.commands.stages.execution import open_executor
-        from sfm_shapefit.commands.write import write_result
+        from sfm_shapefit.pipeline.execution import open_executor
+        from sfm_shapefit.pipeline.locate import locate
+        from sfm_shapefit.pipeline.write import write_result
 
         with open_executor(executor, run.options.num_threads(), scheduler) as workers:
             found = locate(
@@ -78,7 +78,7 @@ def locate_command(
 
 def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results.key_figures import figure_rows
+    from sfm_shapefit.facts.key_figures import figure_rows
 
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -127,7 +127,7 @@ def _group_rows(facts: dict[str, Any]) -> Rows:
 
 def _describe_pairs(facts: dict[str, Any]) -> str:
     """Say what became of the pairs, in the words of `inspect`."""
-    from sfm_shapefit.directions.pair_directions import DirectionStatus
+    from sfm_shapefit.pairs.pair_directions import DirectionStatus
 
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
     ExecutorName,
@@ -29,11 +30,10 @@ from sfm_shapefit.cli.lines import (
     scene_rows,
 )
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.locate_options import MapOptions
-from sfm_shapefit.wording import counted
+from sfm_shapefit.facts.options import MapOptions
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results.map_result import MapResult
+    from sfm_shapefit.facts.map_result import MapResult
 
 
 @app.command(
@@ -60,9 +60,9 @@ def map_command(
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
-        from sfm_shapefit.commands.map import map_database
-        from sfm_shapefit.commands.stages.execution import open_executor
-        from sfm_shapefit.commands.write import write_result
+        from sfm_shapefit.pipeline.execution import open_executor
+        from sfm_shapefit.pipeline.map import map_database
+        from sfm_shapefit.pipeline.write import write_result
 
         with open_executor(executor, run.options.num_threads(), scheduler) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
@@ -74,7 +74,7 @@ def map_command(
 
 def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
     """Say what each model has, what was left out, and where it is."""
-    from sfm_shapefit.results.key_figures import figure_rows
+    from sfm_shapefit.facts.key_figures import figure_rows
 
     several = len(found.models) > 1
     figures: Rows = []

@@ -5,16 +5,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import further_piece_rows, name_pictures, next_steps
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results.result import GraphResult
+    from sfm_shapefit.facts.result import GraphResult
 
 
 @app.command("solve", cls=GroupedCommand, hidden=True, epilog="Example: sfm-shapefit place graph.txt out")
@@ -68,9 +68,9 @@ def place_command(
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
     with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
-        from sfm_shapefit.commands.place import place_graph_file
-        from sfm_shapefit.commands.write import write_result
-        from sfm_shapefit.results.exports import export_files
+        from sfm_shapefit.facts.exports import export_files
+        from sfm_shapefit.pipeline.place import place_graph_file
+        from sfm_shapefit.pipeline.write import write_result
 
         found = place_graph_file(
             source,
@@ -89,7 +89,7 @@ def place_command(
 
 def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.results.key_figures import figure_rows
+    from sfm_shapefit.facts.key_figures import figure_rows
 
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]

@@ -61,7 +61,7 @@ def report_command(
     """
     folder = one_path(source, None, "OUT")
     with report_errors():
-        from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
+        from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
 
         if any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
             for name, value in (("--database", database), ("--write-to", write_to)):
@@ -74,7 +74,7 @@ def report_command(
 
 def _report_output(folder: Path, scene: bool, images: Path | None) -> None:
     """Write the report of what `locate` or `place` wrote."""
-    from sfm_shapefit.errors import InputError
+    from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.report.mesh import write_meshes
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.read_back import read_output
@@ -97,9 +97,9 @@ def _report_model(
     folder: Path, database: Path | None, page: Path, overwrite: bool, images: Path | None
 ) -> None:
     """Write the report of any COLMAP model."""
-    from sfm_shapefit.colmap.quiet import hear_pycolmap
-    from sfm_shapefit.commands.examine import examine
-    from sfm_shapefit.errors import InputError
+    from sfm_shapefit.base.errors import InputError
+    from sfm_shapefit.files.colmap.quiet import hear_pycolmap
+    from sfm_shapefit.pipeline.examine import examine
     from sfm_shapefit.report.first_screen import banner
     from sfm_shapefit.report.page import write_report
 
@@ -122,7 +122,7 @@ def _report_model(
 
 def _pictures(drawn: "Drawing", images: Path | None) -> dict[int, str] | None:
     """Return small pictures of the images, if they are asked for."""
-    from sfm_shapefit.errors import InputError
+    from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.report.sentences import shorten
     from sfm_shapefit.report.thumbnails import thumbnails_of
 

@@ -5,10 +5,10 @@ from typing import Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputPath, one_path, read_options, takes
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
 Images = Annotated[

@@ -9,7 +9,7 @@ import heapq
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 
 
 def find_bodies(num_nodes: int, pairs: IntArray, weights: FloatArray) -> IntArray:

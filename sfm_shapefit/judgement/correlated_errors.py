@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.directions.matches import MatchBatch
-from sfm_shapefit.geometry import tangent_bases
-from sfm_shapefit.jit import cross, inner_kernel, kernel, mix_bits
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.base.jit import cross, inner_kernel, kernel, mix_bits
+from sfm_shapefit.scene.matches import MatchBatch
 
 NUM_SAMPLES = 96
 """Standard deviations from so many samples are right to 7 %."""

@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE
 from sfm_shapefit.judgement.turns import RIGHT_SHARE, TURNED_SHARE, Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment

@@ -41,12 +41,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.matches import RayMatches
-from sfm_shapefit.directions.pair_directions import is_usable
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.rotations.two_view_poses import refine_two_view_poses
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.pair_directions import is_usable
+from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
+from sfm_shapefit.scene.matches import RayMatches
 
 _COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
 _FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)

@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.judgement.uncertainty import Uncertainty, inform, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.program import adjoint
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 # Share of each block's trace that is added.
 _RIDGE = 1e-12

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 
 _ROBUST_SIGMAS = 3.5
 _PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)

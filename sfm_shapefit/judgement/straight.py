@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 
 # All but a few directions lie within this angle of the line.
 _MOST_DEG, _SHARE = 1.0, 0.95

@@ -37,12 +37,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.conditioning import FEW_PAIRS, Conditioning, Looseness
-from sfm_shapefit.measured import Evidence, MeasuredGraph
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Looseness
 
 # A pair agrees within this angle, or within so many of its standard deviations.
 _AGREEING_ANGLE_RAD = np.radians(3.0)

@@ -47,12 +47,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.pair_directions import PairDirections, is_usable
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.small_turns import solve_corrections
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
-from sfm_shapefit.rotations.two_view_poses import LAST_WIDTH_PX
+from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
 
 # Matches of a pair that count as independent, for its turn and for its vote.
 _INDEPENDENT_MATCHES = 20.0

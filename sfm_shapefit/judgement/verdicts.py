@@ -24,17 +24,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import angle_between_deg, distances_in_spreads, normalized, tangent_bases
-from sfm_shapefit.judgement.conditioning import LooseGroup, condition
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import angle_between_deg, distances_in_spreads, normalized, tangent_bases
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.measured import MeasuredGraph
-from sfm_shapefit.rigidity import parallel_rigid_pieces
+from sfm_shapefit.placement.conditioning import LooseGroup, condition
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.solver.rigs.tied import largest_tied
 

@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.jit import inner_kernel, kernel, mix_bits
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
 # A residual so many times the least so far shows that rounding leads, and no longer the system.

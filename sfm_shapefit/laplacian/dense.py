@@ -2,7 +2,7 @@
 
 All matrices are column-major blocks, given by address and leading dimension, and only lower triangles are
 read or written. A kernel is handed the `blas_of` the type, float32 or float64, and is compiled once for both.
-Addresses are arguments, so the compiled kernels stay cached on disk (`sfm_shapefit.jit`). The arrays behind
+Addresses are arguments, so the compiled kernels stay cached on disk (`base/jit`). The arrays behind
 them must outlive the call.
 
 BLAS with two threads splits, and hence rounds, differently from BLAS with one. `one_blas_thread` holds it to
@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
-from sfm_shapefit.arrays import IntArray, frozen
-from sfm_shapefit.jit import array_address, call_address, function_address, inner_kernel, kernel
+from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.jit import array_address, call_address, function_address, inner_kernel, kernel
 
 Block = tuple[int, int]
 """The address of the first entry of a matrix, and its leading dimension."""

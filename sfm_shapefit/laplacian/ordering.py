@@ -15,8 +15,8 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import spilu
 
-from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency
 from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 

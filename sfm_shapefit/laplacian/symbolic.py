@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import IntArray, frozen
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array, group_by
 
 DEFAULT_FACTOR_BYTES = 2_000_000_000

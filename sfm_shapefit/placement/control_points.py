@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, median_spread
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, median_spread
 from sfm_shapefit.placement.gauge import Datum, Gauge, PositionPriors, fit_to_priors
+from sfm_shapefit.scene.known_positions import KnownPositions
 
 FEWEST_CONTROL_POINTS = 3
 _PARAMETERS = 7

@@ -26,18 +26,18 @@ from typing import Annotated
 import numpy as np
 from scipy.sparse import coo_array
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.triangles import triangle_scores
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.judgement.conditioning import FEW_PAIRS, NEARLY_PARALLEL, direction_spread
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.rigidity import RigidPiece, left_out_reasons
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.triangles import triangle_scores
+from sfm_shapefit.placement.conditioning import FEW_PAIRS, NEARLY_PARALLEL, direction_spread
 from sfm_shapefit.placement.place import count_large, order_pieces, refuse_without_triangle
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import has_second_start
-from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
 from sfm_shapefit.solver.solve import choose_method
 from sfm_shapefit.theory import RecoveryConditions, recovery_conditions
-from sfm_shapefit.viewgraph import ViewGraph
 
 WRONG_SCORE_RAD = 0.3
 """Mean angle to its triangles from which a pair counts as wrong; see above."""

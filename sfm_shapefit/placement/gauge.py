@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import (
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import (
     MEDIAN_NORMAL_LENGTH,
     METRIC_SIGMA,
     SIGMA_PER_MEDIAN,
@@ -23,8 +23,8 @@ from sfm_shapefit.geometry import (
     median_spread,
     rotation_angles_deg,
 )
-from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.refinement.options import Scale
+from sfm_shapefit.scene.known_positions import KnownPositions
 
 # An input center that is farther off, of the spread of all, is lost and must not set the scale.
 _CAP_OF_SIZE = 0.5

@@ -21,9 +21,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.priors import cross_matrices
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.geometry import (
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import (
     Similarity,
     compose,
     fit_similarity,
@@ -34,8 +34,8 @@ from sfm_shapefit.geometry import (
     normalized,
     rotation_angles_deg,
 )
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.placement.gauge import PositionPriors, fit_to_priors, prior_gauge
-from sfm_shapefit.wording import counted
 
 FEWEST_WITNESSES = 3
 """Pairs of images, or known positions in each model, that a join needs."""

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.geometry import fit_similarity_l1, median_spread
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.options import PlacementOptions
 

@@ -11,25 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.baselines import FILTERS, solve_baseline
-from sfm_shapefit.display import Displayed
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.heap import hand_back_memory
-from sfm_shapefit.judgement.second_configuration import SecondConfiguration, find_second_configuration
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
-from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
-from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.solve import solve_groups
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""

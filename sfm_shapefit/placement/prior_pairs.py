@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH, angle_between, normalized
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between, normalized
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors
 
 # A direction contradicts its baseline beyond so many standard deviations of it, and beyond so many degrees.

@@ -6,13 +6,13 @@ scale of their offsets; the others hang free, with any scale.
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 

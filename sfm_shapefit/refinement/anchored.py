@@ -11,9 +11,9 @@ everything, is settled by that node. Units are those of the anchors; directions 
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.refinement.angular import (
     DAMPING,
@@ -26,8 +26,8 @@ from sfm_shapefit.refinement.angular import (
     take_step,
 )
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape
+from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.program import adjoint
-from sfm_shapefit.viewgraph import ViewGraph
 
 _MAX_STEPS = 40
 # A step that lowers the cost by less than this share of it is the last one.

@@ -30,10 +30,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import median_spread, tangent_bases
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import median_spread, tangent_bases
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
@@ -42,7 +43,6 @@ from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor
-from sfm_shapefit.viewgraph import ViewGraph
 
 KERNEL_WIDTH = 3.0
 """k: a residual of so many standard deviations counts half of what it can."""

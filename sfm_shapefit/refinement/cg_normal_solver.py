@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver.program import adjoint, differences
-from sfm_shapefit.viewgraph import ViewGraph
 
 # A step is solved until its residual has fallen to this share.
 _REDUCTION = 1e-2

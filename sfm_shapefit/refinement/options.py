@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from sfm_shapefit.settings import explained, option
+from sfm_shapefit.base.settings import explained, option
 from sfm_shapefit.solver.options import SolverOptions
 
 Filter = Literal["none", "1dsfm", "triangles"]

@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
-from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.refinement.angular import (
     AngularResult,
     Metric,
@@ -34,7 +35,6 @@ from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
-from sfm_shapefit.viewgraph import ViewGraph
 
 COLLAPSED = 0.3
 """Disagreement of the starts beyond which one of them has collapsed."""

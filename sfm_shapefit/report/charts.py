@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.report.drawing import PairClass, Pairs
 
 # Smaller residuals count in the first bin.

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
+from sfm_shapefit.facts.rows import covariance_of
+from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.results.rows import covariance_of
-from sfm_shapefit.results.tables import CameraRow, PairRow
 
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.colmap.model import PosedModel
+    from sfm_shapefit.files.colmap.model import PosedModel
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""

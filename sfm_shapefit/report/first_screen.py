@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from sfm_shapefit.base.wording import rounded
+from sfm_shapefit.facts.key_figures import NOISE_ONLY
+from sfm_shapefit.facts.tables import IN_MEMORY
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
-from sfm_shapefit.results.key_figures import NOISE_ONLY
-from sfm_shapefit.results.tables import IN_MEMORY
-from sfm_shapefit.wording import rounded
 
 # Folders of these names say nothing of the scene.
 _NAMELESS = {"sparse", "dense", "model", "models", "colmap", "text", "triangulated", "database", "."}

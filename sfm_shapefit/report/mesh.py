@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners
 
 if TYPE_CHECKING:

@@ -22,8 +22,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.facts.control_points import control_cells
+from sfm_shapefit.facts.json_types import ControlPoint, LoopOfVideo
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.scene_words import loop_cells
 from sfm_shapefit.report.charts import (
     MOST_CELLS,
     Bars,
@@ -41,9 +44,6 @@ from sfm_shapefit.report.sentences import (
     shorten,
     summary_sentences,
 )
-from sfm_shapefit.results.control_points import control_cells
-from sfm_shapefit.results.json_types import ControlPoint, LoopOfVideo
-from sfm_shapefit.results.scene_words import loop_cells
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""

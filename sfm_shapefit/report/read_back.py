@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.result import GraphResult, LocateResult
+from sfm_shapefit.facts.tables import CameraRow, PairRow, read_rows
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.report.drawing import Drawing, build_drawing, poses_of
-from sfm_shapefit.results.result import GraphResult, LocateResult
-from sfm_shapefit.results.tables import CameraRow, PairRow, read_rows
 
 
 def draw_result(found: LocateResult | GraphResult) -> Drawing:

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.facts.intrinsics import describe_intrinsics
+from sfm_shapefit.facts.rigs import describe_rigs
+from sfm_shapefit.facts.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 from sfm_shapefit.report.drawing import Drawing, PairClass
-from sfm_shapefit.results.intrinsics import describe_intrinsics
-from sfm_shapefit.results.rigs import describe_rigs
-from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.report.drawing import Drawing
 
 MAX_BYTES = 4_000_000

@@ -24,8 +24,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
     Linearized,
@@ -40,8 +42,6 @@ from sfm_shapefit.rotations.averaging_kernels import cap_information, residual_s
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenvalues, plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import DualCertificate, certify_rotations
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
-from sfm_shapefit.viewgraph import connected_components
 
 # Standard deviation that is added to that of a pair: calibration is not exact, and matches share errors.
 _FLOOR = np.radians(0.05)

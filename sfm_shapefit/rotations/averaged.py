@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.display import Displayed
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.rotations.options import Averaging
 
 AGREEMENT_DEG = 5.0

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.jit import inner_kernel, kernel
 
 
 @inner_kernel

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
     Preconditioner,

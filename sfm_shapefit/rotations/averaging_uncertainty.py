@@ -30,13 +30,13 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_kernels import sum_blocks
 from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
-from sfm_shapefit.viewgraph import connected_components
 
 _LOSS_FACTOR = 0.823
 _MEDIAN_SQUARE = 2.366

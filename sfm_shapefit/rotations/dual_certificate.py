@@ -35,8 +35,8 @@ import numpy as np
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.rotations.annealing import LONGEST_STEP
 from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem

@@ -13,10 +13,10 @@ Images need no pair inside their frame: sensors that look opposite ways are tied
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.geometry import rotation_angles_deg
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 
 def relative_rotations_of_frames(

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import angle_between, normalized
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import angle_between, normalized
 from sfm_shapefit.rotations.annealing import (
     LAST_REDUCTION,
     LONGEST_STEP,

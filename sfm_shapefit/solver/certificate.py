@@ -42,9 +42,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.jit import array_address, kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.jit import array_address, kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorize
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
@@ -54,7 +55,6 @@ from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
-from sfm_shapefit.viewgraph import ViewGraph
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
 _ROUNDS = 8

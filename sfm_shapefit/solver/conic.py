@@ -6,7 +6,7 @@ v_e; camera 0 is grounded, which is sum_i t_i = 0 after centering:
     minimize    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
-With groups (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, group 0 grounded. The
+With groups (`sfm_shapefit.graph.groups`) t = A x, and x takes the place of t, group 0 grounded. The
 multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow, and trusted: every other solver
 is tested against it.
 """
@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import coo_array, csr_array, hstack
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import tangent_bases
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import scale_functional
-from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:  # rigs.solve calls this solver
-    from sfm_shapefit.solver.rigs.groups import RigidGroups
+    from sfm_shapefit.graph.groups import RigidGroups
 
 # The least tolerance that double precision can still serve.
 _LEAST_CONE_TOL = 1e-12

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 
 FEW_UNKNOWNS = 450
 """Up to so many unknowns a sparse factor does not pay, whatever the graph."""

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from sfm_shapefit.display import Displayed
-from sfm_shapefit.settings import Settings, explained, option
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.settings import Settings, explained, option
 
 if TYPE_CHECKING:  # numpy is not cheap
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
 
 Solver = Literal["auto", "newton", "admm", "conic"]
 

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 
 
 def differences(t: FloatArray, edges: IntArray) -> FloatArray:

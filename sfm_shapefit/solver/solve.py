@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, frozen
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.arrays import FloatArray, frozen
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.graph.rigidity import is_parallel_rigid
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.rigidity import is_parallel_rigid
-from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
@@ -20,7 +21,6 @@ from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import normalize_locations, scale_functional
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
-from sfm_shapefit.viewgraph import ViewGraph
 
 # The scale constraint says nothing where c is smaller than this, relative to the sum of weights.
 _DIRECTIONS_CANCEL = 1e-9
@@ -182,7 +182,7 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
             )
         raise UnsolvableError(
             "the graph is not parallel rigid, so the directions do not determine the locations; "
-            "solve its largest piece (sfm_shapefit.rigidity.rigid_pieces)"
+            "solve its largest piece (sfm_shapefit.graph.rigidity.rigid_pieces)"
         )
     c = scale_functional(graph)
     if np.linalg.norm(c) <= _DIRECTIONS_CANCEL * graph.weights.sum():

@@ -51,7 +51,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 
 if TYPE_CHECKING:
     import pycolmap

@@ -33,9 +33,9 @@ from typing import Literal, TypedDict, Unpack, get_args
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
 
 Seed = int | np.random.Generator
 Corruption = Literal["uniform", "self-consistent", "concentrated"]

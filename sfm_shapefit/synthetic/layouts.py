@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.mounts import Rigs, mounted
 from sfm_shapefit.synthetic.options import SceneOptions, Shape
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.seed import write_model
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.files.colmap.seed import write_model
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
 from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import ModelContent

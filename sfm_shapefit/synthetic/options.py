@@ -7,10 +7,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from sfm_shapefit.settings import Settings, explained, option
+from sfm_shapefit.base.settings import Settings, explained, option
 
 if TYPE_CHECKING:  # numpy is not cheap
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.base.arrays import FloatArray
 
 RigKind = Literal["none", "pair", "back-to-back", "four"]
 Shape = Literal["ring", "facade", "drive", "cloud", "courtyard"]

@@ -17,12 +17,13 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.database import open_database
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.quiet import quiet_log
-from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.synthetic.models import (
     ModelParts,
     Points,
@@ -35,7 +36,6 @@ from sfm_shapefit.synthetic.models import (
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
 from sfm_shapefit.synthetic.workspace import compact_database
-from sfm_shapefit.viewgraph import connected_components
 
 # A right match is off by no more: this is COLMAP's own limit for inliers.
 _LARGEST_ERROR_PX = 4.0

@@ -26,9 +26,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras, lay_out_scene, state_rotations
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces

@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
 from sfm_shapefit.synthetic.mounts import Rigs, yawed
 from sfm_shapefit.synthetic.options import SceneOptions

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
 _NOISE_OF_100_MATCHES_DEG = 0.3
 

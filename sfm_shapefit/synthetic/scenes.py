@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic.layouts import (
     FARTHEST_M,
     ByteArray,

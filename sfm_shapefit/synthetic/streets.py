@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.graphs import GraphProblem, Seed, noisy_directions
 
 # A camera is paired with so many cameras ahead.

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import FARTHEST_M, ByteArray, street
 from sfm_shapefit.synthetic.options import Shape
 from sfm_shapefit.synthetic.textures import facade_texture, ground_texture

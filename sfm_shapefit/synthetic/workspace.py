@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.atomic_folder import atomic_folder
+from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts, Points
 from sfm_shapefit.synthetic.options import WorkspaceOptions

@@ -26,9 +26,9 @@ from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, smal
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.solve import values_of
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.adjustment.made import LENSES, disturb, look_at, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)

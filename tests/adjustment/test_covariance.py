@@ -16,8 +16,8 @@ from sfm_shapefit.adjustment import (
 from sfm_shapefit.adjustment.gauge import small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
-from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.adjustment.made import ring_problem
 from tests.adjustment.test_derivatives import whole_matrix
 

@@ -16,8 +16,8 @@ from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.priors import sum_priors
 from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals, sum_losses
 from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
-from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.adjustment.made import LENSES, disturb, ring_problem
 
 STEP = 1e-5  # central differences are off by its square times third derivatives, 1e-9 of the first ones here

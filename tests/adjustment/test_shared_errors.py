@@ -15,7 +15,7 @@ from sfm_shapefit.adjustment import (
     shared_errors,
 )
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
-from sfm_shapefit.geometry import METRIC_SIGMA, fit_similarity_l1
+from sfm_shapefit.base.geometry import METRIC_SIGMA, fit_similarity_l1
 from tests.adjustment.made import ring_problem
 
 OPTIONS = AdjustmentOptions(loss_scale_px=1.0, noise_px=0.5, cost_tolerance=1e-8)

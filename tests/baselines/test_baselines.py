@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import baselines
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.baselines.onedsfm import onedsfm_scores
-from sfm_shapefit.directions.triangles import triangle_scores
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import box_graph_problem, random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import exact_graph, shape_error
 
 

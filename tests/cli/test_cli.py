@@ -14,15 +14,15 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import sfm_shapefit
-from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.cli import app
-from sfm_shapefit.commands.map import database_in
-from sfm_shapefit.formats.graph_text import graph_text
-from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.facts.key_figures import figure_rows
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.graph_text import graph_text
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.map import database_in
 from sfm_shapefit.report.first_screen import tiles
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.results.key_figures import figure_rows
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
 from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, edit_database, fingerprint
@@ -402,7 +402,7 @@ def test_a_signal_while_writing_leaves_nothing(tmp_path):
     script = f"""
 import os, signal, sys
 from sfm_shapefit import cli
-from sfm_shapefit.commands import write as files
+from sfm_shapefit.pipeline import write as files
 files.write_rows = lambda *_: os.kill(os.getpid(), signal.SIGTERM)
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()

@@ -13,12 +13,12 @@ from functools import partial
 import pytest
 
 from sfm_shapefit import locate
+from sfm_shapefit.base.kernel_cache import counted_as_compiling, measure_compilation
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
 from sfm_shapefit.cli.flags import OutputFlags
 from sfm_shapefit.cli.frame import Run
-from sfm_shapefit.kernel_cache import counted_as_compiling, measure_compilation
-from sfm_shapefit.results.model_verdict import Grade, ModelVerdict
+from sfm_shapefit.facts.grade import Grade, ModelVerdict
 from tests.program import run
 from tests.scenes import FACADE, RING, ROOT
 

@@ -7,12 +7,12 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.colmap import relative_rotations
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
-from sfm_shapefit.commands.stages import doubts as doubts_stage
-from sfm_shapefit.geometry import rotation_angles_deg
+from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.turns import Doubt
+from sfm_shapefit.pairs import essential as relative_rotations
+from sfm_shapefit.pairs.essential import estimate_relative_rotations
+from sfm_shapefit.pipeline import doubts as doubts_stage
 from tests.scenes import BUNDLED, COURTYARD, real_scene
 
 PHOTOGRAPHED = BUNDLED / "photographed"

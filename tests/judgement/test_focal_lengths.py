@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.directions.matches import RayMatches
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.focal_lengths import Lenses, doubt_focal_lengths
+from sfm_shapefit.scene.matches import RayMatches
 from tests.problems import all_pairs, random_rotations
 
 FOCAL_PX = 900.0

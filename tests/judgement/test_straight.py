@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 
 ALONG = np.array([0.6, 0.0, 0.8])

@@ -5,14 +5,14 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.conditioning import condition
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.verdicts import assess
-from sfm_shapefit.measured import Evidence, MeasuredGraph
+from sfm_shapefit.placement.conditioning import condition
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import make_evidence
 from tests.scenes import COURTYARD, real_scene
 

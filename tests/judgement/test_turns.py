@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.judgement.turns import Doubt, PairTurns, find_turned, weigh_pairs
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from tests.problems import all_pairs, random_rotations, turn
 
 SIGMA_RAD = np.radians(0.2)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.geometry import normalized, tangent_bases
-from sfm_shapefit.judgement.conditioning import Looseness
+from sfm_shapefit.base.geometry import normalized, tangent_bases
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import Verdict, assess
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.conditioning import Looseness
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, fit_angles, make_evidence
 
 SIGMA = 0.01  # rad, per axis

@@ -11,8 +11,8 @@ from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_info
 
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.laplacian import ordering
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize

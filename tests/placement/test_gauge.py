@@ -11,19 +11,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import InputError, LocateOptions, locate
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
-from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
-from sfm_shapefit.commands.stages.rigs import find_rigid_parts
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.facts.warnings import prior_warnings
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
 from sfm_shapefit.placement.prior_pairs import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
-from sfm_shapefit.results.warnings import prior_warnings
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
 from tests.scenes import RING
 

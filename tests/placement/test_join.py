@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import Similarity, compose, invert, median_spread, normalized, rotation_angles_deg
-from sfm_shapefit.known_positions import KnownPositions
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import (
+    Similarity,
+    compose,
+    invert,
+    median_spread,
+    normalized,
+    rotation_angles_deg,
+)
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import Ties, join_by_matches, join_by_priors, place_by_priors
+from sfm_shapefit.scene.known_positions import KnownPositions
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 TRUTH = Similarity(scale=2.5, rotation=TURN, translation=np.array([3.0, -1.0, 4.0]))

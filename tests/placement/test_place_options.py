@@ -5,21 +5,21 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.known_positions import KnownPositions
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.facts.warnings import quality_warnings
+from sfm_shapefit.graph.groups import separate
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.gauge import PositionPriors, prior_gauge
 from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.results.warnings import quality_warnings
+from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import separate
 from sfm_shapefit.synthetic import random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import rig_problem
 
 NUM_FRAMES, SENSORS = 12, 3

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.facts.rows import camera_rows, pair_rows
+from sfm_shapefit.facts.warnings import quality_warnings
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.place import place, place_further
-from sfm_shapefit.results.rows import camera_rows, pair_rows
-from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
 
 

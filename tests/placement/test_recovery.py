@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.program import differences
 from tests.problems import fit_angles, shape_error

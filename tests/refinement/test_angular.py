@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.geometry import median_spread, normalized, tangent_bases
+from sfm_shapefit.base.geometry import median_spread, normalized, tangent_bases
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement.angular import (
     AngularTerms,
@@ -17,7 +18,6 @@ from sfm_shapefit.refinement.angular import (
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import fit_angles, shape, shape_error
 
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.geometry import median_spread, normalized
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.geometry import median_spread, normalized
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -13,7 +14,6 @@ from sfm_shapefit.refinement.starts import refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph, shape_error
 
 N = 20

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.facts.warnings import quality_warnings
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refine_starts
-from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import shape_error
 
 

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import (
     reprojection_error_bars,
@@ -23,7 +24,6 @@ from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
-from sfm_shapefit.results.tables import CameraRow
 from tests.drawings import make_drawing
 
 HOSTILE = [

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 NUM = 24
 TURN = 360.0 / NUM

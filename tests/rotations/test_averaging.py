@@ -7,8 +7,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.rotations import annealing, averaging_system, averaging_uncertainty, dual_certificate
 from sfm_shapefit.rotations.annealing import Linearized
 from sfm_shapefit.rotations.average import average_relative_rotations, average_rotations, check_pairs

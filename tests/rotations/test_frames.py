@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 FRAME_OF_IMAGE = np.array([0, 0, 1, 1, 2, 2])
 ROWS = [(0, 1), (0, 2), (0, 3), (1, 3), (1, 4), (2, 5)]

@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit.colmap.gravity import database_gravity, table_gravity
-from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.gravity import refine_with_gravity
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
+from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.pipeline.gravity import refine_with_gravity
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.gravity import DOWN, Gravity, down_of, judge_gravity
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem

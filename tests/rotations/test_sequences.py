@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import confirm_videos, find_videos, judge_loops, loop_pairs
 
 FRAMES = 60

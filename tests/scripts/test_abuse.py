@@ -10,8 +10,8 @@ import pytest
 
 from abuse import determinism, verdicts
 from abuse.fuzz import make_base
-from sfm_shapefit.commands.locate import locate
-from sfm_shapefit.commands.write import write_result
+from sfm_shapefit.pipeline.locate import locate
+from sfm_shapefit.pipeline.write import write_result
 from tests.program import run_python
 from tests.scenes import COURTYARD, FACADE, RING, ROOT
 

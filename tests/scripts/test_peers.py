@@ -15,7 +15,7 @@ from peers import colmap, on_graphs, on_scenes
 from peers.clarabel_direct import solve_direct
 from peers.on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
 from sfm_shapefit import certify
-from sfm_shapefit.colmap.quiet import quiet_log
+from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)

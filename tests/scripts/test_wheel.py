@@ -7,7 +7,7 @@ import pytest
 
 import kernel_wheel
 from harness.installed import install
-from sfm_shapefit.kernel_cache import here
+from sfm_shapefit.base.kernel_cache import here
 from tests.scenes import fingerprint
 
 COMMANDS = """

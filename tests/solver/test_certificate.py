@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver import certificate
@@ -15,7 +16,6 @@ from sfm_shapefit.solver.program import across, adjoint, differences, objective,
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
 from tests.problems import exact_graph, measure_graph, solve_admm
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
@@ -20,7 +21,6 @@ from sfm_shapefit.solver.program import (
     objective,
     scale_functional,
 )
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import draw_graph, shape
 
 TOL = 1e-8

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.geometry import normalized
-from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.groups import RigidGroups, separate
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
@@ -15,14 +17,12 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.rigs import solve as groups_solve
 from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.rigs.solve import solve_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.lud import solve_lud
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import outer, rig_problem
 
 

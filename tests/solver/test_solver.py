@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.options import SolverOptions, Status
@@ -23,7 +24,6 @@ from sfm_shapefit.solver.program import (
 from sfm_shapefit.solver.solve import choose_method, solve
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph, shape
 
 TOL = SolverOptions().tol

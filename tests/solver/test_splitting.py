@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
@@ -31,7 +32,6 @@ from sfm_shapefit.solver.splitting.linear import (
 )
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
-from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
 from tests.problems import shape, solve_admm
 

@@ -8,8 +8,8 @@ import pytest
 
 from scripts.make_data import SCENES
 from sfm_shapefit import evaluate, locate
-from sfm_shapefit.commands.map import map_database
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.synthetic import (
     RenderedScene,
     RenderOptions,

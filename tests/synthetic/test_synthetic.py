@@ -15,8 +15,8 @@ from scipy.sparse.csgraph import connected_components
 
 from scripts.make_data import SCENES, write_scene
 from sfm_shapefit import synthetic
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import BUNDLED

@@ -4,9 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import array_address, inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
@@ -34,7 +35,6 @@ from sfm_shapefit.solver.newton.steps import (
     take_step,
 )
 from sfm_shapefit.solver.options import OnIteration
-from sfm_shapefit.viewgraph import ViewGraph
 
 _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 """By bytes per number: first and last multiple of the identity added to M, per mean eigenvalue."""

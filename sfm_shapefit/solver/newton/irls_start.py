@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.solver.newton.steps import (
     LEAST_MU,
     MU_PER_GAP,

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
@@ -23,7 +24,6 @@ from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, Problem, Progress, Work
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
-from sfm_shapefit.viewgraph import ViewGraph
 
 # Added to the blocks in turn until the matrix is positive definite, per stiffness of the edge.
 _RIDGES = 0.0, 1e-12, 1e-10

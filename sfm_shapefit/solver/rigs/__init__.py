@@ -1,6 +1,6 @@
 """ShapeFit over rigid groups: known offsets inside each, one unknown scale s for all of them.
 
-With t = A x, x = (f, s) (`sfm_shapefit.solver.rigs.groups`), the program is
+With t = A x, x = (f, s) (`sfm_shapefit.graph.groups`), the program is
 
     minimize    R(A x) = sum_e w_e || P_e (t_i - t_j) ||      over the pairs between two groups
     subject to  L(A x) = <c, A x> = kappa,  sum_b f_b = 0,         c = D^T (w v)

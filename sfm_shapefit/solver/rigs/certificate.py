@@ -6,14 +6,14 @@ reduced matrix of these is regular with one pair pinned, nothing else does.
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
-from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, frozen
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import REGULAR, REPAIRS, RESIDUAL_FLOOR, STRICT, Certificate
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.viewgraph import ViewGraph
 
 # Locations may be off those of rigid groups by this share of their extent, which is rounding.
 _OFF_GROUPS = 1e-9

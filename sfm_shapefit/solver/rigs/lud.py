@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
-from sfm_shapefit.viewgraph import ViewGraph
 
 # As the start of a refinement that is enough; more hardly moves it.
 _MAX_STEPS = 150

@@ -12,11 +12,11 @@ eta - h^T K^-1 h. Translations are taken away by grounding one group.
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray, sum_by
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
 from sfm_shapefit.solver.newton.reduction import Reduction
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 # What is left of s when all groups may move is rounding below this share of eta.
 _LEAST_SCHUR = 1e-13

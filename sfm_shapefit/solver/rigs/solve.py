@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.certificate import Certificate
 from sfm_shapefit.solver.conic import solve_conic
@@ -14,10 +16,8 @@ from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.solve import Choice, run_choice
-from sfm_shapefit.viewgraph import ViewGraph
 
 # A^T c counts as 0 below this size, relative to the sum of weights.
 _DIRECTIONS_CANCEL = 1e-12

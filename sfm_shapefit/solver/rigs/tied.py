@@ -14,13 +14,13 @@ baselines.
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.viewgraph import connected_components
 
 _EPSILON = 1e-10
 _STEPS = 4

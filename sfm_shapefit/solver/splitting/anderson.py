@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.solver.splitting.edges import EdgePasses
 
 # Added to the Gram matrix, relative to the mean squared column: the differences are kept to 1e-7.

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import Workers
-from sfm_shapefit.viewgraph import ViewGraph
 
 _CHUNKS = 4
 # So many edges are gathered and then worked on together.

@@ -10,7 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
     Preconditioner,
@@ -21,7 +22,6 @@ from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorization
-from sfm_shapefit.viewgraph import ViewGraph
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
 # factorizations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of

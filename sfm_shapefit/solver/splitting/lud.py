@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.options import OnIteration
@@ -26,7 +27,6 @@ from sfm_shapefit.solver.program import across, adjoint, along, differences
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
-from sfm_shapefit.viewgraph import ViewGraph
 
 _LEAST_LENGTH = 1.0
 _TUNING = Tuning(relaxation=1.6, renewals=(), penalty=1.0, accelerate=False)

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Outcome, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
-from sfm_shapefit.viewgraph import ViewGraph
 
 _TUNING = Tuning(relaxation=1.7, renewals=tuple(10 * 2**k for k in range(8)), penalty=0.5, accelerate=True)
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
@@ -27,7 +28,6 @@ from sfm_shapefit.solver.splitting.linear import (
     laplacian_factor,
 )
 from sfm_shapefit.solver.splitting.shapefit import Splitting
-from sfm_shapefit.viewgraph import ViewGraph
 
 # The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
 _FIRST_TARGET_PER_TOL = 0.3

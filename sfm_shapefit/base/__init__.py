@@ -1,0 +1,1 @@
+"""What every room uses: errors, arrays, kernels, settings, geometry, folders; knows nothing of cameras."""

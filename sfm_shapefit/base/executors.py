@@ -1,0 +1,66 @@
+"""Work shared out to any `concurrent.futures` executor, in order, and reported where a worker dies."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future
+from typing import Literal, TypeVar
+
+from sfm_shapefit.base.errors import ShapeFitError
+
+ExecutorKind = Literal["serial", "processes", "dask"]
+"""No executor, processes of this machine, or a cluster."""
+
+Task = TypeVar("Task")
+Answer = TypeVar("Answer")
+
+# So many tasks are on their way at once, which bounds the memory that they take.
+_TASKS_AT_ONCE = 32
+
+
+class WorkerError(ShapeFitError):
+    """A worker died, or the scheduler could not be reached."""
+
+
+def answers(
+    executor: Executor | None, work: Callable[[Task], Answer], tasks: Iterable[Task]
+) -> Iterator[tuple[Task, Answer]]:
+    """Yield each task with what an executor's workers make of it, in the order of the tasks.
+
+    Args:
+        executor: submits tasks, a few ahead of the answers; it is not shut down. None: all is done here.
+        work: a function of a module, so that other processes find it.
+        tasks: its arguments, which are pickled on the way to other processes.
+
+    Raises:
+        WorkerError: if a worker died and the executor does not replace it.
+        ShapeFitError: as a worker raised it.
+    """
+    if executor is None:
+        for task in tasks:
+            yield task, work(task)
+        return
+    sent: deque[tuple[Task, Future[Answer]]] = deque()
+    try:
+        for task in tasks:
+            sent.append((task, executor.submit(work, task)))
+            if len(sent) == _TASKS_AT_ONCE:
+                first, future = sent.popleft()
+                yield first, _answer(future)
+        while sent:
+            first, future = sent.popleft()
+            yield first, _answer(future)
+    finally:
+        for _, future in sent:
+            future.cancel()
+
+
+def _answer(future: Future[Answer]) -> Answer:
+    try:
+        return future.result()
+    except ShapeFitError:
+        raise
+    except Exception as error:
+        what = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise WorkerError(
+            f"a worker failed ({what}); check its memory and that it sees the database, and run again"
+        ) from error

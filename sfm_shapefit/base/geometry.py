@@ -1,0 +1,271 @@
+"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: geometry that others share.
+
+Everything here works on plain float64 arrays and imports nothing but numpy.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+
+SIGMA_PER_MEDIAN = 1.4826
+"""Standard deviation of a normal x over the median of |x|."""
+
+MEDIAN_NORMAL_LENGTH = 1.538
+"""Median length of a vector of three normal components of variance 1."""
+
+METRIC_SIGMA = 0.1
+"""Relative standard deviation up to which a scale counts as known."""
+
+FLIP_YZ = np.diag([1.0, -1.0, -1.0])
+"""From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
+
+# Where half of the points are good, so is 1 draw of 3 in 8: none in 256 has odds 1e-15.
+_NUM_SAMPLES = 256
+_NUM_REFINED_SAMPLES = 4
+# Reweighting stops earlier once nothing changes.
+_MAX_REWEIGHTINGS = 200
+
+# Rounding of distances, as a share of the largest.
+_ROUNDING = 1e-14
+
+
+def normalized(vectors: FloatArray) -> FloatArray:
+    """Return the unit vectors along the last axis of `vectors`, shape (..., d); zero vectors give NaN."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angles in radians between unit vectors, shapes (..., d) and (..., d).
+
+    Uses tan(angle / 2) = |a - b| / |a + b| (Kahan), exact to rounding at 0 and at 180 degrees, where
+    arccos of the inner product loses half of the digits.
+    """
+    half: FloatArray = np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    return 2.0 * half
+
+
+def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the same angles in degrees."""
+    return np.degrees(angle_between(a, b))
+
+
+def tangent_bases(directions: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the complement of each unit vector.
+
+    Args:
+        directions: (m, d) unit vectors.
+
+    Returns:
+        (m, d, d - 1); the columns of slice e are orthonormal and orthogonal to `directions[e]`. They
+        are the last columns of the Householder reflection that maps the first axis to -+ `directions[e]`.
+    """
+    m, d = directions.shape
+    sign = np.where(directions[:, 0] < 0.0, -1.0, 1.0)
+    mirror = directions.copy()
+    mirror[:, 0] += sign  # no cancellation: both terms have the same sign
+    mirror /= np.linalg.norm(mirror, axis=1, keepdims=True)
+    reflection = np.eye(d) - 2.0 * mirror[:, :, None] * mirror[:, None, :]
+    return np.ascontiguousarray(reflection[:, :, 1:]).reshape(m, d, d - 1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Similarity:
+    """The map x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: FloatArray
+    """(d, d), orthogonal with determinant +1."""
+    translation: FloatArray
+    """(d,)"""
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Map points of shape (n, d)."""
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+
+def invert(similarity: Similarity) -> Similarity:
+    """Return the inverse map."""
+    turn, scale = similarity.rotation.T, 1.0 / similarity.scale
+    return Similarity(scale=scale, rotation=turn, translation=-scale * turn @ similarity.translation)
+
+
+def compose(outer: Similarity, inner: Similarity) -> Similarity:
+    """Return x -> outer(inner(x))."""
+    return Similarity(
+        scale=outer.scale * inner.scale,
+        rotation=outer.rotation @ inner.rotation,
+        translation=outer.apply(inner.translation[None])[0],
+    )
+
+
+def fit_similarity(
+    source: FloatArray, target: FloatArray, weights: FloatArray | None = None, *, rotate: bool = True
+) -> Similarity:
+    """Return the similarity that maps `source` onto `target` with least weighted squares.
+
+    The scale is never negative: a mirrored source, which would fit best turned inside out, gets scale 0.
+    A source whose points coincide leaves the scale open and gets 1.
+
+    Args:
+        source, target: (n, d) corresponding points.
+        weights: (n,) non-negative weights, not all 0; equal if None.
+        rotate: False keeps the axes and fits scale and translation only.
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 1991, eqs. 40-42.
+    """
+    w = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
+    source_mean, target_mean = w @ source, w @ target
+    x, y = source - source_mean, target - target_mean
+    spread = float(w @ np.sum(x * x, axis=1))
+    cross = (w[:, None] * y).T @ x
+    rotation = nearest_rotations(cross) if rotate else np.eye(source.shape[1])
+    scale = max(0.0, float(np.sum(rotation * cross)) / spread) if spread > 0.0 else 1.0
+    return Similarity(
+        scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean
+    )
+
+
+def median_spread(points: FloatArray) -> float:
+    """Return the median distance of points (n, d) from their coordinate-wise median.
+
+    Where more than half of the points coincide to rounding it is the largest distance instead; 0 only if all
+    coincide. Points that lie 1e13 times as far away do not matter, as long as they are fewer than half.
+    """
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    median, largest = float(np.median(distances)), float(distances.max())
+    return median if median > _ROUNDING * largest else largest
+
+
+def distances_in_spreads(points: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the distances of points (n, d) from the median of others, (n,), in median spreads of these."""
+    distances = np.linalg.norm(points - np.median(reference, axis=0), axis=1)
+    return np.asarray(distances / max(median_spread(reference), np.finfo(np.float64).tiny))
+
+
+def fit_similarity_l1(
+    source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf, iterations: int = 200
+) -> Similarity:
+    """Return the similarity that minimizes the sum of unsquared distances min(distance, cap).
+
+    Without a cap, a few bad targets hardly matter, but one source point that is far enough away shrinks
+    the scale towards 0: it costs its distance at the true scale, and nearly nothing at scale 0. A finite
+    cap closes that hole; half of the points may then be anywhere.
+
+    Iteratively reweighted least squares (weight 1 / distance, 0 beyond the cap) from the equal-weight
+    solution and from the best fits of a few points drawn with a fixed seed; the lowest sum is kept. The
+    floor of the distances in the weights is 1e-9 of the target's spread, so that points which fit exactly
+    do not stop the iteration.
+
+    Args:
+        source, target: (n, d) corresponding points, n >= 1.
+        rotate: False keeps the axes and fits scale and translation only.
+        cap: positive distance, in the target's units, beyond which a point counts as lost.
+        iterations: limit of reweighting steps from each start; it stops earlier once nothing changes.
+    """
+    floor = 1e-9 * (median_spread(target) or 1.0)
+
+    def distances(similarity: Similarity) -> FloatArray:
+        return np.asarray(np.linalg.norm(similarity.apply(source) - target, axis=1))
+
+    def total(apart: FloatArray) -> float:
+        return float(np.minimum(apart, cap).sum())
+
+    def cost(similarity: Similarity) -> float:
+        return total(distances(similarity))
+
+    def reweigh(best: Similarity) -> Similarity:
+        apart = distances(best)
+        for _ in range(iterations):
+            weights = np.where(apart < cap, floor / np.maximum(apart, floor), 0.0)
+            if not weights.any():
+                break
+            candidate = fit_similarity(source, target, weights, rotate=rotate)
+            apart_then = distances(candidate)
+            if total(apart_then) >= total(apart) * (1.0 - 1e-12):
+                break
+            best, apart = candidate, apart_then
+        return best
+
+    plain = fit_similarity(source, target, rotate=rotate)
+    sampled = sorted(fits_of_few_points(source, target, rotate=rotate), key=cost)
+    return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
+
+
+def fits_of_few_points(
+    source: FloatArray, target: FloatArray, *, rotate: bool, count: int = _NUM_SAMPLES
+) -> list[Similarity]:
+    """Return similarities that each fit as few points as determine one, drawn with a fixed seed.
+
+    They are what `fit_similarity` returns for each few, all at once.
+    """
+    size = min(len(source), source.shape[1] if rotate else 2)
+    rng = np.random.default_rng(0)
+    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(count)])
+    w = np.full(size, 1.0 / size)
+    source_means, target_means = w @ source[few], w @ target[few]
+    x, y = source[few] - source_means[:, None], target[few] - target_means[:, None]
+    spreads = np.vecdot(np.sum(x * x, axis=2), w)
+    crosses = np.swapaxes(w[:, None] * y, 1, 2) @ x
+    eyes = np.broadcast_to(np.eye(source.shape[1]), crosses.shape)
+    rotations = nearest_rotations(crosses) if rotate else eyes
+    alike = np.maximum((rotations * crosses).reshape(count, -1).sum(axis=1), 0.0)
+    scales = np.divide(alike, spreads, out=np.ones(count), where=spreads > 0.0)
+    moved = ((scales[:, None, None] * rotations) @ source_means[:, :, None])[:, :, 0]
+    fits = zip(scales.tolist(), rotations, target_means - moved, strict=True)
+    return [Similarity(scale=scale, rotation=turn, translation=shift) for scale, turn, shift in fits]
+
+
+def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
+    """Return the angles of rotations (..., 3, 3) in degrees, in [0, 180].
+
+    By atan2 of the sine (skew part) and the cosine (trace): exact to rounding at 0 and at 180 degrees.
+    """
+    skew = rotations - np.swapaxes(rotations, -1, -2)
+    sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
+    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0
+    angles: FloatArray = np.arctan2(sine, cosine)
+    return np.degrees(angles)
+
+
+def mean_rotation_l1(rotations: FloatArray) -> FloatArray:
+    """Return the rotation with the least sum of chordal distances |R_i - R|_F: a robust mean.
+
+    Weiszfeld's iteration, started from the chordal mean of the half of the rotations that is closest to
+    the best single one (out of at most 100, drawn with a fixed seed). Chordal distances are bounded, so
+    that any majority that agrees wins.
+
+    Args:
+        rotations: (n, d, d), n >= 1.
+
+    Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011;
+    the chordal instead of the geodesic distance.
+    """
+    floor = 1e-9  # of the distances in the weights; chordal distances are at most 2 sqrt(2) for d = 3
+
+    def distances(rotation: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(rotations - rotation, axis=(1, 2)))
+
+    count = len(rotations)
+    candidates = np.random.default_rng(0).permutation(count)[:100]
+    center = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
+    nearest = np.argsort(distances(center), kind="stable")[: count // 2 + 1]
+    best = nearest_rotations(rotations[nearest].sum(axis=0))
+    for _ in range(_MAX_REWEIGHTINGS):
+        weights = floor / np.maximum(distances(best), floor)
+        candidate = nearest_rotations(np.einsum("k,kij->ij", weights, rotations))
+        if distances(candidate).sum() >= distances(best).sum() * (1.0 - 1e-12):
+            break
+        best = candidate
+    return best
+
+
+def nearest_rotations(matrices: FloatArray) -> FloatArray:
+    """Return the rotations R that maximize trace(R^T M) for matrices M, (..., d, d)."""
+    u, _, vt = np.linalg.svd(matrices)
+    flip = np.ones(matrices.shape[:-1])
+    flip[..., -1] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
+    return np.asarray((u * flip[..., None, :]) @ vt)

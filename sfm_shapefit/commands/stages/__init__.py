@@ -1,1 +1,0 @@
-"""The steps that the commands share, between the values of the core and the files of the user."""

@@ -1,0 +1,98 @@
+"""What is told of ground control points: a row for each, warnings, and one sentence on all."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.json_types import ControlPoint
+from sfm_shapefit.placement.control_points import ControlFit, ControlPoints, TriangulatedControl
+
+
+def control_rows(
+    known: ControlPoints, found: TriangulatedControl, fit: ControlFit | str
+) -> list[ControlPoint]:
+    """Return what stands of each point in locate.json."""
+    fitted = fit if isinstance(fit, ControlFit) else None
+    rows: list[ControlPoint] = []
+    for k, name in enumerate(known.names):
+        own = known.points == k
+        residual = np.full(3, np.nan) if fitted is None else fitted.residuals[k]
+        there = bool(np.isfinite(residual).all())
+        errors = found.errors_px[own & found.agreeing]
+        sets = fitted is not None and bool(fitted.fitting[k])
+        rows.append(
+            {
+                "name": name,
+                "use": "check" if known.is_check[k] else "control" if sets else "unused",
+                "known": known.positions[k].tolist(),
+                "residual": residual.tolist() if there else None,
+                "error": float(np.linalg.norm(residual)) if there else None,
+                "error_px": float(np.mean(errors)) if len(errors) else None,
+                "num_marks": int(own.sum()),
+                "num_agreeing_marks": int(np.sum(own & found.agreeing)),
+            }
+        )
+    return rows
+
+
+def control_warnings(
+    known: ControlPoints, found: TriangulatedControl, fit: ControlFit | str, names: Sequence[str]
+) -> Iterator[str]:
+    """Yield what is wrong with the points or their marks, a sentence each; `names` are of the images."""
+    if isinstance(fit, str):
+        yield f"{fit}: the model does not stand in the axes of the control points"
+    else:
+        there = np.isfinite(fit.residuals[:, 0])
+        errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)
+        if errors.any():
+            worst = int(np.argmax(errors))
+            yield (
+                f"{int(np.sum(errors > 0.0))} of the control points contradict the others and set nothing, "
+                f"{known.names[worst]} most, which is {errors[worst]:.3g} off; check coordinates and marks"
+            )
+        lost = np.flatnonzero(~there)
+        if len(lost):
+            yield (
+                f"{len(lost)} of the control points cannot be triangulated, {known.names[lost[0]]} for one: "
+                "they need agreeing marks in two placed images"
+            )
+    missing = np.where(found.agreeing | np.isnan(found.errors_px), 0.0, found.errors_px)
+    if missing.any():
+        worst = int(np.argmax(missing))
+        yield (
+            f"{counted(int(np.sum(missing > 0.0)), 'mark')} of control points miss where the others put the "
+            f"point, that of {known.names[known.points[worst]]} in {names[known.images[worst]]} most, by "
+            f"{missing[worst]:.0f} px"
+        )
+
+
+def describe_control_points(rows: Sequence[ControlPoint]) -> str:
+    """Say how far the model is off control points and check points; empty where there are none."""
+    parts = []
+    for use, noun in (("control", "control point"), ("check", "check point")):
+        own = [row for row in rows if row["use"] == use and row["error"] is not None]
+        if own:
+            errors = [row["error"] or 0.0 for row in own]
+            worst = own[int(np.argmax(errors))]["name"]
+            typical = float(np.sqrt(np.mean(np.square(errors))))
+            off = f"off by {typical:.3g} (root mean square), {worst} most, by {max(errors):.3g}"
+            parts.append(f"{counted(len(own), noun)} {off}")
+    unused = sum(row["use"] == "unused" for row in rows)
+    if unused:
+        parts.append(f"{unused} not used")
+    return "; ".join(parts)
+
+
+def control_cells(row: ControlPoint) -> list[str]:
+    """Return the cells of a point's row: name, use, error and its axes, pixels, marks."""
+    residual, error, pixels = row["residual"], row["error"], row["error_px"]
+    axes = ", ".join(f"{value:.3g}" for value in residual) if residual else ""
+    return [
+        row["name"],
+        row["use"],
+        "" if error is None else f"{error:.3g}",
+        axes,
+        "" if pixels is None else f"{pixels:.2g}",
+        f"{row['num_agreeing_marks']} of {row['num_marks']}",
+    ]

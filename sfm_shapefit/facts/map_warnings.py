@@ -1,0 +1,72 @@
+"""What the user of `map` should know beyond the warnings of each model, a sentence each."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.joins import JoinedModel
+from sfm_shapefit.facts.map_result import MappedModel
+from sfm_shapefit.facts.options import KnownDistance
+from sfm_shapefit.facts.scene_words import describe_repeated_pairs, describe_rival_pairs
+
+# A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
+# 0.89), an image if a smaller share of its own does.
+_ALARMING_SHARE = 0.7
+_DOUBTFUL_SHARE = 0.25
+
+
+def map_warnings(
+    incomplete_rigs: Sequence[int], models: Sequence[MappedModel], left_out: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield what the user should know, a sentence each."""
+    if incomplete_rigs:
+        yield (
+            f"{len(incomplete_rigs)} rigs of the database are not used, rig "
+            f"{incomplete_rigs[0]} for one, because a sensor has no pose in them or an image no "
+            "frame: their cameras are placed one by one"
+        )
+    for number, model in enumerate(models):
+        share, agreements = model.averaging.share, model.averaging.agreements
+        if share < _ALARMING_SHARE:
+            yield (
+                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
+                "trust it without a look"
+            )
+        if model.averaging.num_repeated:
+            yield f"model {number}: {describe_repeated_pairs(model.averaging.num_repeated)}"
+        if model.averaging.num_rivals:
+            yield f"model {number}: {describe_rival_pairs(model.averaging.num_rivals)}"
+        doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
+        if len(doubtful):
+            worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
+            yield (
+                f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
+                f"rotations, above all those of {worst}"
+            )
+    if left_out:
+        name, reason = next(iter(left_out.items()))
+        many = f"{len(left_out)} images are in no model, {name} for one"
+        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"
+
+
+def lost_distances(
+    known: Iterable[KnownDistance], models: Sequence[MappedModel], joined: Sequence[JoinedModel]
+) -> Iterator[str]:
+    """Yield what became of known distances that are in no model."""
+    model_of = {
+        image.name: number
+        for number, model in enumerate(models)
+        for image in model.located.reconstruction.images.values()
+        if image.has_pose
+    }
+    for first, second, _ in known:
+        ends = [model_of.get(name) for name in (first, second)]
+        if None in ends:
+            name = (first, second)[ends.index(None)]
+            yield f"the known distance of {first} and {second} is of no use: {name} is in no model"
+        elif ends[0] != ends[1] and not any({*ends} <= {*one.models} for one in joined):
+            yield (
+                f"the known distance of {first} and {second} is of no use: they are in models {ends[0]} and "
+                f"{ends[1]}, which are not joined"
+            )

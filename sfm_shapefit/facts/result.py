@@ -1,0 +1,414 @@
+"""What `locate` and `solve` return: the answer with the evidence for it."""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.certified import Departure, compare_with_certified
+from sfm_shapefit.facts.columns import Column, TableName, table_of
+from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
+from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
+from sfm_shapefit.facts.key_figures import figure_rows
+from sfm_shapefit.facts.notebook import notebook_html
+from sfm_shapefit.facts.options import LocateOptions, Source
+from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
+from sfm_shapefit.facts.summary import summarize_graph, summarize_model
+from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.onedsfm import EpipolarGeometries
+from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.graph.rigidity import RigidPiece
+from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.straight import find_line, sigma_along
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
+from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.solver.options import SolverResult
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
+CARRIED_FIXED = "fixed; no pair of it takes part"
+CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inputs:
+    """What `locate` worked from."""
+
+    folder: Path | None
+    """The model folder; None for a reconstruction in memory."""
+    database: Path | None
+    """The database whose matches were used, if any."""
+    source: Source
+    """Where the directions came from; never "auto"."""
+    statement: str
+    """How that choice was made, for the user."""
+    left_out: PairNames = frozenset()
+    """Pairs that are taken for unmatched."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
+
+    first: tuple[str, str]
+    """The first and the last frame of the earlier stretch."""
+    second: tuple[str, str]
+    """Those of the later one."""
+    num_pairs: int
+    num_matches: int
+    num_refused: int
+    """Pairs that were left out, because they do not agree with the chain of pairs near in time."""
+    angle_deg: float
+    """Median angle between the relative rotations of these pairs and those of the chain."""
+    tolerance_deg: float
+    """Up to where they agree with it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class LocateResult(Displayed):
+    """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
+    inputs: Inputs
+    options: LocateOptions
+    model: PosedModel
+    """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
+    directions: PairDirections
+    """All pairs that were looked at, with their support."""
+    placement: Placement
+    """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
+    largest rigid piece solved, and the evidence for it, in the solver's units."""
+    kept: BoolArray
+    """Which of the placement's cameras are in the output; the others are not trusted enough, or see too few
+    points."""
+    gauge: Gauge
+    """From the solver's units to the output's."""
+    adjusted: Adjusted | None
+    """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
+    adjustment: AdjustedPlacement | None
+    """What became of the placement and of the given rotations, before any bundle adjustment; None if the
+    placement stayed as it was found."""
+    timings_s: dict[str, float]
+    """Wall-clock seconds per stage."""
+    warnings: tuple[str, ...]
+    """What the user should know, a sentence each."""
+    turned_deg: FloatArray | None = None
+    """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
+    where it was kept; None if there was none."""
+    further: "tuple[FurtherPiece, ...]" = ()
+    """The further rigid pieces of three cameras or more, each with a scale of its own."""
+    fixed: BoolArray | None = None
+    """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+    triplet_scores: FloatArray | None = None
+    """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
+    matched_shares: FloatArray | None = None
+    """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
+    loops: tuple[Loop, ...] = ()
+    """Of the videos among the images, where `map` looked for some."""
+    prior_angles: PriorAngles | None = None
+    """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
+    that set the axes."""
+    poor: dict[int, int] = field(default_factory=dict)
+    """By the id of each image that was left out because it sees too few points, or hardly any of those that
+    its matches could make: how many it sees."""
+    unsupported: frozenset[int] = frozenset()
+    """The ids of images hardly any of whose matches makes a point with a third image; left out too, unless
+    the least trust is 0."""
+    agreeing_observations: float = math.nan
+    """Of the keypoints of images in the output that are matched in two or more of the others, the share that
+    sees a 3D point; NaN where there is no database."""
+    contradicting_observations: float = math.nan
+    """Of the same, the share that sees none and most of whose matches miss the cameras' epipolar lines."""
+    focal_doubts: tuple[FocalDoubt, ...] = ()
+    """Cameras whose matches prefer another focal length than the given one, by their id."""
+
+    intrinsics: Intrinsics = field(default_factory=Intrinsics)
+    """Cameras whose intrinsics were in doubt, and what became of them."""
+    rigs: tuple[RefinedSensor, ...] = ()
+    """The sensors that were refined in their rigs."""
+    control_points: tuple[ControlPoint, ...] = ()
+    """Ground control points with their residuals, where some are given."""
+    suspicions: tuple[str, ...] = ()
+    """What those who gave the rotations saw that speaks against the model, for its verdict."""
+    join: Join | None = None
+    """What came of joining it to a larger model of `map`."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in locate.json."""
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> LocateSummary:
+        return summarize_model(self)
+
+    def _headline(self) -> str:
+        images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
+        return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.warnings]
+        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, 3)
+
+    @cached_property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of all images of the input, posed or not."""
+        return tuple(image.name for image in self.model.reconstruction.images.values())
+
+    @cached_property
+    def departure(self) -> Departure:
+        """What is certified, what is delivered, and how far apart they are."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        return compare_with_certified(self.placement, centers, adjusted=self.adjusted is not None)
+
+    @cached_property
+    def verdict(self) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return judge_model(self)
+
+    @property
+    def certified(self) -> SolverResult:
+        """The solve of the largest rigid piece, with its certificate, before any refinement."""
+        return self.placement.certified
+
+    @property
+    def pieces(self) -> list[RigidPiece]:
+        """The parallel-rigid pieces of the view graph, largest first."""
+        return self.placement.pieces
+
+    @cached_property
+    def cameras(self) -> list[CameraRow]:
+        """One row per image of the input: the posed ones by id, then those without a rotation."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        solved_pieces = [piece.placement for piece in self.further]
+        rows = camera_rows(
+            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
+        )
+        for camera, reason in without_direction(self.directions, self.placement.graph).items():
+            rows[camera] = replace(rows[camera], reason=reason)
+        for camera, center in self._carried().items():
+            is_fixed = self.fixed is not None and self.fixed[camera]
+            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
+            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
+        for camera, count in self.few_points.items():
+            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
+            rows[camera] = replace(rows[camera], reason=reason)
+        for camera in self.cameras_without_support:
+            rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
+        unposed = sorted(set(self.image_names) - set(self.model.names))
+        return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    @property
+    def agreeing_pairs(self) -> float:
+        """Of the pairs of cameras in the output that say anything of a direction, the share that agrees.
+
+        Pairs whose matches contradict the rotations count as disagreeing; NaN where there are none.
+        """
+        placement = self.placement
+        is_in = np.zeros(placement.num_cameras, dtype=np.bool_)
+        is_in[placement.cameras[self.kept]] = True
+        judged = is_in[placement.graph.edges[placement.edges[placement.pairs]]].all(axis=1)
+        against = [k for k, status in enumerate(self.directions.status) if status in CONTRADICTIONS]
+        num_against = int(np.sum(is_in[self.directions.pairs[against].reshape(-1, 2)].all(axis=1)))
+        agreeing = int(np.sum(placement.assessment.inliers[placement.pairs] & judged))
+        total = int(np.sum(judged)) + num_against
+        return agreeing / total if total else math.nan
+
+    @property
+    def few_points(self) -> dict[int, int]:
+        """By the images that were left out for what they see of points, how many these are."""
+        images = enumerate(self.model.image_ids.tolist())
+        return {camera: self.poor[image_id] for camera, image_id in images if image_id in self.poor}
+
+    @property
+    def cameras_without_support(self) -> list[int]:
+        """The images hardly any of whose matches makes a point with a third image, in the output or not."""
+        return np.flatnonzero(np.isin(self.model.image_ids, list(self.unsupported))).tolist()
+
+    def _carried(self) -> dict[int, tuple[float, ...]]:
+        """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
+        ids = self.model.image_ids
+        judged = set(self.placement.cameras[self.kept].tolist())
+        return {
+            camera: tuple(self.reconstruction.image(image_id).projection_center().tolist())
+            for camera, image_id in enumerate(ids.tolist())
+            if camera not in judged and self.reconstruction.image(image_id).has_pose
+        }
+
+    @cached_property
+    def pairs(self) -> list[PairRow]:
+        """One row per pair that was looked at, usable or not, in the order of pairs."""
+        support = self.directions.num_inliers[self.directions.usable()]
+        usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
+        names = self.model.names
+        axes = self.gauge.axes
+        rows = [
+            _turn(next(usable), axes)
+            if status is DirectionStatus.USABLE
+            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
+            for (i, j), status, support in zip(
+                self.directions.pairs.tolist(),
+                self.directions.status,
+                self.directions.num_inliers.tolist(),
+                strict=True,
+            )
+        ]
+        if self.triplet_scores is not None and self.matched_shares is not None:
+            scores = score_pairs(self.triplet_scores, self.matched_shares)
+            columns = (self.triplet_scores.tolist(), self.matched_shares.tolist(), scores.tolist())
+            rows = [
+                replace(row, triplet_score=triplet, matched_share=share, pair_score=score)
+                for row, triplet, share, score in zip(rows, *columns, strict=True)
+            ]
+        if self.prior_angles is not None:
+            angles = self.prior_angles.angles_deg.tolist()
+            rows = [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
+        return rows
+
+    @cached_property
+    def line_sigma(self) -> float | None:
+        """Median standard deviation along the line on which all cameras stand, as a share of its length.
+
+        None where they do not stand on one, or where it is not known.
+        """
+        placement = self.placement
+        line = find_line(placement.graph.directions[placement.edges[placement.pairs]])
+        if line is None:
+            return None
+        sigma = sigma_along(line, placement.locations, placement.covariances)
+        return sigma if math.isfinite(sigma) else None
+
+    @cached_property
+    def doubtful_pairs(self) -> list[PairRow]:
+        """The pairs that agree with the model and look like repeated structure all the same, worst first."""
+        doubtful = doubtful_pairs(np.array([row.pair_score for row in self.pairs])).tolist()
+        rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
+        used = [row for row in rows if row.verdict == Verdict.INLIER.value]
+        return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
+
+
+def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
+    """Return a pair's row with its direction in the output's axes."""
+    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FurtherPiece:
+    """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
+
+    placement: Placement
+    """Its solution; `placement.piece` is its number."""
+    kept: BoolArray
+    """Which of the placement's cameras are in its model; the others are not trusted enough."""
+    gauge: Gauge
+    """From the solver's units to those of its model, a unit of its own."""
+    reconstruction: "pycolmap.Reconstruction"
+    """Its seeded model."""
+    image_ids: IntArray
+    """(k,) the images of the placement's cameras."""
+
+    @cached_property
+    def camera_rows(self) -> list[CameraRow]:
+        """One row per camera of the piece."""
+        centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
+        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GraphResult(Displayed):
+    """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
+
+    path: Path
+    """The graph's file or folder."""
+    statement: str
+    """What it is, and where rotations came from, for the user."""
+    options: PlacementOptions
+    placement: Placement
+    further: tuple[Placement, ...]
+    """The further rigid pieces of three nodes or more, each with a scale of its own."""
+    timings_s: dict[str, float]
+    """Wall-clock seconds per stage."""
+    geometries: EpipolarGeometries | None = None
+    """The relative poses that the directions came from, if it has any."""
+    rotations: FloatArray | None = None
+    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in locate.json."""
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> GraphSummary:
+        return summarize_graph(self)
+
+    def _headline(self) -> str:
+        placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
+        return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.summary()["warnings"]]
+        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, self.placement.graph.dimension)
+
+    @cached_property
+    def departure(self) -> Departure:
+        """What is certified, what is delivered, and how far apart they are."""
+        return compare_with_certified(self.placement, self.placement.locations, adjusted=False)
+
+    @cached_property
+    def verdict(self) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return judge_graph(self)
+
+    @property
+    def certified(self) -> SolverResult:
+        """The solve of the largest rigid piece, with its certificate, before any refinement."""
+        return self.placement.certified
+
+    @cached_property
+    def cameras(self) -> list[CameraRow]:
+        """One row per node."""
+        return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
+
+    @cached_property
+    def pairs(self) -> list[PairRow]:
+        """One row per edge."""
+        support = np.zeros(self.placement.num_pairs, dtype=np.int64)
+        return pair_rows(self.placement, support, self.further)
+
+
+def _centers_of(
+    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
+) -> FloatArray:
+    """Return the centers (k, 3) of images, NaN for those that are not kept."""
+    centers = np.full((len(kept), 3), np.nan)
+    centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
+    return centers

@@ -1,0 +1,223 @@
+"""One row per camera, per pair and per rigid piece of a placed graph."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.facts.json_types import Piece
+from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.graph.rigidity import left_out_reasons
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.placement.place import Placement, count_large
+
+_UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_FILTERED = "left out by the filter"
+_OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
+_NOT_SOLVED = "free: its directions determine no placement"
+
+
+def camera_rows(
+    placement: Placement,
+    centers: FloatArray,
+    scale: float,
+    further: Sequence[Placement] = (),
+    axes: FloatArray | None = None,
+) -> list[CameraRow]:
+    """Return one row per camera of a placed graph.
+
+    Args:
+        placement: the graph and its solution.
+        centers: (k, d) centers of the placed cameras in the output's units; NaN for those that are left out
+            because they are not trusted.
+        scale: the output's units in one unit of the solver.
+        further: the other pieces that are solved; the rows of their cameras say where they stand.
+        axes: (d, d) rotation from the input's axes to the output's; the same if None.
+    """
+    graph = placement.graph
+    # Each camera's home is the first piece of three cameras or more that holds it, or the largest.
+    homes: list[int | None] = [None] * graph.num_nodes
+    for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
+        for camera in placement.pieces[k].nodes.tolist():
+            homes[camera] = k
+    reasons = left_out_reasons(placement.considered, placement.pieces)
+    folders: dict[int, list[str]] = {}
+    for piece in further:
+        for camera in piece.cameras.tolist():
+            folders.setdefault(camera, []).append(folder_of(piece.piece))
+    reasons |= {
+        camera: f"{reasons[camera]}; see {', '.join(names)}"
+        for camera, names in folders.items()
+        if camera in reasons
+    }
+    degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
+    rows = [
+        CameraRow(
+            name=graph.name_of(camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
+        )
+        for camera, degree in enumerate(degrees.tolist())
+    ]
+    for camera, row in zip(
+        placement.cameras.tolist(), own_camera_rows(placement, centers, scale, axes), strict=True
+    ):
+        rows[camera] = replace(row, degree=rows[camera].degree)
+    return rows
+
+
+def own_camera_rows(
+    placement: Placement, centers: FloatArray, scale: float, axes: FloatArray | None = None
+) -> list[CameraRow]:
+    """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
+    graph, assessment = placement.graph, placement.assessment
+    inside = graph.edges[placement.edges[placement.pairs]]
+    degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
+    covariances = placement.covariances if axes is None else _turned(placement.covariances, axes)
+    sigmas, correlations = scale * standard_deviations(covariances), correlations_of(covariances)
+    rows = []
+    for k, camera in enumerate(placement.cameras.tolist()):
+        kept = bool(np.isfinite(centers[k]).all())
+        trust, reason = float(assessment.trust[k]), assessment.reasons[k]
+        rows.append(
+            CameraRow(
+                name=graph.name_of(camera),
+                placed=kept,
+                reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
+                piece=placement.piece,
+                center=tuple(centers[k].tolist()) if kept else (),
+                degree=int(degrees[camera]),
+                trust=trust,
+                sigma=tuple(sigmas[k].tolist()),
+                correlation=tuple(correlations[k].tolist()),
+            )
+        )
+    return rows
+
+
+def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return covariances (n, d, d) in other axes, infinite where nothing holds a node."""
+    held = ~np.isinf(covariances).any(axis=(1, 2))
+    turned = np.full(covariances.shape, np.inf)
+    turned[held] = axes @ covariances[held] @ axes.T
+    return turned
+
+
+def covariance_of(row: CameraRow) -> FloatArray:
+    """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
+    d = len(row.sigma)
+    correlations = np.eye(d)
+    if row.correlation:  # which earlier outputs lack
+        i, j = np.triu_indices(d, k=1)
+        correlations[i, j] = correlations[j, i] = row.correlation
+    sigmas = np.array(row.sigma)
+    found = np.zeros((max(d, 3), max(d, 3)))
+    found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
+    return found[:3, :3]
+
+
+def correlations_of(covariances: FloatArray) -> FloatArray:
+    """Return the correlations of each two axes, (n, d (d - 1) / 2): 0 if exact, NaN if nothing holds it."""
+    sigmas = standard_deviations(covariances)
+    i, j = np.triu_indices(covariances.shape[1], k=1)
+    products = sigmas[:, i] * sigmas[:, j]
+    with np.errstate(invalid="ignore"):
+        found = covariances[:, i, j] / np.where(products > 0.0, products, 1.0)
+    return np.asarray(np.clip(found, -1.0, 1.0))
+
+
+def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:
+    """Return one row per pair of cameras.
+
+    Args:
+        placement: the graph and its largest piece.
+        support: (m,) the pairs' number of inlier matches.
+        further: the other pieces that are solved; their pairs are judged by them.
+    """
+    graph = placement.graph
+    judged: dict[int, tuple[Placement, int, float]] = {}
+    for piece in (placement, *further):
+        dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
+        if not piece.certified.status.has_certificate:
+            dual_norms[:] = np.nan
+        judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
+    dropped = set(placement.dropped.tolist())
+    rows = []
+    for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
+        row = PairRow(
+            name1=graph.name_of(i),
+            name2=graph.name_of(j),
+            direction=tuple(graph.directions[edge].tolist()),
+            support=int(support[edge]),
+            weight=float(graph.weights[edge]),
+        )
+        if edge not in judged:
+            inner = placement.groups is not None and bool(
+                placement.groups.group_of[i] == placement.groups.group_of[j]
+            )
+            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
+            rows.append(replace(row, reason=_INNER if inner else elsewhere))
+            continue
+        piece, e, dual_norm = judged[edge]
+        assessment = piece.assessment
+        verdict = assessment.verdict(e)
+        rows.append(
+            replace(
+                row,
+                residual_deg=float(assessment.residuals_deg[e]),
+                dual_norm=float(dual_norm),
+                leverage=float(assessment.leverages[e]),
+                verdict=verdict.value,
+                reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
+            )
+        )
+    return rows
+
+
+def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
+    """Return what locate.json says of each parallel-rigid piece of three cameras or more, and of the largest.
+
+    Args:
+        placement: the graph and its largest piece.
+        solved: number, scale and number of placed cameras of each piece that is solved.
+    """
+    facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
+    large = max(count_large(placement.pieces, placement.num_cameras), 1)
+    rows: list[Piece] = []
+    for k, piece in enumerate(placement.pieces[:large]):
+        scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
+        hinges = piece.hinges[piece.hinges < placement.num_cameras]
+        rows.append(
+            {
+                "num_cameras": int(np.sum(piece.nodes < placement.num_cameras)),
+                "scale": scale,
+                "hinges": [placement.graph.name_of(hinge) for hinge in hinges.tolist()],
+                "folder": folder_of(k) if k in facts else "",
+                "num_placed": num_placed,
+            }
+        )
+    return rows
+
+
+def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:
+    """Say, for the cameras none of whose pairs has a usable direction, what became of their pairs."""
+    causes: dict[int, Counter[str]] = {c: Counter() for c in np.flatnonzero(graph.degrees() == 0).tolist()}
+    for pair, status in zip(directions.pairs.tolist(), directions.status, strict=True):
+        for camera in pair:
+            if camera in causes:
+                causes[camera][status.value] += 1
+    reasons = dict.fromkeys(causes, "no matches with any posed image")
+    for camera, counter in causes.items():
+        for cause, count in counter.most_common(1):
+            total = counter.total()
+            reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
+    return reasons
+
+
+def folder_of(piece: int) -> str:
+    """Return where a piece stands in the output."""
+    return f"pieces/{piece}" if piece else "."

@@ -1,0 +1,208 @@
+"""What the user should know beyond the tables, a sentence each."""
+
+from collections.abc import Collection, Iterator, Sequence
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.turns import Doubt
+from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.solver.options import Status
+
+# A larger share of pairs that contradict the solution, or the given rotations, is warned of.
+_ALARMING_SHARE = 0.5
+_ALARMING_LEVEL_DEG = 5.0
+# If no more pairs contradict refined locations, it does not matter that one of the convex starts collapsed.
+_FEW_REJECTED = 0.1
+# Cameras within so many median distances of the median say how large the scene is.
+_INSIDE = 30.0
+# A camera is uncertain if its standard deviation is more than this share of the extent of all.
+_UNCERTAIN_SHARE = 0.05
+_TWOFOLD_SHARE = 0.05
+"""Of pairs on two directions among those on one or two. It was at most 0.005 on eight real scenes and 0.04 in
+drawn courtyards, which are placed well, and 0.31 before drawn facades of one house again and again, where
+half of the cameras were shifted by a house without a contradiction."""
+# Fewer pairs on two directions prove nothing.
+_FEWEST_TWOFOLD = 3
+
+
+def quality_warnings(placement: Placement) -> Iterator[str]:
+    """Yield what the user should know about a solution, a sentence each."""
+    if not placement.certified.status.has_certificate:
+        yield placement.certified.status.value
+    elif placement.certified.status is not Status.CONVERGED:
+        yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
+    if placement.certified.unique is False:
+        yield "other placements may fit as well: the certificate does not prove the optimum unique"
+    level = placement.assessment.level_deg
+    if level > _ALARMING_LEVEL_DEG:
+        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
+    refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
+        assert refined.disagreement is not None
+        yield (
+            f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long "
+            f"chains and under heavy corruption; kept: {refined.start}"
+            + ("" if refined.is_refined else ", unrefined; --objective auto refines both and compares")
+        )
+    yield from _uncertainty_warnings(placement)
+    if rejected > _ALARMING_SHARE:
+        yield f"{rejected:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if placement.second_configuration is not None:
+        yield placement.second_configuration.statement()
+
+
+def uncertain_cameras(placement: Placement) -> IntArray:
+    """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
+    if len(placement.cameras) < SMALLEST_PIECE:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
+
+
+def _largest_sigmas(placement: Placement) -> FloatArray:
+    """Return the largest of each camera's standard deviations along the axes."""
+    return np.asarray(standard_deviations(placement.covariances).max(axis=1))
+
+
+def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
+    """Yield a warning that names the least certain camera, if any is uncertain."""
+    largest, uncertain = _largest_sigmas(placement), uncertain_cameras(placement)
+    if np.isnan(largest).any():
+        yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
+    if len(uncertain):
+        worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
+        share, see = f"{_UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
+        if len(uncertain) == 1:
+            yield f"{worst} is uncertain by more than {share} of the extent; {see}"
+        else:
+            yield (
+                f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
+                f"{worst}; {see}"
+            )
+
+
+def _extent(locations: FloatArray) -> float:
+    """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
+    distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
+    inside = locations[distances <= _INSIDE * median_spread(locations)]
+    return float(np.linalg.norm(np.ptp(inside, axis=0)))
+
+
+def match_warnings(directions: PairDirections) -> Iterator[str]:
+    """Yield what the matches of all pairs together say against any answer, if they do."""
+    counts = directions.counts()
+    usable, twofold = (counts.get(s, 0) for s in (DirectionStatus.USABLE, DirectionStatus.TWO_MOTIONS))
+    if twofold >= _FEWEST_TWOFOLD and twofold > _TWOFOLD_SHARE * (usable + twofold):
+        yield (
+            f"the matches of {twofold} pairs agree on two directions each, those of {usable} on one: things "
+            "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
+            "contradiction behind; compare images of neighboring cameras before trusting them"
+        )
+    against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
+    if against > _ALARMING_SHARE * len(directions.pairs):
+        yield (
+            f"the matches of {against} of {len(directions.pairs)} pairs contradict the given rotations: the "
+            "scene repeats itself, or rotations or intrinsics are wrong"
+        )
+
+
+def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
+    """Yield which cameras are left out for want of trust, if any are."""
+    lost = np.flatnonzero(~kept)
+    if len(lost):
+        worst = _least_trusted(placement, lost)
+        if len(lost) == 1:
+            yield f"1 camera is left out because it is not trusted: {worst}; --min-trust 0 keeps it"
+        else:
+            yield (
+                f"{len(lost)} cameras are left out because they are not trusted, above all {worst}; "
+                "--min-trust 0 keeps them"
+            )
+
+
+def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
+    """Yield which cameras are left out, or kept as was asked, though their matches make no points, if any."""
+    if names:
+        subject, rest = (
+            ("1 camera is", "its pose is")
+            if len(names) == 1
+            else (f"{len(names)} cameras are", "their poses are")
+        )
+        what = "kept, as --min-trust 0 asks, though" if is_kept else "left out because"
+        remedy = "" if is_kept else "; --min-trust 0 keeps what is left out"
+        yield (
+            f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
+            f"{rest} wrong, or the scene repeats itself{remedy}"
+        )
+
+
+def ambiguity_warnings(placement: Placement) -> Iterator[str]:
+    """Yield which cameras stand as well turned as they do as placed."""
+    doubts = placement.assessment.doubts
+    if doubts is None:
+        return
+    ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
+    for body in np.unique(doubts.bodies[ambiguous]).tolist():
+        members = np.flatnonzero(doubts.bodies == body)
+        names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
+        yield (
+            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} "
+            f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
+        )
+
+
+def focal_warnings(
+    model: PosedModel, doubts: tuple[FocalDoubt, ...], tried: Collection[int] = ()
+) -> Iterator[str]:
+    """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
+    for doubt in doubts:
+        advice = "--refine-intrinsics focal lets it change"
+        if doubt.camera in tried:
+            advice = "the adjustment could not tell, so calibrate that camera"
+        focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())
+        yield (
+            f"the matches of camera {doubt.camera} prefer a focal length of about "
+            f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
+            f"asked); its images stand wrong if that is so: {advice}"
+        )
+
+
+def graph_warnings(placement: Placement) -> Iterator[str]:
+    """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
+    yield from quality_warnings(placement)
+    floor = LocateOptions().min_trust
+    low = np.flatnonzero(placement.assessment.trust < floor)
+    if len(low):
+        yield (
+            f"{len(low)} of {len(placement.cameras)} nodes have a trust below {floor:g}, above all "
+            f"{_least_trusted(placement, low)}; see trust in cameras.csv"
+        )
+
+
+def _least_trusted(placement: Placement, rows: IntArray) -> str:
+    """Return the name of the least trusted of some of the placed cameras, and why it is."""
+    worst = int(rows[np.argmin(placement.assessment.trust[rows])])
+    return f"{placement.graph.name_of(int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"
+
+
+def prior_warnings(found: PriorAngles | None, pairs: IntArray, names: Sequence[str]) -> Iterator[str]:
+    """Warn of pairs whose directions contradict the baselines of position priors."""
+    if found is None or not found.contradicting.any():
+        return
+    rows = np.flatnonzero(found.contradicting)
+    worst = int(rows[np.argmax(found.angles_deg[rows])])
+    first, second = (names[k] for k in pairs[worst].tolist())
+    compared = int(np.isfinite(found.angles_deg).sum())
+    yield (
+        f"the directions of {len(rows)} of {counted(compared, 'pair')} contradict the baselines of their "
+        f"position priors, that of {first} and {second} most, by {found.angles_deg[worst]:.0f} deg; see "
+        "prior_angle_deg in pairs.csv"
+    )

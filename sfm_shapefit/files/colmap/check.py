@@ -1,0 +1,522 @@
+"""Everything that must hold before pycolmap may open a model folder.
+
+pycolmap trusts its input: on a file that was cut short it can loop for ever, or read a camera that is
+not there, and it passes NaN through without a word. So the files are walked here first, record by
+record, with every length checked against the end of the file and every reference against the file it
+refers to. Binary layouts, all little-endian, counts uint64 unless noted:
+
+    cameras   count, then  id u32, model i32, width u64, height u64, params f64 each
+    images    count, then  id u32, qw qx qy qz tx ty tz f64, camera u32, name to NUL,
+                           count, then  x y f64, point3D id u64 (all ones: none)
+    points3D  count, then  id u64, x y z f64, r g b u8, error f64, count, then  image u32, point2D u32
+    rigs      count, then  id u32, count u32, reference sensor (type i32, id u32), and for each further
+                           sensor  type i32, id u32, has_pose u8, and then qw .. tz f64 if it has
+    frames    count, then  id u32, rig u32, qw .. tz f64, count u32, then  type i32, sensor u32, data u64
+
+Text models are checked line by line for what pycolmap overlooks (NaN, lines cut short, names it would cut);
+it refuses the rest itself.
+
+Source: https://colmap.github.io/format.html, "Sparse reconstruction".
+"""
+
+import itertools
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.files.lines import refuse_database, refuse_irregular_file
+
+REQUIRED_FILES = ("cameras", "images", "points3D")
+
+UNIT_QUATERNION_TOLERANCE = 1e-3
+"""A quaternion printed with 4 digits still passes; a wrong one does not."""
+
+_NO_POINT = np.uint64(2**64 - 1)
+_CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
+
+_U64 = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")
+_IMAGE = struct.Struct("<I7dI")
+_RIG = struct.Struct("<II")
+_SENSOR = struct.Struct("<iI")
+_HAS_POSE = struct.Struct("<B")
+_POSE = struct.Struct("<7d")
+_FRAME = struct.Struct("<II7dI")
+_FRAME_DATA = struct.Struct("<iIQ")
+_POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
+_POINT3D_BYTES = 51  # id 8, xyz 24, rgb 3, error 8, track length 8
+_TRACK_ELEMENT_BYTES = 8
+
+UInt64Array = npt.NDArray[np.uint64]
+
+
+def check_model_files(folder: Path) -> None:
+    """Refuse a model folder that pycolmap must not be given.
+
+    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads. It
+    must have cameras, images and points3D, and either both or none of rigs and frames.
+
+    Raises:
+        InputError: naming the file, and the record or the line, that is missing, truncated, not finite,
+            repeated, or refers to something that is not there.
+    """
+    suffix = model_suffix(folder)
+    for name in (*REQUIRED_FILES, "rigs", "frames"):
+        refuse_irregular_file(folder / f"{name}{suffix}")
+    has_rigs = (folder / f"rigs{suffix}").exists()
+    has_frames = (folder / f"frames{suffix}").exists()
+    if has_rigs != has_frames:
+        there, missing = ("rigs", "frames") if has_rigs else ("frames", "rigs")
+        raise InputError(
+            f"{folder} has {there}{suffix} but no {missing}{suffix}; add it, or remove {there}{suffix}"
+        )
+    if suffix == ".bin":
+        _check_binary_model(folder, with_rigs=has_rigs)
+    else:
+        _check_camera_lines(folder / "cameras.txt")
+        _check_image_lines(folder / "images.txt")
+        _check_point_lines(folder / "points3D.txt")
+
+
+def model_suffix(folder: Path) -> str:
+    """Return ".bin" or ".txt": the format in which pycolmap would read the model in `folder`.
+
+    Raises:
+        InputError: if `folder` is not a readable folder with a complete model in one of the two formats.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            refuse_database(folder)
+            raise InputError(f"{folder} is a file; give the folder that holds cameras, images and points3D")
+        present = {entry.name for entry in folder.iterdir()}
+    except FileNotFoundError:
+        raise InputError(f"the model folder {folder} does not exist") from None
+    except OSError as error:
+        raise InputError(f"the model folder {folder} cannot be read: {error.strerror}") from None
+
+    for suffix in (".bin", ".txt"):
+        if all(name + suffix in present for name in REQUIRED_FILES):
+            return suffix
+    raise InputError(_missing_files_message(folder, present))
+
+
+def _missing_files_message(folder: Path, present: set[str]) -> str:
+    """Return the sentence about a folder without a complete model, with the likely folder if there is one."""
+    for suffix in (".bin", ".txt"):
+        missing = [name + suffix for name in REQUIRED_FILES if name + suffix not in present]
+        if len(missing) < len(REQUIRED_FILES):
+            return (
+                f"{folder} lacks {' and '.join(missing)}; a COLMAP model needs cameras, images and points3D, "
+                "all .bin or all .txt"
+            )
+    for inner, suffix in itertools.product(("0", "sparse/0", "sparse"), (".bin", ".txt")):
+        if all((folder / inner / (name + suffix)).is_file() for name in REQUIRED_FILES):
+            return f"{folder} holds no COLMAP model, but {folder / inner} does; give that folder"
+    return f"{folder} holds no COLMAP model; give the folder with cameras, images and points3D (.bin or .txt)"
+
+
+@cache
+def _num_params_of_model() -> dict[int, tuple[str, int]]:
+    """Return the name and the number of parameters of each camera model id that pycolmap knows."""
+    table = {}
+    for name, model in pycolmap.CameraModelId.__members__.items():
+        if model != pycolmap.CameraModelId.INVALID:
+            camera = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1)
+            table[int(model)] = (name, len(camera.params))
+    return table
+
+
+def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float]) -> None:
+    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names."""
+    if not all(map(math.isfinite, pose)):
+        raise source.fault(f"{label} has a pose that is not finite")
+    norm = math.hypot(*pose[:4])
+    if abs(norm - 1.0) > UNIT_QUATERNION_TOLERANCE:
+        raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
+
+
+# --- binary models ---------------------------------------------------------------------------------
+
+
+class _BinaryFile:
+    """The bytes of a model file and a position in them; every read is checked against their end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.offset = 0
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path} cannot be read: {error.strerror}") from None
+
+    def fault(self, reason: str) -> InputError:
+        """Return the error that names this file."""
+        return InputError(f"{self.path}: {reason}")
+
+    def truncated(self, what: str) -> InputError:
+        """Return the error that the file ends inside `what`."""
+        return self.fault(f"the file ends inside {what}; it is truncated, copy or write it again")
+
+    def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
+        """Read one record of fixed length."""
+        end = self.offset + layout.size
+        if end > len(self.data):
+            raise self.truncated(what)
+        values = layout.unpack_from(self.data, self.offset)
+        self.offset = end
+        return values
+
+    def require_room(self, count: int, smallest: int, what: str) -> None:
+        """Refuse a count of records, each at least `smallest` bytes long, that cannot fit in the file."""
+        if count * smallest > len(self.data) - self.offset:
+            raise self.truncated(f"its {count} {what}")
+
+    def take_count(self, smallest: int, what: str) -> int:
+        """Read a uint64 count and refuse it if so many records cannot fit."""
+        count = int(self.take(_U64, f"the number of {what}")[0])
+        self.require_room(count, smallest, what)
+        return count
+
+    def take_name(self, what: str) -> bytes:
+        """Read bytes up to the next NUL."""
+        end = self.data.find(b"\0", self.offset)
+        if end < 0:
+            raise self.truncated(what)
+        name = self.data[self.offset : end]
+        self.offset = end + 1
+        return name
+
+    def finish(self) -> None:
+        """Refuse bytes after the last record."""
+        if self.offset != len(self.data):
+            raise self.fault(f"{len(self.data) - self.offset} bytes follow the last record; write it again")
+
+
+class _Images(NamedTuple):
+    """What other files refer to in images.bin: of each image (n,), by id, and of each observation (O,)."""
+
+    ids: IntArray
+    camera_ids: IntArray
+    num_points2d: IntArray
+    observed_points: UInt64Array
+
+
+def _check_binary_model(folder: Path, *, with_rigs: bool) -> None:
+    """Walk the binary files in the order in which they refer to each other."""
+    camera_ids = _check_cameras(_BinaryFile(folder / "cameras.bin"))
+    image_file = _BinaryFile(folder / "images.bin")
+    images = _check_images(image_file, camera_ids)
+    point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
+    unknown = images.observed_points[~np.isin(images.observed_points, point_ids)]
+    if len(unknown):
+        raise image_file.fault(f"an image observes 3D point {unknown[0]}, which points3D.bin does not have")
+    if with_rigs:
+        rigs = _check_rigs(_BinaryFile(folder / "rigs.bin"), camera_ids)
+        frame_file = _BinaryFile(folder / "frames.bin")
+        camera_of_image = _check_frames(frame_file, rigs)
+        if rigs or camera_of_image:  # two empty files are read like a model without rigs and frames
+            _check_frames_match_images(frame_file, camera_of_image, images)
+
+
+def _check_cameras(file: _BinaryFile) -> set[int]:
+    """Walk cameras.bin and return the camera ids."""
+    num_params = _num_params_of_model()
+    ids: set[int] = set()
+    for _ in range(file.take_count(_CAMERA.size, "cameras")):
+        camera_id, model_id, _, _ = map(int, file.take(_CAMERA, "a camera"))
+        if model_id not in num_params:
+            raise file.fault(f"camera {camera_id} has the unknown camera model {model_id}")
+        if camera_id in ids:
+            raise file.fault(f"camera {camera_id} stands twice")
+        ids.add(camera_id)
+        params = file.take(struct.Struct(f"<{num_params[model_id][1]}d"), f"camera {camera_id}")
+        if not all(map(math.isfinite, params)):
+            raise file.fault(f"camera {camera_id} has a parameter that is not finite")
+    file.finish()
+    return ids
+
+
+def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
+    """Walk images.bin; one step per image, its points at once."""
+    header_of: dict[int, tuple[int, int]] = {}  # camera id, number of points
+    names: set[bytes] = set()
+    observed = [np.empty(0, dtype=np.uint64)]
+    for _ in range(file.take_count(_IMAGE.size + 1 + _U64.size, "images")):
+        image_id, *pose, camera_id = file.take(_IMAGE, "an image")
+        label = f"image {image_id}"
+        name = file.take_name(f"the name of {label}")
+        _refuse_pose(file, label, pose)
+        if camera_id not in camera_ids:
+            raise file.fault(f"{label} refers to camera {camera_id}, which cameras.bin does not have")
+        if not name:
+            raise file.fault(f"{label} has no name")
+        if image_id in header_of or name in names:
+            raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
+        count = file.take_count(_POINT2D.itemsize, f"points of {label}")
+        points = np.frombuffer(file.data, dtype=_POINT2D, count=count, offset=file.offset)
+        file.offset += count * _POINT2D.itemsize
+        if not np.isfinite(points["xy"]).all():
+            raise file.fault(f"{label} has a point whose coordinates are not finite")
+        header_of[int(image_id)] = (int(camera_id), count)
+        names.add(name)
+        observed.append(points["point3d_id"][points["point3d_id"] != _NO_POINT])
+    file.finish()
+    table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
+    return _Images(table[:, 0], table[:, 1], table[:, 2], np.concatenate(observed))
+
+
+def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
+    """Walk points3D.bin in two compiled passes and return the point ids, ascending."""
+    count = file.take_count(_POINT3D_BYTES, "3D points")
+    data = np.frombuffer(file.data, dtype=np.uint8)
+    starts = np.empty(count + 1, dtype=np.int64)
+    complete = int(_walk_points(data, file.offset, starts))
+    if complete < count:
+        raise file.truncated(f"3D point {complete + 1} of {count}")
+    file.offset = int(starts[-1])
+    file.finish()
+
+    ids = np.empty(count, dtype=np.uint64)
+    num_elements = (int(starts[-1] - starts[0]) - count * _POINT3D_BYTES) // _TRACK_ELEMENT_BYTES
+    elements = np.empty((num_elements, 2), dtype=np.int64)
+    not_finite = int(_read_points(data, starts, ids, elements))
+    if not_finite >= 0:
+        raise file.fault(f"3D point {ids[not_finite]} has coordinates that are not finite")
+    ids.sort()
+    repeated = ids[1:][ids[1:] == ids[:-1]]
+    if len(repeated):
+        raise file.fault(f"3D point {repeated[0]} stands twice")
+    # Each element of a track refers to an image, and to a point of it.
+    position = np.searchsorted(images.ids, elements[:, 0])
+    is_known = np.append(images.ids, -1)[position] == elements[:, 0]
+    bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
+    if len(bad):
+        image_id, point = bad[0]
+        raise file.fault(
+            f"a track refers to point {point} of image {image_id}, which images.bin does not have"
+        )
+    return ids
+
+
+@inner_kernel
+def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
+    """Return the little-endian uint64 at `offset`."""
+    value = np.uint64(0)
+    for k in range(8):
+        value |= np.uint64(data[offset + k]) << np.uint64(8 * k)
+    return value
+
+
+@kernel
+def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> int:
+    """Fill in the offset of each point and the end of the last; return how many points are complete."""
+    size = len(data)
+    count = len(starts) - 1
+    for p in range(count):
+        starts[p] = offset
+        if offset + 51 > size:
+            return p
+        track_length = _read_u64(data, offset + 43)
+        offset += 51
+        if track_length > np.uint64((size - offset) // 8):
+            return p
+        offset += 8 * int(track_length)
+    starts[count] = offset
+    return count
+
+
+@kernel
+def _read_points(data: npt.NDArray[np.uint8], starts: IntArray, ids: UInt64Array, elements: IntArray) -> int:
+    """Fill in ids and track elements; return the first point whose xyz is not finite, or -1.
+
+    A double is not finite when the 11 bits of its exponent are all ones.
+    """
+    not_finite = -1
+    element = 0
+    for p in range(len(ids)):
+        ids[p] = _read_u64(data, starts[p])
+        for k in range(3):
+            bits = _read_u64(data, starts[p] + 8 + 8 * k)
+            if (bits >> np.uint64(52)) & np.uint64(0x7FF) == np.uint64(0x7FF) and not_finite < 0:
+                not_finite = p
+        for offset in range(starts[p] + 51, starts[p + 1], 8):
+            bits = _read_u64(data, offset)
+            elements[element, 0] = np.int64(bits & np.uint64(0xFFFFFFFF))
+            elements[element, 1] = np.int64(bits >> np.uint64(32))
+            element += 1
+    return not_finite
+
+
+def _check_rigs(file: _BinaryFile, camera_ids: set[int]) -> dict[int, set[tuple[int, int]]]:
+    """Walk rigs.bin and return the sensors (type, id) of each rig."""
+    rigs: dict[int, set[tuple[int, int]]] = {}
+    for _ in range(file.take_count(_RIG.size, "rigs")):
+        rig_id, num_sensors = map(int, file.take(_RIG, "a rig"))
+        label = f"rig {rig_id}"
+        if rig_id in rigs:
+            raise file.fault(f"{label} stands twice")
+        file.require_room(num_sensors, _SENSOR.size, f"sensors of {label}")
+        rigs[rig_id] = {
+            _take_sensor(file, label, camera_ids, is_reference=k == 0) for k in range(num_sensors)
+        }
+        if len(rigs[rig_id]) < num_sensors:
+            raise file.fault(f"{label} has a sensor that stands twice")
+    file.finish()
+    return rigs
+
+
+def _take_sensor(
+    file: _BinaryFile, label: str, camera_ids: set[int], *, is_reference: bool
+) -> tuple[int, int]:
+    """Read one sensor of a rig, and its pose unless it is the reference; return its type and id."""
+    sensor_type, sensor_id = map(int, file.take(_SENSOR, label))
+    if sensor_type == _CAMERA_SENSOR and sensor_id not in camera_ids:
+        raise file.fault(f"{label} refers to camera {sensor_id}, which cameras.bin does not have")
+    if not is_reference and file.take(_HAS_POSE, label)[0]:
+        _refuse_pose(file, f"{label} has a sensor that", file.take(_POSE, label))
+    return sensor_type, sensor_id
+
+
+def _check_frames(file: _BinaryFile, rigs: dict[int, set[tuple[int, int]]]) -> dict[int, int]:
+    """Walk frames.bin and return the camera of each image that a frame refers to."""
+    camera_of_image: dict[int, int] = {}
+    frame_ids: set[int] = set()
+    for _ in range(file.take_count(_FRAME.size, "frames")):
+        frame_id, rig_id, *pose, num_data = file.take(_FRAME, "a frame")
+        label = f"frame {frame_id}"
+        if frame_id in frame_ids:
+            raise file.fault(f"{label} stands twice")
+        frame_ids.add(int(frame_id))
+        if rig_id not in rigs:
+            raise file.fault(f"{label} refers to rig {rig_id}, which rigs.bin does not have")
+        _refuse_pose(file, label, pose)
+        file.require_room(int(num_data), _FRAME_DATA.size, f"images of {label}")
+        for _ in range(int(num_data)):
+            sensor_type, sensor_id, data_id = map(int, file.take(_FRAME_DATA, label))
+            if (sensor_type, sensor_id) not in rigs[int(rig_id)]:
+                raise file.fault(f"{label} refers to sensor {sensor_id}, which rig {rig_id} does not have")
+            if sensor_type != _CAMERA_SENSOR:
+                continue
+            if data_id in camera_of_image:
+                raise file.fault(f"image {data_id} stands in two frames")
+            camera_of_image[data_id] = sensor_id
+    file.finish()
+    return camera_of_image
+
+
+def _check_frames_match_images(file: _BinaryFile, camera_of_image: dict[int, int], images: _Images) -> None:
+    """Refuse images without a frame, frames without their image, and two opinions about its camera."""
+    camera_of = dict(zip(images.ids.tolist(), images.camera_ids.tolist(), strict=True))
+    for image_id in sorted(camera_of_image.keys() | camera_of.keys()):
+        if image_id not in camera_of:
+            raise file.fault(f"a frame refers to image {image_id}, which images.bin does not have")
+        if image_id not in camera_of_image:
+            raise file.fault(f"image {image_id} of images.bin is in no frame")
+        if camera_of[image_id] != camera_of_image[image_id]:
+            raise file.fault(
+                f"image {image_id} belongs to camera {camera_of_image[image_id]} here, "
+                f"but to camera {camera_of[image_id]} in images.bin"
+            )
+
+
+# --- text models -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """One line of a text file, with its place for messages."""
+
+    path: Path
+    number: int
+    text: str
+
+    def fault(self, reason: str) -> InputError:
+        """Return the error that names this line."""
+        return InputError(f"{self.path}:{self.number}: {reason}")
+
+    def finite(self, tokens: Sequence[str], what: str) -> list[float]:
+        """Return the tokens as numbers."""
+        try:
+            values = list(map(float, tokens))
+        except ValueError:
+            raise self.fault(f"{what} holds something that is not a number") from None
+        if not all(map(math.isfinite, values)):
+            raise self.fault(f"{what} holds a number that is not finite")
+        return values
+
+    @property
+    def is_record(self) -> bool:
+        """Whether this is neither blank nor a comment."""
+        return not self.text.strip().startswith("#") and not self.text.isspace()
+
+
+def _lines(path: Path, *, records_only: bool = True) -> Iterator[_Line]:
+    """Yield the lines of a text file that are records, or all."""
+    try:
+        with path.open(encoding="utf-8", errors="surrogateescape") as stream:
+            for number, text in enumerate(stream, start=1):
+                line = _Line(path, number, text)
+                if line.is_record or not records_only:
+                    yield line
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def _check_camera_lines(path: Path) -> None:
+    """Each line: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
+    num_params = dict(_num_params_of_model().values())
+    for line in _lines(path):
+        tokens = line.text.split()
+        if len(tokens) < 4 or tokens[1] not in num_params:
+            raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
+        if len(tokens) - 4 != num_params[tokens[1]]:
+            raise line.fault(
+                f"{tokens[1]} has {num_params[tokens[1]]} parameters, but {len(tokens) - 4} are given"
+            )
+        line.finite(tokens[2:], "the camera")
+
+
+def _check_image_lines(path: Path) -> None:
+    """Two lines per image: IMAGE_ID, QW .. TZ, CAMERA_ID, NAME and then (X, Y, POINT3D_ID)[]."""
+    names: dict[str, int] = {}
+    lines = _lines(path, records_only=False)
+    for line in lines:
+        if not line.is_record:
+            continue
+        tokens = line.text.split()
+        if len(tokens) != 10:
+            raise line.fault(
+                "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME "
+                "(a name with spaces needs the .bin format)"
+            )
+        _refuse_pose(line, f"image {tokens[0]}", line.finite(tokens[1:8], "the pose"))
+        if tokens[9] in names:
+            raise line.fault(f"the name {tokens[9]} stands in line {names[tokens[9]]} already")
+        names[tokens[9]] = line.number
+        points = next(lines, None)
+        if points is None:
+            raise line.fault("the line of its points is missing; add one, empty if the image has none")
+        tokens = points.text.split()
+        if len(tokens) % 3:
+            raise points.fault("expected triples X, Y, POINT3D_ID")
+        points.finite(tokens, "a point")
+
+
+def _check_point_lines(path: Path) -> None:
+    """Each line: POINT3D_ID, X, Y, Z, R, G, B, ERROR, (IMAGE_ID, POINT2D_IDX)[]."""
+    for line in _lines(path):
+        tokens = line.text.split()
+        if len(tokens) < 8 or len(tokens) % 2:
+            raise line.fault("expected POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as pairs")
+        line.finite(tokens[1:4], "the 3D point")

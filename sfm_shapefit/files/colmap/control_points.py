@@ -1,0 +1,241 @@
+"""Ground control points from a file, and where a model has them.
+
+The file is OpenDroneMap's gcp_list.txt:
+
+    WGS84 UTM 32N                                     the projection of the coordinates
+    481367.1 5782936.2 100.3 3044 2622 a.jpg P1       x y z, pixels, image, name of the point
+    481367.1 5782936.2 100.3 1606 2763 b.jpg P1
+
+Coordinates on the WGS84 ellipsoid, and of the zones of UTM on it, become meters east, north and up of their
+median. Nothing else is converted.
+
+Source: https://docs.opendronemap.org/gcp/ (the format; geographic coordinates are longitude, then latitude).
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.model import PosedModel, camera_rays
+from sfm_shapefit.files.colmap.priors import enu_of
+from sfm_shapefit.files.lines import is_number, text_of
+from sfm_shapefit.placement.control_points import ControlPoints, TriangulatedControl
+from sfm_shapefit.placement.gauge import Datum
+from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
+from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
+
+_LARGEST = 1e30
+_CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
+_LOCAL = {"local", "enu"}
+_GEODETIC = re.compile(r"(epsg:4326|epsg:4979|wgs84|.*\+proj=(latlong|longlat)\b.*)")
+_UTM_WORDS = re.compile(r"wgs84 utm (?:zone )?(\d{1,2}) ?([ns])")
+_UTM_CODE = re.compile(r"epsg:32([67])(\d\d)")
+_UTM_STRING = re.compile(r".*\+proj=utm\b.*\+zone=(\d{1,2})\b.*")
+_EARTH_SHAPE, _UNITS = re.compile(r"\+(?:ellps|datum)=(\S+)"), re.compile(r"\+units=(\S+)")
+_ZONES = range(1, 61)
+_LINE = "x y z, two pixel coordinates, the name of an image, and perhaps that of the point"
+# Marks are set by hand, in a model that may be bent: they miss by more than keypoints do.
+_MARK_ERRORS = 4.0
+
+
+class _Mark(NamedTuple):
+    """A line of the file."""
+
+    number: int
+    position: tuple[float, float, float]
+    pixel: tuple[float, float]
+    image: str
+    point: str
+    is_check: bool
+
+
+def read_control_points(path: Path, model: PosedModel) -> ControlPoints:
+    """Read a gcp_list.txt: a line that names the projection, then one line per mark of a point in an image.
+
+    The projection is WGS84 (longitude, latitude, altitude), one of its zones of UTM, or "local" for axes that
+    are metric as they are. Points without a name are told apart by their coordinates. A point whose name
+    begins with CHK-, or after whose name stands "check", only checks the model. Marks in images that the
+    model lacks are passed over.
+
+    Raises:
+        InputError: if the file cannot be read, its projection is another, a line is malformed or contradicts
+            an earlier one, no image is one of the model's, or the points cannot tell scale and axes.
+    """
+    lines = [
+        (number, line)
+        for number, line in enumerate(text_of(path).splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        raise InputError(f"{path} is empty; its first line is the projection, then a line is {_LINE}")
+    convert = _projection(path, *lines[0])
+    marks = [_parse(path, number, line) for number, line in lines[1:]]
+    _refuse_contradictions(path, marks)
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    used = [mark for mark in marks if mark.image in index_of_name]
+    if not used:
+        raise InputError(f"{path} has no mark in an image of the model, such as {model.names[0]}")
+    names = sorted({mark.point for mark in used})
+    place = {name: k for k, name in enumerate(names)}
+    used.sort(key=lambda mark: (place[mark.point], index_of_name[mark.image]))
+    first = {mark.point: mark for mark in reversed(used)}
+    try:
+        positions, datum = convert(np.array([first[name].position for name in names]))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    statement = f"{len(names)} points of {path}"
+    if datum is not None:
+        latitude, longitude, altitude = datum
+        statement += f", meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+    if len(used) < len(marks):
+        statement += f", without {len(marks) - len(used)} of {len(marks)} marks, whose images the model lacks"
+    return ControlPoints(
+        names=tuple(names),
+        positions=positions,
+        is_check=np.array([first[name].is_check for name in names], dtype=np.bool_),
+        points=np.array([place[mark.point] for mark in used], dtype=np.int64),
+        images=np.array([index_of_name[mark.image] for mark in used], dtype=np.int64),
+        pixels=np.array([mark.pixel for mark in used]),
+        statement=statement,
+        datum=datum,
+    )
+
+
+def triangulate_control_points(
+    reconstruction: pycolmap.Reconstruction,
+    names: tuple[str, ...],
+    known: ControlPoints,
+    options: StructureOptions,
+) -> TriangulatedControl:
+    """Return where the placed images of a model have control points; marks may be wrong.
+
+    Args:
+        reconstruction: not changed.
+        names: (n,) of the images that the marks index.
+        known: the points and their marks.
+        options: of 3D points; a mark may miss by four times what a keypoint may.
+    """
+    ids = {image.name: image_id for image_id, image in reconstruction.images.items()}
+    placed = [k for k, name in enumerate(names) if name in ids and reconstruction.image(ids[name]).has_pose]
+    images = [reconstruction.image(ids[names[k]]) for k in placed]
+    poses = [image.cam_from_world() for image in images]
+    place = np.full(len(names), -1)
+    place[placed] = np.arange(len(placed))
+    rows = np.flatnonzero(place[known.images] >= 0)
+    cameras = [reconstruction.camera(image.camera_id) for image in images]
+    on_plane = np.full((len(rows), 2), np.nan)
+    for k, row in enumerate(rows.tolist()):
+        ray = camera_rays(cameras[place[known.images[row]]], known.pixels[row : row + 1])[0]
+        if ray[2] > 0.0:
+            on_plane[k] = ray[:2] / ray[2]
+    counts = np.bincount(known.points[rows], minlength=len(known.names))
+    seen = place[known.images[rows]]
+    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
+    turns = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
+    focals = np.array([camera.mean_focal_length() for camera in cameras])
+    tracks = ObservedTracks(
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        cameras=seen,
+        keypoints=rows,
+        pixels=known.pixels[rows],
+        on_plane=on_plane,
+        ids=np.arange(len(known.names)),
+        may_split=False,
+    )
+    limits = PointLimits(
+        max_error_px=_MARK_ERRORS * options.max_reprojection_error_px,
+        min_angle_deg=options.min_triangulation_angle_deg,
+        min_length=2,
+    )
+    stand = CameraPoses(
+        rotations=turns, centers=centers, focal_lengths_px=focals, images=np.arange(len(placed))
+    )
+    found = triangulate_tracks(tracks, stand, limits)
+    positions = np.full((len(known.names), 3), np.nan)
+    positions[found.tracks] = found.points
+    agreeing, errors = np.zeros(len(known.points), dtype=np.bool_), np.full(len(known.points), np.nan)
+    agreeing[rows] = found.points_seen >= 0
+    inside = np.einsum("kab,kb->ka", turns[seen], positions[known.points[rows]] - centers[seen])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        errors[rows] = focals[seen] * np.linalg.norm(inside[:, :2] / inside[:, 2:] - on_plane, axis=1)
+    return TriangulatedControl(positions, errors, agreeing)
+
+
+Converter = Callable[[FloatArray], tuple[FloatArray, Datum | None]]
+
+
+def _projection(path: Path, number: int, line: str) -> Converter:
+    """Return what turns coordinates of the projection that a line names into metric ones."""
+    named = " ".join(line.lower().replace("wgs 84", "wgs84").split())
+    if named in _LOCAL:
+        return lambda xyz: (xyz, None)
+    if _GEODETIC.fullmatch(named):
+        return lambda xyz: _from_geodetic(xyz[:, [1, 0, 2]])
+    zone, is_north = _zone(named)
+    if zone in _ZONES:
+        return lambda xyz: _from_geodetic(_from_utm(xyz, zone, is_north))
+    raise InputError(
+        f"{path}, line {number}: the projection {line.strip()!r} is not one that is converted; give "
+        "coordinates in EPSG:4326 (longitude, latitude, altitude), in a zone as WGS84 UTM 32N, or metric "
+        "ones after the line local"
+    )
+
+
+def _zone(named: str) -> tuple[int, bool]:
+    """Return the zone of UTM on WGS84 that a projection names, 0 if it is none, and whether it is north."""
+    if words := _UTM_WORDS.fullmatch(named):
+        return int(words[1]), words[2] == "n"
+    if code := _UTM_CODE.fullmatch(named):
+        return int(code[2]), code[1] == "6"
+    string = _UTM_STRING.fullmatch(named)
+    shapes = set(_EARTH_SHAPE.findall(named)) | set(_UNITS.findall(named))
+    return (int(string[1]), "+south" not in named) if string and shapes <= {"wgs84", "m"} else (0, True)
+
+
+def _from_geodetic(geodetic: FloatArray) -> tuple[FloatArray, Datum]:
+    datum = Datum(*np.median(geodetic, axis=0).tolist())
+    return enu_of(geodetic, datum), datum
+
+
+def _from_utm(xyz: FloatArray, zone: int, is_north: bool) -> FloatArray:
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north))
+
+
+def _parse(path: Path, number: int, line: str) -> _Mark:
+    """Return the mark of a line."""
+    cells = [cell.strip() for cell in (line.split("\t") if line.count("\t") >= 5 else line.split())]
+    if len(cells) < 6 or not all(map(is_number, cells[:5])):
+        raise InputError(f"{path}, line {number}: expected {_LINE}")
+    values = np.array([float(cell) for cell in cells[:5]])
+    if not (np.abs(values) <= _LARGEST).all():
+        raise InputError(f"{path}, line {number}: coordinates must be finite, and all three known")
+    point = cells[6] if len(cells) > 6 else "({}, {}, {})".format(*cells[:3])
+    is_check = point.lower().startswith(_CHECK_PREFIX) or _CHECK_WORD in map(str.lower, cells[7:])
+    x, y, z, u, v = values.tolist()
+    return _Mark(number, (x, y, z), (u, v), cells[5], point, is_check)
+
+
+def _refuse_contradictions(path: Path, marks: list[_Mark]) -> None:
+    """Refuse a point of two positions or roles, and one that an image shows twice."""
+    first: dict[str, _Mark] = {}
+    seen: set[tuple[str, str]] = set()
+    for mark in marks:
+        before = first.setdefault(mark.point, mark)
+        where = f"{path}, line {mark.number}: "
+        if before.position != mark.position:
+            raise InputError(
+                f"{where}{mark.point} has other coordinates than in line {before.number}; keep one position"
+            )
+        if before.is_check != mark.is_check:
+            raise InputError(f"{where}{mark.point} is a check point in one line and none in another")
+        if (mark.point, mark.image) in seen:
+            raise InputError(f"{where}{mark.point} is marked twice in {mark.image}; keep one of its marks")
+        seen.add((mark.point, mark.image))

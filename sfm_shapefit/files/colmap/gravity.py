@@ -1,0 +1,89 @@
+"""Gravity in axes of cameras: a table, or the gravity column that pose priors of a COLMAP database have.
+
+Source: `colmap/geometry/pose_prior.h`: gravity is a direction in axes of the camera, x to the right, y down
+and z ahead, so that (0, 1, 0) is that of a level camera.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.priors import PRIORS_OF_IMAGES
+from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
+from sfm_shapefit.files.lines import is_number, lines_of_cells
+from sfm_shapefit.rotations.gravity import Gravity
+
+_SIGMA_DEG = 1.0
+# No instrument is as exact, and beside a gravity that is, the pairs' share of the system drowns in rounding.
+_LEAST_SIGMA_DEG = 1e-3
+_LARGEST = 1e30
+_FORM = "the name of an image, three components of its gravity and at most a standard deviation in degrees"
+
+
+def table_gravity(path: Path, model: PosedModel) -> Gravity:
+    """Read a text table `name x y z [sigma_deg]`, by commas or white space; sigma is 1 degree if not given.
+
+    A first line that names the columns is optional. Lines that begin with # are comments; images that the
+    model lacks are passed over.
+
+    Raises:
+        InputError: if the file cannot be read, a line is malformed, or no name is one of the model's.
+    """
+    rows: dict[str, list[float]] = {}
+    for place, (number, cells) in enumerate(lines_of_cells(path)):
+        where = f"{path}, line {number}: "
+        if place == 0 and len(cells) > 1 and not is_number(cells[1]):
+            continue
+        if len(cells) not in (4, 5) or not all(map(is_number, cells[1:])):
+            raise InputError(f"{where}expected {_FORM}")
+        values = [float(cell) for cell in cells[1:]]
+        length, sigma = float(np.linalg.norm(values[:3])), [*values, _SIGMA_DEG][3]
+        if not 1.0 / _LARGEST <= length <= _LARGEST or not _LEAST_SIGMA_DEG <= sigma < 90.0:
+            raise InputError(
+                f"{where}the direction must be finite and not zero, the standard deviation between "
+                f"{_LEAST_SIGMA_DEG:g} and 90 deg"
+            )
+        if cells[0] in rows:
+            raise InputError(f"{where}{cells[0]} stands twice; keep one of its gravities")
+        rows[cells[0]] = [*values[:3], sigma]
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
+    if not found:
+        raise InputError(f"{path} has no gravity of the model's images, such as {model.names[0]}")
+    return _gravity(found)
+
+
+def database_gravity(path: Path, model: PosedModel) -> Gravity:
+    """Read the gravity of the pose priors of the model's images, each to 1 degree; nothing is changed.
+
+    Raises:
+        InputError: if the database has none of these images, or a damaged one.
+    """
+    query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {PRIORS_OF_IMAGES}"
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    found: dict[int, list[float]] = {}
+    columns = ("corr_data_id", "corr_sensor_type", "gravity")
+    for name, blob in readonly_rows(path, "pose_priors", {columns: query}):
+        if name not in index_of_name or blob is None:
+            continue
+        if not isinstance(blob, bytes) or len(blob) != 24:
+            raise InputError(
+                f"{path}: the gravity of image {name} is damaged; leave it out or write it again"
+            )
+        values = np.frombuffer(blob, dtype="<f8")
+        if 1.0 / _LARGEST <= float(np.linalg.norm(values)) <= _LARGEST:
+            found[index_of_name[name]] = [*values.tolist(), _SIGMA_DEG]
+    if not found:
+        raise InputError(f"{path} has no gravity of its images; give a table with --gravity")
+    return _gravity(found)
+
+
+def _gravity(found: dict[int, list[float]]) -> Gravity:
+    indices = sorted(found)
+    values = np.array([found[k] for k in indices])
+    lengths = np.linalg.norm(values[:, :3], axis=1, keepdims=True)
+    sigmas = np.array([math.radians(sigma) for sigma in values[:, 3].tolist()])
+    return Gravity(np.array(indices, dtype=np.int64), values[:, :3] / lengths, sigmas)

@@ -1,0 +1,253 @@
+"""Intrinsics that were never measured: which they are, and focal lengths of them from the view graph.
+
+COLMAP sets a focal length to 1.2 times the larger side of the image where it knows none, and to that of the
+EXIF data where there is one; the database says of the first that it is no prior. Of the second it says that
+it is one, but such a camera has never been calibrated either: its distortion is 0 in a model that has some,
+and its principal point the very middle of the image. Where most cameras of a database were calibrated, all
+were.
+
+A fundamental matrix knows the focal lengths of its two images (Fetzer, Reisert, Kanatani, "Stable intrinsic
+auto-calibration from fundamental matrices of devices with uncorrelated camera parameters", WACV 2020).
+pycolmap solves for those of all pairs at once. It works on a database of its own here, with the matrices and
+nothing else of the user's. Pairs whose matches fit a homography say nothing, so a camera needs others.
+"""
+
+import sqlite3
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing
+from enum import Enum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.adjustment.free_lenses import LensDoubt
+from sfm_shapefit.adjustment.views import is_adjusted, lens_of
+from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
+from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
+from sfm_shapefit.files.colmap.quiet import quiet_stderr
+from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
+from sfm_shapefit.files.pair_list import PairNames
+
+
+class Origin(Enum):
+    """Where the intrinsics of a camera come from; the value names it in words."""
+
+    GUESS = "a guess"
+    EXIF = "EXIF data"
+    CALIBRATION = "given"
+
+
+_FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}
+_DISTORTION_SIGMAS = {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
+# COLMAP's TwoViewGeometryConfiguration: essential or fundamental matrix, not a homography.
+_WITH_DEPTH = (2, 3)
+# A camera needs so many pairs with depth, and such a share of all of its pairs.
+_FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3
+# Pairs of most matches that take part: 100 bytes each, and the time is in proportion to them.
+_MOST_PAIRS = 50_000
+# Of the factors that pycolmap finds: it adds up in the order in which its threads end, so the thirteenth
+# digit differs from run to run, and an adjustment from there in more.
+_DIGITS = 8
+# Of unit rays: what makes relative rotations worth measuring anew.
+_SAME_RAYS = 0.01
+
+
+class Uncalibrated(NamedTuple):
+    """A camera that was never calibrated."""
+
+    origin: Origin
+    """Of its intrinsics."""
+    database_id: int
+    """Its id in the database."""
+
+
+def find_uncalibrated(database: Path, model: PosedModel) -> dict[int, Uncalibrated]:
+    """Return the cameras of a model that have the very intrinsics which a database guessed, by their id.
+
+    Args:
+        database: which is not changed.
+        model: whose images are those of the database by name.
+
+    Raises:
+        InputError: if the database cannot be read.
+    """
+    columns = ("camera_id", "width", "height", "params", "prior_focal_length")
+    query = f"SELECT images.name, {', '.join(columns)} FROM images JOIN cameras USING (camera_id)"
+    rows = {name: row for name, *row in readonly_rows(database, "cameras", {columns: query})}
+    found: dict[int, Uncalibrated] = {}
+    for image_id, name in zip(model.image_ids.tolist(), model.names, strict=True):
+        camera = model.reconstruction.camera(model.reconstruction.image(image_id).camera_id)
+        if camera.camera_id not in found and name in rows:
+            database_id, width, height, params, prior = rows[name]
+            if camera.params.astype("<f8").tobytes() == params:
+                found[camera.camera_id] = Uncalibrated(_origin(camera, width, height, prior), database_id)
+    origins = [one.origin for one in found.values()]
+    known = {Origin.CALIBRATION}
+    if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
+        # A calibration leaves the distortion 0 where the images do not tell it; EXIF leaves it 0 everywhere.
+        known.add(Origin.EXIF)
+    return {camera: one for camera, one in found.items() if one.origin not in known}
+
+
+def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Origin:
+    """Return where the intrinsics of a row of the table cameras come from, by that row alone."""
+    if not prior:
+        return Origin.GUESS
+    principal = camera.params[camera.principal_point_idxs()]
+    extra = camera.params[camera.extra_params_idxs()]
+    is_centered = bool((principal == [0.5 * width, 0.5 * height]).all())
+    return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
+
+
+def doubt_lenses(
+    cameras: Mapping[int, pycolmap.Camera], origins: Mapping[int, Origin]
+) -> dict[int, LensDoubt]:
+    """Return how far intrinsics may be off, of those cameras whose model can be adjusted."""
+    return {
+        camera_id: LensDoubt(lens_of(cameras[camera_id]), _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
+        for camera_id, origin in sorted(origins.items())
+        if is_adjusted(cameras[camera_id])
+    }
+
+
+def with_focal_lengths(model: PosedModel, factors: Mapping[int, float]) -> PosedModel:
+    """Return a model whose focal lengths are some factor larger, by camera; the input is not touched."""
+    found = {}
+    for camera_id, factor in factors.items():
+        camera = model.reconstruction.camera(camera_id)
+        params = camera.params.copy()
+        params[camera.focal_length_idxs()] *= factor
+        found[camera_id] = params.tolist()
+    return with_parameters(model, found)
+
+
+def with_parameters(model: PosedModel, found: Mapping[int, Sequence[float]]) -> PosedModel:
+    """Return a model with other parameters of some cameras, by their id; the input is not touched."""
+    if not found:
+        return model
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for camera_id, params in found.items():
+        copy.camera(camera_id).params = list(params)
+    return read_model(copy)
+
+
+def differ_in_rays(one: PosedModel, other: PosedModel) -> bool:
+    """Return whether the rays of a camera's corner or edges differ by a hundredth between two models."""
+    for camera_id, camera in one.reconstruction.cameras.items():
+        against = other.reconstruction.camera(camera_id)
+        if camera.params.tolist() == against.params.tolist():
+            continue
+        w, h = camera.width, camera.height
+        xy = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
+        rays, those = (np.asarray(through.cam_ray_from_img(xy)) for through in (camera, against))
+        if not np.abs(rays - those).max() <= _SAME_RAYS:  # NaN differs too
+            return True
+    return False
+
+
+def calibrate_view_graph(
+    database: Path, cameras: Collection[int], left_out: PairNames = frozenset()
+) -> dict[int, float]:
+    """Return by which factors the fundamental matrices of a database want other focal lengths, by camera.
+
+    Args:
+        database: which is not changed.
+        cameras: that are asked, by their id there; all others are held.
+        left_out: pairs of images that say nothing.
+
+    Returns:
+        Of the cameras whose pairs can tell.
+
+    Raises:
+        InputError: if the database cannot be read.
+    """
+    tables = _read_tables(database, left_out)
+    asked = _with_enough_pairs(tables, set(cameras))
+    if not asked:
+        return {}
+    with tempfile.TemporaryDirectory(prefix="shapefit-") as folder:
+        private = Path(folder) / "database.db"
+        pycolmap.Database.open(private).close()
+        _fill(private, tables, asked)
+        before = _focal_lengths(private)
+        options = pycolmap.ViewGraphCalibrationOptions()
+        options.random_seed, options.reestimate_relative_pose = 0, False
+        options.cross_validate_prior_focal_lengths = False
+        try:
+            with quiet_stderr():
+                done = pycolmap.calibrate_view_graph(private, options)
+        except PYCOLMAP_ERRORS:
+            return {}
+        after = _focal_lengths(private)
+    factors = {camera: round(after[camera] / before[camera], _DIGITS) for camera in asked}
+    return {i: f for i, f in sorted(factors.items()) if done and np.isfinite(f) and f not in (0.0, 1.0)}
+
+
+Rows = list[tuple[Any, ...]]
+
+
+def _read_tables(database: Path, left_out: PairNames) -> dict[str, Rows]:
+    """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
+    cameras = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
+    images = ("image_id", "name", "camera_id")
+    pairs = ("pair_id", "rows", "config", "F")
+    where = "WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id"
+    most = _MOST_PAIRS + len(left_out)
+    queries = {
+        "cameras": (cameras, f"SELECT {', '.join(cameras)} FROM cameras"),
+        "images": (images, f"SELECT {', '.join(images)} FROM images"),
+        "two_view_geometries": (
+            pairs,
+            f"SELECT {', '.join(pairs)} FROM two_view_geometries {where} LIMIT {most}",
+        ),
+    }
+    found = {
+        table: readonly_rows(database, table, {needed: query}) for table, (needed, query) in queries.items()
+    }
+    ids = {name: image_id for image_id, name, _ in found["images"]}
+    unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in _ends_of(left_out, ids)}
+    kept = [row for row in found["two_view_geometries"] if row[0] not in unwanted]
+    return found | {"two_view_geometries": kept[:_MOST_PAIRS]}
+
+
+def _ends_of(pairs: PairNames, ids: Mapping[str, int]) -> Iterator[tuple[int, int]]:
+    """Yield the ids of the images of pairs that the database has."""
+    for first, second in pairs:
+        if first in ids and second in ids:
+            yield ids[first], ids[second]
+
+
+def _with_enough_pairs(tables: Mapping[str, Rows], asked: set[int]) -> set[int]:
+    """Return the cameras among those asked whose pairs have depth often enough."""
+    camera_of = {image: camera for image, _, camera in tables["images"]}
+    all_pairs, deep = dict.fromkeys(asked, 0), dict.fromkeys(asked, 0)
+    for pair_id, _, config, _ in tables["two_view_geometries"]:
+        for camera in asked.intersection(camera_of.get(i, -1) for i in divmod(pair_id, MAX_NUM_IMAGES)):
+            all_pairs[camera] += 1
+            deep[camera] += config in _WITH_DEPTH
+    return {c for c in asked if deep[c] >= max(_FEWEST_PAIRS, _LEAST_SHARE * all_pairs[c])}
+
+
+def _fill(private: Path, tables: Mapping[str, Rows], asked: set[int]) -> None:
+    """Write the view graph into an empty database of our own; what is not asked is a prior there."""
+    cameras = [(*row[:5], int(row[0] not in asked)) for row in tables["cameras"]]
+    pairs = [(p, 0, 2, b"", c, f) for p, _, c, f in tables["two_view_geometries"] if c in _WITH_DEPTH]
+    with closing(sqlite3.connect(private)) as opened, opened:
+        opened.executemany("INSERT INTO cameras VALUES (?, ?, ?, ?, ?, ?)", cameras)
+        opened.executemany(
+            "INSERT INTO images (image_id, name, camera_id) VALUES (?, ?, ?)", tables["images"]
+        )
+        columns = "(pair_id, rows, cols, data, config, F)"
+        opened.executemany(f"INSERT INTO two_view_geometries {columns} VALUES (?, ?, ?, ?, ?, ?)", pairs)
+
+
+def _focal_lengths(private: Path) -> dict[int, float]:
+    """Return the mean focal length of each camera of a database of our own."""
+    opened = pycolmap.Database.open(private)
+    try:
+        return {camera.camera_id: float(camera.mean_focal_length()) for camera in opened.read_all_cameras()}
+    finally:
+        opened.close()

@@ -1,0 +1,197 @@
+"""Position priors of cameras: pose priors of a COLMAP database, a table of names and positions, or EXIF data.
+
+Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
+north and up of their median. Their covariances are taken as meters squared in those axes.
+
+Source: https://colmap.github.io/database.html; `colmap/geometry/pose_prior.h`: coordinate system -1 is
+undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP 3.12 a row names its image,
+from then on its sensor and datum, and an image is the datum of a camera.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
+from sfm_shapefit.files.lines import is_number, lines_of_cells
+from sfm_shapefit.placement.gauge import Datum, PositionPriors
+from sfm_shapefit.scene.known_positions import KnownPositions
+
+_WGS84, _CARTESIAN = 0, 1
+_SENSOR_IS_CAMERA = 0
+PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
+"""What joins pose priors to their images, of databases whose priors may be of other sensors too."""
+# A row has name and position, and no standard deviation, one or three.
+_TABLE_COLUMNS = (4, 5, 7)
+_GEODETIC_NAMES = {"lat", "latitude"}
+# Sums of squares of squares of coordinates and standard deviations must not overflow.
+_LARGEST = 1e30
+
+
+class MissingPriorsError(InputError):
+    """A database that has no position prior of a model's images."""
+
+
+def database_priors(path: Path, model: PosedModel) -> PositionPriors:
+    """Read the pose priors of the model's images, matched by name, from a database, which is not changed.
+
+    Raises:
+        MissingPriorsError: if the database has no prior of these images.
+        InputError: if it mixes coordinate systems, or is damaged.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    systems: set[int] = set()
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
+    by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
+    # Of each version of the schema, the newest first, by the columns that it has.
+    queries = {
+        ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, PRIORS_OF_IMAGES),
+        ("image_id", covariances): selected.format(covariances, by_image),
+        ("image_id", "position"): selected.format("NULL", by_image),
+    }
+    for name, position, covariance, system in readonly_rows(path, "pose_priors", queries):
+        index = index_of_name.get(name)
+        xyz = _numbers(path, name, position, 3)
+        if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():
+            continue
+        found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3)
+        systems.add(system)
+    if not found:
+        raise MissingPriorsError(
+            f"{path} has no position prior of the model's images; give a table with --priors"
+        )
+    if len(systems) > 1:
+        raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind with --priors")
+    return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
+
+
+def table_priors(path: Path, model: PosedModel) -> PositionPriors:
+    """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
+
+    A first line that names the columns is optional; where it calls the second one lat or latitude, rows
+    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments; names that
+    are not among the model's are passed over.
+
+    Raises:
+        InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
+            is one of the model's.
+    """
+    rows, geodetic = read_position_table(path)
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
+    if not found:
+        raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
+    return _priors(found, f"{len(found)} positions of {path}", geodetic=geodetic)
+
+
+def exif_priors(folder: Path, model: PosedModel) -> PositionPriors:
+    """Read the GPS positions that the EXIF data of the model's images have, by pycolmap's own reader.
+
+    A position without altitude has that of the median.
+
+    Raises:
+        InputError: if no image of the model in the folder has a position.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for index, name in enumerate(model.names):
+        bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
+        if bitmap is not None:
+            read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
+            position = np.array([np.nan if value is None else value for value in read])
+            if np.isfinite(position[:2]).all():
+                found[index] = position, np.full((3, 3), np.nan)
+    if not found:
+        raise InputError(f"{folder} has no image of the model with a GPS position in its EXIF data")
+    altitudes = np.array([position[2] for position, _ in found.values()])
+    level = float(np.median(altitudes[np.isfinite(altitudes)])) if np.isfinite(altitudes).any() else 0.0
+    for position, _ in found.values():
+        position[2] = level if np.isnan(position[2]) else position[2]
+    return _priors(found, f"EXIF data of {len(found)} images of {folder}", geodetic=True)
+
+
+def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatArray]], bool]:
+    """Read position (3,) and covariance (3, 3) of each name of a table, and whether it has latitudes.
+
+    Raises:
+        InputError: if the file cannot be read or a line is malformed.
+    """
+    found: dict[str, tuple[FloatArray, FloatArray]] = {}
+    geodetic, first = False, True
+    for number, cells in lines_of_cells(path):
+        if first and len(cells) > 1 and not is_number(cells[1]):
+            geodetic = cells[1].lower() in _GEODETIC_NAMES
+        else:
+            row = _parse(path, number, cells)
+            if cells[0] in found:
+                raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
+            found[cells[0]] = row
+        first = False
+    return found, geodetic
+
+
+def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
+    """Return positions (k, 3), latitude, longitude in degrees and altitude, in meters east, north and up.
+
+    Raises:
+        ValueError: if a latitude or longitude is out of range.
+    """
+    if (np.abs(geodetic[:, 0]) > 90.0).any() or (np.abs(geodetic[:, 1]) > 360.0).any():
+        raise ValueError("a latitude or longitude is out of range; give degrees")
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.ellipsoid_to_enu(geodetic, *datum))
+
+
+def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
+    """Return the doubles of a blob, NaN if it is NULL."""
+    if blob is None:
+        return np.full(count, np.nan)
+    if not isinstance(blob, bytes) or len(blob) != 8 * count:
+        raise InputError(f"{path}: the pose prior of image {name} is damaged; leave it out or write it again")
+    return np.frombuffer(blob, dtype="<f8").astype(np.float64)
+
+
+def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return position and covariance of a line of a table."""
+    if len(cells) not in _TABLE_COLUMNS or not all(map(is_number, cells[1:])):
+        raise InputError(
+            f"{path}, line {number}: expected a name, three coordinates and at most one standard deviation "
+            "or three"
+        )
+    values = np.array([float(cell) for cell in cells[1:]])
+    if not (np.abs(values) <= _LARGEST).all() or (values[3:] < 1.0 / _LARGEST).any():
+        raise InputError(
+            f"{path}, line {number}: coordinates must be finite and standard deviations positive, "
+            f"all below {_LARGEST:g}"
+        )
+    if len(values) == 3:
+        return values, np.full((3, 3), np.nan)
+    return values[:3], np.diag(np.broadcast_to(values[3:] ** 2, 3))
+
+
+def _priors(
+    found: dict[int, tuple[FloatArray, FloatArray]], source: str, *, geodetic: bool
+) -> PositionPriors:
+    """Return priors in Cartesian axes."""
+    cameras = sorted(found)
+    positions, covariances = (np.array([found[k][part] for k in cameras]) for part in (0, 1))
+    statement, datum = source, None
+    if geodetic:
+        datum = Datum(*np.median(positions, axis=0).tolist())
+        try:
+            positions = enu_of(positions, datum)
+        except ValueError as error:
+            raise InputError(f"{source}: {error}") from error
+        latitude, longitude, altitude = datum
+        statement += (
+            f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+        )
+    return PositionPriors(
+        known=KnownPositions.measured(np.array(cameras, dtype=np.int64), positions, covariances),
+        statement=statement,
+        datum=datum,
+    )

@@ -1,0 +1,119 @@
+"""g2o files, those of pose-graph tools (g2o, GTSAM): relative poses are read, placed nodes are written.
+
+    VERTEX_SE3:QUAT    id x y z qx qy qz qw        center and rotation world_from_cam
+    EDGE_SE3:QUAT      i j x y z qx qy qz qw [21]  cam_i_from_cam_j, whose x y z is camera j seen from i
+    VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
+    VERTEX_XY          id x y                      the same in the plane
+
+Of an edge the rotation and the direction of x y z are taken; its length and the 21 numbers of its information
+matrix are not used. Ids are whole numbers: on writing the nodes' own where all are, else 0, 1, ... with the
+names in comments.
+
+Source: Kuemmerle, Grisetti, Strasdat, Konolige, Burgard, "g2o: a general framework for graph
+optimization", ICRA 2011, and its file format.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.files.lines import TextTable, first_words, is_repeated, read_lines, rotations_by_name
+from sfm_shapefit.files.onedsfm import EpipolarGeometries
+
+_POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+_POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
+# An edge ends with so many numbers, the upper triangle of its information matrix.
+_INFORMATION = 21
+_PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
+_FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
+
+
+def is_g2o(source: Path | str) -> bool:
+    """Return whether a path is a text file whose first word is a tag of g2o."""
+    words = first_words(Path(source))
+    return bool(words) and words[0].startswith(("EDGE_", *_PASSED_OVER))
+
+
+def read_g2o(path: Path | str) -> EpipolarGeometries:
+    """Read the relative poses of a g2o file; its vertices are passed over, see `read_g2o_rotations`.
+
+    Raises:
+        InputError: if the file is malformed or holds edges of another kind, naming the first bad line.
+    """
+    table = _select_tag(Path(path), _RELATIVE_POSE)
+    for row in table.rows:
+        if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION:
+            del row[-_INFORMATION:]
+    values = table.values(first=3, width=_RELATIVE_POSE_COLUMNS)
+    names, pairs = table.pairs(first=1)
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
+    largest = np.abs(values[:, :3]).max(axis=1)
+    table.refuse(~(largest > 0.0), "has no translation, so no direction")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    return EpipolarGeometries(
+        names=names,
+        pairs=pairs,
+        rotations=_rotations(table, values[:, 3:]),
+        to_second=normalized(values[:, :3] / largest[:, None]),  # squares neither overflow nor vanish
+    )
+
+
+def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
+    """Read the vertices' rotations (n, 3, 3) cam_from_world of the named cameras, and (n,) who has one.
+
+    Raises:
+        InputError: if the file is malformed, naming the first bad line, or has none of the cameras.
+    """
+    table = _select_tag(Path(path), _POSE)
+    values = table.values(first=2, width=_POSE_COLUMNS)
+    return rotations_by_name(table, 1, _rotations(table, values[:, 3:]), names)
+
+
+def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray | None = None) -> str:
+    """Return the vertices of named nodes; numbers round-trip.
+
+    Args:
+        names: (k,) of the nodes.
+        locations: (k, 3), or (k, 2) without rotations.
+        rotations: (k, 3, 3) cam_from_world; points are written without.
+
+    Raises:
+        InputError: if the dimension is neither 2 nor 3.
+    """
+    dimension = locations.shape[1]
+    if dimension not in (2, 3):
+        raise InputError(f"g2o has no vertices in {dimension} dimensions; leave out its file")
+    numbered = all(name.isascii() and name.isdigit() for name in names)
+    tag, values = ("VERTEX_XY" if dimension == 2 else "VERTEX_TRACKXYZ"), locations
+    if rotations is not None:
+        tag = "VERTEX_SE3:QUAT"
+        quaternions = Rotation.from_matrix(rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
+        values = np.concatenate([locations, quaternions], axis=1)
+    lines = []
+    for k, (name, row) in enumerate(zip(names, values.tolist(), strict=True)):
+        if not numbered:
+            lines.append(f"# {k} {''.join(c if c.isprintable() else '?' for c in name)}")
+        lines.append(" ".join([tag, name if numbered else str(k), *map(repr, row)]))
+    return "\n".join(lines) + "\n"
+
+
+def _select_tag(file: Path, tag: str) -> TextTable:
+    """Return the lines of one tag; edges that are not understood are refused."""
+    table = read_lines(file, _FORM)
+    strange = [row[0] != _RELATIVE_POSE and not row[0].startswith(_PASSED_OVER) for row in table.rows]
+    table.refuse(np.array(strange), f"is neither a vertex nor {_FORM}, which alone can be read")
+    chosen = [k for k, row in enumerate(table.rows) if row[0] == tag]
+    if not chosen:
+        raise InputError(f"{file} has no {tag}; give a pose graph in three dimensions")
+    return TextTable(file, [table.numbers[k] for k in chosen], [table.rows[k] for k in chosen])
+
+
+def _rotations(table: TextTable, quaternions: FloatArray) -> FloatArray:
+    """Return the transposed rotations (k, 3, 3) of quaternions x, y, z, w, which must be of length 1."""
+    table.refuse_no_unit(quaternions, "has no unit quaternion qx qy qz qw")
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).swapaxes(1, 2)

@@ -1,0 +1,53 @@
+"""Relative poses as text, one pair a line: read. GLOMAP's form, names instead of ids.
+
+    NAME1 NAME2 QW QX QY QZ TX TY TZ        # comments and empty lines are skipped
+
+is cam2_from_cam1 in COLMAP's camera axes: x_2 = R(q) x_1 + t. Only the direction of t counts; t = 0 is
+refused, for such a pair has none. Names have no blanks.
+
+Source: GLOMAP's relative pose files, `glomap/io/pose_io.cc` (ReadRelPose).
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.files.lines import UNIT_TOLERANCE, first_numbers, is_repeated, read_lines
+from sfm_shapefit.files.onedsfm import EpipolarGeometries
+
+_COLUMNS = 9
+
+
+def is_relative_poses(source: Path | str) -> bool:
+    """Return whether a path is a text file whose first line is one of GLOMAP's: 9 words, a quaternion."""
+    values = first_numbers(Path(source), _COLUMNS)
+    if values is None:
+        return False
+    is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= UNIT_TOLERANCE
+    return is_unit and bool(np.any(values[4:]))  # a direction in 7 dimensions would be of length 1 with these
+
+
+def read_relative_poses(path: Path | str) -> EpipolarGeometries:
+    """Read relative poses; names are in order, numbers by value.
+
+    Raises:
+        InputError: if the file is malformed, naming the first bad line.
+    """
+    table = read_lines(Path(path), "NAME1 NAME2 QW QX QY QZ TX TY TZ")
+    values = table.values(first=2, width=_COLUMNS)
+    names, pairs = table.pairs()
+    quaternions, translations = values[:, :4], values[:, 4:]
+    lengths = np.linalg.norm(translations, axis=1)
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins an image with itself")
+    table.refuse_no_unit(quaternions, "has no unit quaternion QW QX QY QZ")
+    table.refuse(np.asarray(~(lengths > 0.0)), "has no translation, so no direction")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+    return EpipolarGeometries(
+        names=names,
+        pairs=pairs,
+        rotations=rotations,
+        to_second=normalized(-np.einsum("kji,kj->ki", rotations, translations)),
+    )

@@ -1,0 +1,211 @@
+"""What the readers of text formats share: lines of words and numbers, refused by their number."""
+
+import csv
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+
+# Longer numbers are words: Python refuses to convert very long ones.
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
+_DATABASE = b"SQLite format 3\0"
+UNIT_TOLERANCE = 1e-3
+"""By how much the length of a quaternion or direction, or R R^T, may be off: a few printed digits pass."""
+
+
+def refuse_irregular_file(path: Path) -> None:
+    """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
+
+    Raises:
+        InputError: if `path` is, or links to, a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it says why it cannot be read
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path} cannot be read: Is a directory")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
+
+
+def is_database(path: Path) -> bool:
+    """Tell whether a path is a file that begins as a database of SQLite does."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_DATABASE)) == _DATABASE
+    except OSError:
+        return False
+
+
+def refuse_database(path: Path) -> None:
+    """Refuse a database where a model or a text file is wanted.
+
+    Raises:
+        InputError: if it is one; it says which command takes it.
+    """
+    if is_database(path):
+        raise InputError(
+            f"{path} is a database: `sfm-shapefit map` makes a model from it alone; the other commands take "
+            "the model's folder, and the database by --database"
+        )
+
+
+def text_of(file: Path) -> str:
+    """Return what an ordinary text file holds, without the byte order mark that editors of Windows put first.
+
+    Raises:
+        InputError: if it is none, is missing, cannot be read, or is no UTF-8.
+    """
+    refuse_irregular_file(file)
+    refuse_database(file)
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file} does not exist") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} is not a readable text file ({error})") from error
+
+
+def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells, between commas or white space, of each line that is no comment.
+
+    Raises:
+        InputError: as `text_of`.
+    """
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            cells = next(csv.reader([line])) if "," in line else line.split()
+            yield number, [cell.strip() for cell in cells]
+
+
+def first_words(file: Path) -> list[str]:
+    """Return the words of the first line that is not empty, or none if this is no ordinary text file."""
+    if not file.is_file():  # a pipe or a device would be read for ever
+        return []
+    try:
+        with file.open(encoding="utf-8-sig") as stream:
+            return next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
+    except (OSError, ValueError):
+        return []
+
+
+def first_numbers(file: Path, width: int) -> FloatArray | None:
+    """Return what follows two names in the first line that is not empty; None unless it has `width` words."""
+    words = first_words(file)
+    try:
+        values = np.array(words[2:], dtype=np.float64)
+    except ValueError:
+        return None
+    return values if len(words) == width else None
+
+
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """The words of some lines of a file, and the numbers of these lines for messages."""
+
+    file: Path
+    numbers: list[int]
+    rows: list[list[str]]
+
+    def refuse(self, bad: BoolArray, reason: str) -> None:
+        """Raise InputError for the first line that is bad."""
+        if bad.any():
+            raise InputError(f"{self.file}, line {self.numbers[int(np.argmax(bad))]}: {reason}")
+
+    def values(self, first: int, width: int) -> FloatArray:
+        """Return the finite numbers of the columns from `first` on, shape (m, width - first).
+
+        Raises:
+            InputError: naming the first line with another number of columns, or a word that is no number.
+        """
+        for number, row in zip(self.numbers, self.rows, strict=True):
+            if len(row) != width:
+                raise InputError(f"{self.file}, line {number}: has {len(row)} columns, expected {width}")
+        try:
+            values = np.array([row[first:] for row in self.rows], dtype=np.float64)
+        except ValueError:
+            words = ((n, w) for n, row in zip(self.numbers, self.rows, strict=True) for w in row[first:])
+            number, word = next((n, w) for n, w in words if not is_number(w))
+            raise InputError(f"{self.file}, line {number}: {word!r} is not a number") from None
+        self.refuse(np.asarray(~np.isfinite(values).all(axis=1)), "has a number that is not finite")
+        return values
+
+    def pairs(self, first: int = 0) -> tuple[tuple[str, ...], IntArray]:
+        """Return the names in the two columns from `first` on, in order, and their indices (m, 2)."""
+        names, nodes = node_indices([word for row in self.rows for word in row[first : first + 2]])
+        return names, nodes.reshape(-1, 2)
+
+    def refuse_no_unit(self, vectors: FloatArray, reason: str) -> None:
+        """Raise InputError for the first line whose vector (m, d) is not of length 1."""
+        lengths = np.linalg.norm(vectors, axis=1)
+        self.refuse(np.asarray(~(np.abs(lengths - 1.0) <= UNIT_TOLERANCE)), reason)
+
+
+def read_lines(file: Path, form: str) -> TextTable:
+    """Return the lines of a text file that are not empty; `#` begins a comment.
+
+    Raises:
+        InputError: if the file cannot be read or holds no line; `form` is what one should look like.
+    """
+    text, numbers, rows = text_of(file), [], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if words := line.split("#", 1)[0].split():
+            numbers.append(number)
+            rows.append(words)
+    if not rows:
+        what = "has no lines" if text else "is empty, so it has no lines"
+        raise InputError(f"{file} {what} of the form {form}; give some")
+    return TextTable(file, numbers, rows)
+
+
+def node_indices(words: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
+    """Return the distinct ids in order, numbers by value, and the index of every word among them."""
+    ids = sorted(set(words))
+    if all(_IS_INTEGER.fullmatch(word) for word in ids):
+        ids.sort(key=int)
+    index = {word: k for k, word in enumerate(ids)}
+    return tuple(ids), np.fromiter((index[word] for word in words), dtype=np.int64, count=len(words))
+
+
+def rotations_by_name(
+    table: TextTable, column: int, rotations: FloatArray, names: Sequence[str]
+) -> tuple[FloatArray, BoolArray]:
+    """Return the rotations (n, 3, 3) of names, the identity where a table has none, and (n,) who has one.
+
+    Raises:
+        InputError: if the ids in the table's column repeat one, or none is among the names.
+    """
+    ids = [row[column] for row in table.rows]
+    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
+    row_of = {name: row for row, name in enumerate(ids)}
+    known = np.array([name in row_of for name in names], dtype=np.bool_)
+    if not known.any():
+        raise InputError(f"{table.file} has a rotation of none of the {len(names)} cameras; check its ids")
+    found = np.tile(np.eye(3), (len(names), 1, 1))
+    found[known] = rotations[[row_of[name] for name in names if name in row_of]]
+    return found, known
+
+
+def is_repeated(rows: IntArray) -> BoolArray:
+    """Return which of (k, c) rows occurred before."""
+    found = np.ones(len(rows), dtype=np.bool_)
+    found[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return found
+
+
+def is_number(word: str) -> bool:
+    """Return whether a word is a number for Python, finite or not."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

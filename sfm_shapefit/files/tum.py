@@ -1,0 +1,58 @@
+"""Poses as plain text: the TUM RGB-D trajectory format, and a CSV; both written.
+
+    TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the center, and R^T as a quaternion
+    CSV   name,x,y,z,qw,qx,qy,qz              the center, and cam_from_world as in COLMAP's images.txt
+
+Camera axes are COLMAP's in both (z forward, y down), as in TUM's own data. The timestamp is the number
+that is an image's name without folder and suffix, as in TUM's data (1305031102.175304.png), if all names
+are different numbers; otherwise the position of the image in the order of names, from 0. Lines are in the
+order of timestamps.
+
+Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012; its file formats.
+"""
+
+import csv
+import io
+import math
+from pathlib import PurePosixPath
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.scene.posed_model import PosedModelFile
+
+
+def tum_text(model: PosedModelFile) -> str:
+    """Return the posed images as a trajectory; numbers round-trip."""
+    quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
+    numbers = (np.concatenate([model.centers, quaternions], axis=1) + 0.0).tolist()
+    rows = sorted(zip(_timestamps(model.names), numbers, strict=True), key=lambda row: float(row[0]))
+    lines = [" ".join([stamp, *map(repr, row)]) for stamp, row in rows]
+    return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
+
+
+def poses_csv(model: PosedModelFile) -> str:
+    """Return the posed images as a CSV; numbers round-trip."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", "x", "y", "z", "qw", "qx", "qy", "qz"])
+    quaternions = np.roll(Rotation.from_matrix(model.rotations).as_quat(canonical=True), 1, axis=1)
+    numbers = np.concatenate([model.centers, quaternions], axis=1) + 0.0
+    for name, row in zip(model.names, numbers.tolist(), strict=True):
+        writer.writerow([name, *map(repr, row)])
+    return stream.getvalue()
+
+
+def _timestamps(names: tuple[str, ...]) -> list[str]:
+    """Return the timestamp of each image, as text."""
+    stems = [PurePosixPath(name).stem for name in names]
+    if len(set(stems)) == len(stems) and all(map(_is_time, stems)):
+        return stems
+    position = {name: k for k, name in enumerate(sorted(names))}
+    return [str(position[name]) for name in names]
+
+
+def _is_time(stem: str) -> bool:
+    """Return whether a name is a plain decimal number."""
+    digits = stem.replace(".", "", 1)
+    return digits.isascii() and digits.isdigit() and math.isfinite(float(stem))

@@ -1,0 +1,1 @@
+"""The view graph: nodes, pairs with directions, groups that move together, and rigidity."""

@@ -1,0 +1,141 @@
+"""What was measured, as one value: the view graph, how certain its directions are, and what moves together.
+
+Everything that places cameras takes a `MeasuredGraph`, and everything that works on a part of it, such as one
+rigid piece, takes what `MeasuredGraph.part` makes of it.
+"""
+
+from dataclasses import KW_ONLY, dataclass
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import ViewGraph
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What the matches say beyond the directions of a graph."""
+
+    support: IntArray
+    """(m,) matches of each pair of the graph."""
+    contradicting: IntArray
+    """(q, 2) other pairs, whose matches contradict the given rotations."""
+    contradicting_support: IntArray
+    """(q,) their number of matches."""
+    errors: FloatArray | None = None
+    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
+    share keypoints (`judgement.correlated_errors`); the pairs' errors are independent if None."""
+
+    def part(self, rows: IntArray, nodes: IntArray, num_nodes: int) -> "Evidence":
+        """Return the evidence for a graph of some of the edges and nodes, renumbered.
+
+        Args:
+            rows: indices of the edges that are kept, in their new order.
+            nodes: indices of the nodes that are kept, in their new order.
+            num_nodes: of the graph that this evidence belongs to.
+        """
+        new = np.full(num_nodes, -1, dtype=np.int64)
+        new[nodes] = np.arange(len(nodes))
+        pairs = new[self.contradicting.reshape(-1, 2)]
+        kept = (pairs >= 0).all(axis=1)
+        return Evidence(
+            support=self.support[rows],
+            contradicting=pairs[kept],
+            contradicting_support=self.contradicting_support[kept],
+            errors=None if self.errors is None else self.errors[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredGraph:
+    """A view graph with all that is known of its directions and nodes."""
+
+    graph: ViewGraph
+    """Cameras first, then 3D points, which are joined to cameras only."""
+    _: KW_ONLY
+    covariance: FloatArray | None = None
+    """(m, d - 1, d - 1) of each direction, rad^2, in `tangent_bases(graph.directions)`; NaN where it is
+    unknown, None where all are."""
+    evidence: Evidence | None = None
+    """Support of the edges, and pairs whose matches contradict the given rotations; None if unknown."""
+    num_points: int = 0
+    """How many of the nodes, the last ones, are 3D points, which only help to place the cameras."""
+    groups: RigidGroups | None = None
+    """Which nodes move together; None where each moves by itself."""
+    fixed_group: int | None = None
+    """The group that stays where it is; None if there is no such group."""
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of nodes that are cameras, the first ones."""
+        return self.graph.num_nodes - self.num_points
+
+    @property
+    def is_pair(self) -> BoolArray:
+        """(m,) whether an edge joins two cameras; the others join a camera and a point."""
+        return np.asarray((self.graph.edges < self.num_cameras).all(axis=1))
+
+    @property
+    def pairs(self) -> IntArray:
+        """The edges that join two cameras, ascending."""
+        return np.flatnonzero(self.is_pair)
+
+    @property
+    def classes(self) -> IntArray:
+        """(m,) the class of noise of each edge: 0 for pairs of cameras, 1 for directions to points."""
+        return (~self.is_pair).astype(np.int64)
+
+    @property
+    def pair_graph(self) -> ViewGraph:
+        """The view graph of all cameras without the points."""
+        return self.without_points().graph
+
+    @property
+    def cameras_per_group(self) -> IntArray:
+        """(B,) number of cameras in each rigid group; 0 for a point, which is a group of its own."""
+        assert self.groups is not None
+        group_of = self.groups.group_of[: self.num_cameras]
+        return np.bincount(group_of, minlength=self.groups.num_groups).astype(np.int64)
+
+    def part(self, rows: IntArray) -> tuple["MeasuredGraph", IntArray]:
+        """Return what was measured of the edges `rows` and of their nodes, renumbered.
+
+        A fixed group of which no node is left is fixed no more.
+
+        Returns:
+            The smaller value, and (n',) the index in this graph of each of its nodes, ascending.
+        """
+        if len(rows) == self.graph.num_edges and np.array_equal(rows, np.arange(len(rows))):
+            graph, nodes = self.graph, np.unique(self.graph.edges)
+            if len(nodes) == graph.num_nodes:  # all of it, and samples of errors are large
+                return self, nodes
+        graph, nodes = self.graph.restricted_to(rows)
+        return self._with_rows(graph, rows, nodes), nodes
+
+    def without_points(self) -> "MeasuredGraph":
+        """Return what was measured of all cameras alone, with the numbers that they have."""
+        if self.num_points == 0:
+            return self
+        rows, cameras = self.pairs, np.arange(self.num_cameras)
+        graph = self.graph
+        names = None if graph.names is None else graph.names[: self.num_cameras]
+        bare = ViewGraph(
+            self.num_cameras, graph.edges[rows], graph.directions[rows], graph.weights[rows], names
+        )
+        return self._with_rows(bare, rows, cameras)
+
+    def _with_rows(self, graph: ViewGraph, rows: IntArray, nodes: IntArray) -> "MeasuredGraph":
+        """Return what is left of the edges `rows` and of the nodes, whose graph is given."""
+        groups, fixed = self.groups, self.fixed_group
+        if groups is not None and fixed is not None:
+            present = np.unique(groups.group_of[nodes])
+            fixed = int(np.searchsorted(present, fixed)) if fixed in present else None
+        return MeasuredGraph(
+            graph,
+            covariance=None if self.covariance is None else self.covariance[rows],
+            evidence=self.evidence and self.evidence.part(rows, nodes, self.graph.num_nodes),
+            num_points=int(np.sum(nodes >= self.num_cameras)),
+            groups=None if groups is None else groups.restricted_to(nodes),
+            fixed_group=fixed,
+        )

@@ -1,0 +1,134 @@
+"""Directions of many pairs, from their matches or from stored relative poses, and which to believe."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, frozen
+from sfm_shapefit.base.geometry import normalized, tangent_bases
+from sfm_shapefit.pairs.kernels import MEASURES, MIN_MATCHES, estimate_pairs
+from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
+from sfm_shapefit.scene.matches import RayMatches, RelativePoses
+
+
+def estimate_directions(
+    matches: RayMatches, options: DirectionOptions | None = None, threads: int = 1
+) -> PairDirections:
+    """Return one direction per pair from its matches and the known rotations.
+
+    Each pair is estimated on its own and with the same draws, so neither batches nor threads change
+    a bit of the answer.
+
+    Args:
+        matches: those of k pairs.
+        options: what to believe; defaults if None.
+        threads: number of threads to share the pairs among.
+    """
+    options = options or DirectionOptions()
+    k = len(matches.pairs)
+    directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
+    rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
+    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
+    settings = (options.inlier_threshold_px, options.num_hypotheses)
+
+    def run(begin: int, end: int) -> None:
+        estimate_pairs(begin, end, *given, *settings, directions, measures, moments)
+
+    if threads <= 1:
+        # Where memory is short, Python waits for ever for a thread that could not begin.
+        run(0, k)
+    else:
+        cuts = [k * share // threads for share in range(threads + 1)]
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, cuts[:-1], cuts[1:]))
+    return _judge(matches, directions, measures, moments, options)
+
+
+def from_relative_poses(
+    poses: RelativePoses, rotations: FloatArray, options: DirectionOptions | None = None
+) -> PairDirections:
+    """Return directions R_j^T t_ij from relative poses and the known rotations.
+
+    Args:
+        poses: those of k pairs; their translations may have any positive length.
+        rotations: (n, 3, 3) cam_from_world of all cameras.
+        options: what to believe; defaults if None.
+
+    Returns:
+        Directions; what only matches can tell (residual, parallax, covariance) is NaN.
+    """
+    options = options or DirectionOptions()
+    r_i, r_j = rotations[poses.pairs[:, 0]], rotations[poses.pairs[:, 1]]
+    known = r_j @ r_i.transpose(0, 2, 1)
+    sine = np.linalg.norm(poses.rotations - known, axis=(1, 2)) / np.sqrt(8.0)  # of half the angle
+    mismatch = 2.0 * np.degrees(np.arcsin(np.minimum(sine, 1.0))) > options.max_rotation_error_deg
+    status = first_reasons(
+        (mismatch, DirectionStatus.ROTATION_MISMATCH),
+        (poses.num_inliers < options.min_inliers, DirectionStatus.TOO_FEW_MATCHES),
+    )
+    directions = normalized(np.einsum("kab,ka->kb", r_j, poses.translations))
+    unknown = np.full(len(status), np.nan)
+    return PairDirections(
+        pairs=poses.pairs,
+        directions=np.where(is_usable(status)[:, None], directions, np.nan),
+        status=status,
+        num_matches=poses.num_inliers,
+        num_inliers=poses.num_inliers,
+        num_rivals=np.zeros(len(status), dtype=np.int64),
+        cheirality_fraction=unknown,
+        median_residual_px=unknown,
+        parallax_deg=unknown,
+        covariance=np.full((len(status), 2, 2), np.nan),
+    )
+
+
+def _judge(
+    matches: RayMatches,
+    directions: FloatArray,
+    measures: FloatArray,
+    moments: FloatArray,
+    options: DirectionOptions,
+) -> PairDirections:
+    """Decide which estimates to believe, and give the others their reason."""
+    num_matches = np.diff(matches.offsets)
+    inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
+    covariance = _tangent_covariance(directions, moments)
+    sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
+    status = first_reasons(
+        (num_matches < max(options.min_inliers, MIN_MATCHES), DirectionStatus.TOO_FEW_MATCHES),
+        (inliers < options.min_inlier_ratio * num_matches, DirectionStatus.LOW_INLIER_RATIO),
+        (inliers < options.min_inliers, DirectionStatus.FEW_INLIERS),
+        ((sigma_deg > options.max_sigma_deg) | (voters < options.min_inliers), DirectionStatus.NO_PARALLAX),
+        (rivals > options.max_rival_share * loyal, DirectionStatus.TWO_MOTIONS),
+        (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
+        (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
+    )
+    usable = is_usable(status)
+    return PairDirections(
+        pairs=matches.pairs,
+        directions=np.where(usable[:, None], directions, np.nan),
+        status=status,
+        num_matches=np.asarray(num_matches, dtype=np.int64),
+        num_inliers=inliers.astype(np.int64),
+        num_rivals=rivals.astype(np.int64),
+        cheirality_fraction=front / np.maximum(voters, 1.0),
+        median_residual_px=residual_px,
+        parallax_deg=np.degrees(parallax_rad),
+        covariance=np.where(usable[:, None, None], covariance, np.nan),
+    )
+
+
+def _tangent_covariance(directions: FloatArray, moments: FloatArray) -> FloatArray:
+    """Return A^-1 B A^-1 in each direction's tangent basis, shape (k, 2, 2), from A and B (k, 2, 3, 3).
+
+    Where A has no information, and where the variance exceeds (1 rad)^2, it is that, which means: unknown.
+    """
+    is_estimated = np.linalg.norm(directions, axis=1, keepdims=True) > 0.0
+    bases = tangent_bases(np.where(is_estimated, directions, [1.0, 0.0, 0.0]))
+    curvature, slope_variance = np.einsum("kab,ksac,kcd->skbd", bases, moments, bases)
+    values, vectors = np.linalg.eigh(curvature)
+    inverse = (vectors / np.maximum(values, 1.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(inverse @ slope_variance @ inverse)
+    variances[values[:, 0] <= 1.0, 1] = 1.0
+    return np.asarray((axes * np.minimum(variances, 1.0)[:, None, :]) @ axes.transpose(0, 2, 1))

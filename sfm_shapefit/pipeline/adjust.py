@@ -1,0 +1,93 @@
+"""`bundle_adjust`: poses and points of a model adjusted by its own observations; for pipelines."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sfm_shapefit.adjustment import (
+    Adjusted,
+    AdjustmentOptions,
+    FrameCovariances,
+    RotationPrior,
+    adjust,
+    estimate_covariances,
+    isotropic_information,
+)
+from sfm_shapefit.adjustment.sources import read_bundle
+from sfm_shapefit.adjustment.views import read_frames, with_points, with_poses
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.settings import merge_options
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class AdjustedModel(Displayed):
+    """A model after bundle adjustment, and how it went."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    """A new one: ids, names and tracks are the input's, errors of points are updated."""
+    frame_ids: tuple[int, ...]
+    """Of the frames with a pose, in the order of the problem and of the covariances."""
+    adjusted: Adjusted
+    """The answer as arrays: costs, iterations, why it ended."""
+    covariances: FrameCovariances | None
+    """Of the frames' centers and rotations, if they were asked for."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return the main figures in plain values."""
+        return self.adjusted.summary()
+
+    def _headline(self) -> str:
+        return f"{len(self.frame_ids)} frames adjusted"
+
+
+def bundle_adjust(
+    reconstruction: "pycolmap.Reconstruction",
+    options: AdjustmentOptions | None = None,
+    *,
+    rotation_sigma_deg: float | None = None,
+    fixed_frames: Collection[int] = (),
+    covariances: bool = False,
+    **overrides: Any,
+) -> AdjustedModel:
+    """Adjust poses and points of a model, from where they are, by the points that its images observe.
+
+        adjusted = bundle_adjust(model)                                  # all free, Cauchy loss of 1 px
+        adjusted = bundle_adjust(model, hold_rotations=True)             # rotations that were measured
+        adjusted = bundle_adjust(model, rotation_sigma_deg=0.03)         # or pulled to, so far
+
+    Unlike `locate(..., bundle_adjust=True)`, nothing is triangulated or filtered here. Rigs hold their
+    sensors. Lenses that are no case of OPENCV, such as fisheyes, are undistorted and stay what they are.
+
+    Args:
+        reconstruction: the start; it is not changed.
+        options: settings, see `help(AdjustmentOptions)`; defaults if None.
+        rotation_sigma_deg: standard deviation, about each axis, of the rotations that the model has; they
+            pull by it. None: they do not.
+        fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        covariances: whether those of the frames are computed, too.
+        **overrides: single options by name.
+
+    Raises:
+        InputError: if no posed image observes a point, or a number is impossible.
+    """
+    options = merge_options(options, AdjustmentOptions, overrides)
+    frames = read_frames(reconstruction, fixed_frames)
+    point_ids, problem = read_bundle(reconstruction, frames)
+    if rotation_sigma_deg is not None:
+        sigmas = np.full(len(frames.frame_ids), np.radians(rotation_sigma_deg))
+        prior = RotationPrior(rotations=frames.rotations, information=isotropic_information(sigmas))
+        problem = replace(problem, rotation_prior=prior)
+    adjusted = adjust(problem, options)
+    found = adjusted.problem
+    moved = replace(frames, rotations=found.rotations, centers=found.centers, lenses=tuple(found.lenses))
+    return AdjustedModel(
+        reconstruction=with_points(with_poses(reconstruction, frames, moved), point_ids, found.points),
+        frame_ids=frames.frame_ids,
+        adjusted=adjusted,
+        covariances=estimate_covariances(found, options) if covariances else None,
+    )

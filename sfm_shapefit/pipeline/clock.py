@@ -1,0 +1,42 @@
+"""How long each stage takes, and how far it is."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.solver.options import IterationInfo
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of a stage, the work done so far and the work in all."""
+
+
+@dataclass(slots=True)
+class Clock:
+    """Measures stages and passes their progress on."""
+
+    progress: Progress = field(default=lambda _stage, _done, _total: None)
+    seconds: dict[str, float] = field(default_factory=dict)
+    stage: str = ""
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time a stage; one that comes again adds to its time, and so does one that fails."""
+        self.stage = stage
+        hand_back_memory()
+        self.progress(stage, 0, 1)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:  # a component that cannot be placed has taken its time, too
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+        self.progress(stage, 1, 1)
+
+    def advance(self, done: int, total: int) -> None:
+        """Report progress inside the current stage."""
+        self.progress(self.stage, done, total)
+
+    def iteration(self, info: IterationInfo) -> None:
+        """Report an iteration of the solver: of at most so many, for fewer may do."""
+        self.progress(self.stage, info.iteration, max(info.limit, info.iteration))

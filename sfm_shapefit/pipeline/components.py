@@ -1,0 +1,135 @@
+"""The components of the view graph, each with averaged rotations.
+
+Frames that the averaging of a component drops are grouped anew by the pairs among themselves.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.gravity import refine_with_gravity
+from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
+from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.gravity import Gravity
+from sfm_shapefit.rotations.trusted import average_consistently
+
+# Our own averaging leaves out what only unsound pairs tie to the rest, or pairs below `min_matches`;
+# pycolmap's what contradicts its answer, too.
+_UNTIED = (
+    "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
+    "contradict the rest"
+)
+
+
+class ComponentAveraging(NamedTuple):
+    """How the rotations of components are averaged."""
+
+    options: MapOptions
+    clock: Clock
+    gravity: Gravity | None
+    """Of the frames."""
+    shares: Mapping[tuple[int, int], float]
+    """The matched share of the overlap of pairs of frames, as far as it is known."""
+
+    def average(
+        self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
+    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
+        """Yield the frames of each component that got rotations, ascending, and those rotations.
+
+        Why a frame belongs to none is written to `reasons`.
+        """
+        waiting, least = _group_frames(num_frames, relative.pairs), self.options.min_model_size
+        while waiting:
+            members = waiting.pop(0)
+            if len(members) < least:
+                if len(members) > 1:
+                    few = (
+                        f"matched with {counted(len(members) - 1, 'other image')} only; a model needs {least}"
+                    )
+                    reasons |= dict.fromkeys(members.tolist(), few)
+                continue
+            inside, local = pairs_among(relative, members)
+            try:
+                with self.clock("rotation averaging"):
+                    answer = self._average_component(members, inside, local)
+            except UnsolvableError as error:
+                reasons |= dict.fromkeys(members.tolist(), str(error))
+                continue
+            kept, left = members[answer.registered], members[~answer.registered]
+            reasons |= dict.fromkeys(left.tolist(), _UNTIED)
+            if len(left) < len(members):
+                rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
+                waiting = [*waiting, *(group for group in _group_frames(num_frames, rest) if len(group) > 1)]
+            if len(kept) >= least:
+                yield kept, answer.subset(answer.registered)
+            else:
+                tied = f"tied to {counted(len(kept) - 1, 'other image')} only by pairs that can be believed"
+                reasons |= dict.fromkeys(kept.tolist(), f"{tied}; a model needs {least}")
+
+    def _average_component(
+        self, members: IntArray, inside: RelativeRotations, local: RelativeRotations
+    ) -> AveragedRotations:
+        """Average rotations, by the arrangement of the frames that the matches speak for, and by gravity.
+
+        Args:
+            members: the frames.
+            inside: the pairs among them.
+            local: the same by their place among these.
+        """
+        answer = self._arrange(len(members), local, self._evidence_of(inside))
+        if self.gravity is None:
+            return answer
+        return refine_with_gravity(answer, local, self.gravity.among(members))
+
+    def _arrange(
+        self, num_frames: int, relative: RelativeRotations, evidence: FloatArray
+    ) -> AveragedRotations:
+        """Average rotations, by the arrangement of the frames that the matches speak for."""
+
+        def average(some: RelativeRotations) -> AveragedRotations:
+            return average_consistently(
+                num_frames,
+                some,
+                self.options.min_matches,
+                averaging=self.options.averaging,
+                threads=self.options.num_threads(),
+            )
+
+        averaged = average(relative)
+        if not evidence.any():
+            return averaged
+        chosen = choose_arrangement(relative, evidence, averaged, average)
+        return replace(
+            chosen.averaged,
+            num_repeated=int(chosen.refused.sum()),
+            num_rivals=int(chosen.rival.sum()),
+        )
+
+    def _evidence_of(self, relative: RelativeRotations) -> FloatArray:
+        """Return how much speaks for each pair of frames."""
+        shares = [self.shares.get(pair, np.nan) for pair in map(tuple, relative.pairs.tolist())]
+        return evidence_of(relative, np.array(shares))
+
+
+def pairs_among(
+    relative: RelativeRotations, members: IntArray
+) -> tuple[RelativeRotations, RelativeRotations]:
+    """Return the pairs among some images or frames, ascending, and the same by their place among these."""
+    inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
+    return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
+
+
+def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
+    """Return the connected components, ascending, the largest first; single frames are components too."""
+    labels = connected_components(num_frames, pairs)
+    groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
+    return sorted(groups, key=lambda group: (-len(group), int(group[0])))

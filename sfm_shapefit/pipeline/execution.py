@@ -1,0 +1,189 @@
+"""Pairs measured by other processes or machines, through any `concurrent.futures` executor.
+
+What is measured of pairs, directions or relative rotations, is a function of a batch of their matches. The
+pairs of a database are cut into parts of some hundred thousand matches. A task names the database file and
+the function, and carries the cameras, without which matches are no rays: names, rotations, intrinsics. Its
+worker opens the file read-only for itself, reads its part, and sends back what it measured. Every pair is
+estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
+of one process, to the bit, whichever worker did what, and however often.
+
+A worker that dies is the executor's business: a pool of processes breaks, which is reported; dask gives the
+task to another one.
+"""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context, resource_tracker
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.executors import ExecutorKind, WorkerError, answers
+from sfm_shapefit.base.extras import MissingExtraError
+from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database_pairs import PairRows
+from sfm_shapefit.files.colmap.model import PosedModel, from_posed_cameras, posed_cameras
+from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.posed_model import PosedModelFile
+
+Measured = TypeVar("Measured")
+
+MATCHES_PER_TASK = 1_000_000
+"""About 1.5 seconds of work for directions, and 230 MB."""
+# Dask gives a task whose worker died to another so many times.
+_RETRIES = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairWork(Generic[Measured]):
+    """What to measure of the pairs of a database."""
+
+    estimate: Callable[[MatchBatch], Measured]
+    """A function of a module, or a `partial` of one, so that other processes find it."""
+    min_matches: int = 1
+    """Pairs with fewer are left out."""
+    matches_per_task: int = MATCHES_PER_TASK
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PairTask(Generic[Measured]):
+    """Some pairs of a database, and all that is needed to measure them elsewhere."""
+
+    database: Path
+    """Its absolute path, the same for all workers."""
+    rows: PairRows
+    """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
+    cameras: PosedModelFile
+    """Of the whole model: the indices of pairs refer to them."""
+    work: PairWork[Measured]
+
+
+def measure_with_workers(
+    database: MatchDatabase,
+    model: PosedModel,
+    work: PairWork[Measured],
+    executor: Executor,
+    advance: Callable[[int, int], None],
+) -> list[Measured]:
+    """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
+
+    The executor is not shut down; `advance` is told of the pairs that are done and of their number.
+
+    Raises:
+        WorkerError: if a worker died and the executor does not replace it.
+        InputError: as a worker found the database.
+    """
+    cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
+    parts = database.parts(work.matches_per_task)
+    tasks = (PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts)
+    found: list[Measured] = []
+    for (_, stop), (_, measured) in zip(parts, answers(executor, measure_task, tasks), strict=True):
+        found += measured
+        advance(stop, database.num_pairs)
+    return found
+
+
+def measure_task(task: PairTask[Measured]) -> list[Measured]:
+    """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
+    model = from_posed_cameras(task.cameras)
+    with open_database(task.database, model, rows=task.rows) as database:
+        everything = (0, database.num_pairs)  # whose rays are not kept: each batch is needed once
+        batches = database.iter_matches(task.work.min_matches, part=everything)
+        return [task.work.estimate(batch) for batch in batches]
+
+
+@contextmanager
+def open_executor(
+    kind: ExecutorKind, workers: int, scheduler: str | None = None
+) -> Iterator[Executor | None]:
+    """Open an executor by its name, and close it in the end.
+
+    Args:
+        kind: "serial" is none, "processes" a pool on this machine, "dask" a cluster.
+        workers: processes on this machine.
+        scheduler: address of a dask scheduler that runs already; a cluster of this machine if None. Whoever
+            can reach a scheduler can run code on its workers: keep it inside a trusted network.
+
+    Raises:
+        InputError: if dask is not installed, or a scheduler is named for another executor.
+        WorkerError: if the scheduler cannot be reached.
+    """
+    if scheduler is not None and kind != "dask":
+        raise InputError("a scheduler belongs to the executor dask; add --executor dask, or leave it out")
+    if kind == "serial":
+        yield None
+    elif kind == "processes":
+        # Processes are spawned, because forking clashes with threads.
+        with _Pool(workers, mp_context=get_context("spawn")) as pool:
+            yield pool
+    else:
+        with _dask_client(workers, scheduler) as client:
+            yield client.get_executor(retries=_RETRIES)
+
+
+class _Pool(ProcessPoolExecutor):
+    """A pool whose processes leave interrupts to this one."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Submit a task, for which a process may have to be started."""
+        with _children_are_not_interrupted():
+            return super().submit(fn, *args, **kwargs)
+
+
+@contextmanager
+def _children_are_not_interrupted() -> Iterator[None]:
+    """Start threads and processes in which SIGINT is blocked.
+
+    A terminal interrupts all processes of a command at once. The first one ends the others; what these had to
+    say of it would be tracebacks.
+    """
+    resource_tracker.ensure_running()  # whose start would end the blocking
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Let an interrupt come at the end of the block; a cluster that is half open cannot be closed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    """Connect to a scheduler, or start a cluster of worker processes here."""
+    try:
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError:
+        raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
+    if scheduler is None:
+        with ExitStack() as opened:
+            with _interrupts_wait(), _children_are_not_interrupted():
+                # The port of the dashboard is taken where another run has a cluster.
+                local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
+                client = opened.enter_context(Client(opened.enter_context(local)))
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"the dask scheduler {scheduler} cannot be reached; check its address") from error
+    with client:
+        yield client

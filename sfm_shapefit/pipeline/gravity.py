@@ -1,0 +1,79 @@
+"""Gravity in `map`: read first, a term of the averaging, and at the end what turns the model upright."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.facts.options import GRAVITY_OF_DATABASE, MapOptions
+from sfm_shapefit.files.colmap.database_images import rotations_of
+from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.seed import turn_model
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.seed import Seeded
+from sfm_shapefit.rotations.average import check_pairs
+from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.gravity import (
+    FEWEST_GRAVITIES,
+    Gravity,
+    down_of,
+    judge_gravity,
+    turn_upright,
+    with_gravity,
+)
+
+_NAMED = 3
+
+
+def read_gravity(database: Path, model: PosedModel, options: MapOptions) -> Gravity | None:
+    """Return the gravities of a model's images, if they are wanted.
+
+    Raises:
+        InputError: as the readers.
+    """
+    if not options.gravity:
+        return None
+    if options.gravity == GRAVITY_OF_DATABASE:
+        return database_gravity(database, model)
+    return table_gravity(Path(options.gravity), model)
+
+
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
+    """Return averaged rotations of frames refined on their pairs and gravities together."""
+    supports = relative.weight_shares * relative.num_matches
+    given, _ = check_pairs(
+        relative.pairs, relative.rotations, relative.information, supports, len(averaged.registered)
+    )
+    return with_gravity(averaged, given, gravity)
+
+
+def turn_model_upright(
+    seeded: Seeded, model: PosedModel, gravity: Gravity | None
+) -> tuple[Seeded, tuple[str, ...]]:
+    """Return a model turned so that z points up, unless something else set its axes, and what to warn of."""
+    if gravity is None:
+        return seeded, ()
+    rotations, placed = rotations_of(seeded.reconstruction, model.image_ids.tolist())
+    members = np.flatnonzero(placed)
+    own = gravity.among(members)
+    if len(own.indices) < FEWEST_GRAVITIES:
+        few = f"{len(own.indices)} of the placed images have a gravity, and two are needed"
+        return seeded, (f"{few} to turn the model upright",)
+    turn = turn_upright(down_of(rotations[members], own))
+    off, wrong = judge_gravity(rotations[members] @ turn.T, own)
+    warnings = []
+    if wrong.any():
+        worst = np.flatnonzero(wrong)[np.argsort(-off[wrong], kind="stable")]
+        names = [model.names[members[own.indices[k]]] for k in worst[:_NAMED].tolist()]
+        warnings.append(
+            f"the gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no "
+            f"part: above all those of {', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"
+        )
+    if seeded.gauge.axes is not None:
+        return seeded, tuple(warnings)
+    statement = f"{seeded.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
+    gauge = replace(seeded.gauge, axes=turn, statement=statement)
+    return seeded.moved(turn_model(seeded.reconstruction, turn), gauge), tuple(warnings)

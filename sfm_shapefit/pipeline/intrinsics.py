@@ -1,0 +1,57 @@
+"""Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
+
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
+from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.files.colmap.intrinsics import (
+    Origin,
+    calibrate_view_graph,
+    doubt_lenses,
+    find_uncalibrated,
+    with_focal_lengths,
+)
+from sfm_shapefit.files.colmap.model import PosedModel
+
+# A view graph that wants a focal length further off says more about the graph than about the lens.
+_MOST_OFF = 4.0
+
+
+def settle_intrinsics(
+    model: PosedModel, inputs: Inputs, options: LocateOptions
+) -> tuple[PosedModel, Intrinsics]:
+    """Return the model to start from, and which intrinsics the adjustments may change.
+
+    Args:
+        model: as given, of which nothing changes.
+        inputs: whose database, if there is one, says which intrinsics are guesses; pairs that are left out
+            say nothing of focal lengths.
+        options: `refine_intrinsics`.
+
+    Raises:
+        InputError: if the database cannot be read.
+    """
+    wanted, database = options.refine_intrinsics, inputs.database
+    guessed = {} if database is None else find_uncalibrated(database, model)
+    cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
+    origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
+    origins |= {i: found.origin for i, found in guessed.items()}
+    doubts = {} if wanted == "none" else doubt_lenses(cameras, origins)
+    factors = {}
+    if database is not None and guessed and wanted != "none":
+        asked = [found.database_id for found in guessed.values()]
+        by_database = calibrate_view_graph(database, asked, inputs.left_out)
+        factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}
+        factors = {i: factor for i, factor in factors.items() if 1.0 / _MOST_OFF <= factor <= _MOST_OFF}
+    intrinsics = Intrinsics(
+        given={i: cameras[i] for i in origins},
+        origins=origins,
+        free=FreeLenses(doubts, distortion=wanted != "focal"),
+        view_graph=factors,
+    )
+    return with_focal_lengths(model, factors), intrinsics
+
+
+def _cameras_in_use(model: PosedModel) -> list[int]:
+    """Return the ids of the cameras that took the posed images, ascending."""
+    return sorted({model.camera(k).camera_id for k in range(model.num_images)})

@@ -1,0 +1,213 @@
+"""What is said of models that were joined: scale, verdict, and rows for cameras and pairs, as of one model.
+
+Nothing is placed anew. The joined model is looked at as `report MODEL` looks at any, pairs between the models
+too, and what its models know of their own cameras is kept: who is not trusted, and why, and how well a center
+is known. Errors of a join come on top, as if they moved each camera of the model that was joined alike:
+
+    C' = s^2 R C R^T + sigma^2 / 3 I        sigma, the standard deviation of where its cameras come to lie
+
+The verdict is no better than that of any of the models.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import numpy as np
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import Similarity, compose
+from sfm_shapefit.facts.grade import Grade, ModelVerdict
+from sfm_shapefit.facts.joins import Joined, JoinedModel
+from sfm_shapefit.facts.json_types import EarthDatum, JoinedSummary, JudgedModel
+from sfm_shapefit.facts.key_figures import UNITS, key_figures
+from sfm_shapefit.facts.map_result import MappedModel
+from sfm_shapefit.facts.options import KnownDistance
+from sfm_shapefit.facts.rows import correlations_of, covariance_of
+from sfm_shapefit.facts.summary import told_distances, told_verdict
+from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION, CameraRow
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
+from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.placement.gauge import Gauge
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_SIGMA_OF = (
+    "joined: what the models know of their cameras, and how well the joins are known; relative to the mean "
+    "position and scale of the first"
+)
+# What says how large a model is; another scale has no meaning beside that of a known distance.
+_ARBITRARY = ("unit", "input")
+
+
+class Group(NamedTuple):
+    """Models in the world of the first of them."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    world_from: Mapping[int, Similarity]
+    """By the number of each model, the first one's first."""
+    joins: Sequence[Joined]
+
+
+def tell_group(
+    group: Group,
+    models: Sequence[MappedModel],
+    known: Sequence[KnownDistance],
+    left_out: PairNames,
+    clock: Clock,
+) -> JoinedModel:
+    """Return joined models with what can be said of them.
+
+    Args:
+        group: the models.
+        models: all models of the run, by number.
+        known: distances that were told, between images of any models.
+        left_out: pairs of images whose matches say nothing.
+        clock: what it takes is added to its seconds.
+    """
+    # Here, since it draws on the report, which the other commands do without.
+    from sfm_shapefit.pipeline.examine import examine_source
+
+    located = models[next(iter(group.world_from))].located
+    gauge, rescale = _choose_scale(group, located.gauge, known)
+    group = _rescaled(group, rescale)
+    model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
+    inputs = choose_inputs(group.reconstruction, database, located.options.directions)
+    inputs = replace(inputs, left_out=left_out)
+    own = Clock(clock.progress)
+    with open_source(model, inputs) as matches:
+        found = examine_source(matches, inputs, located.options, own)
+    weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
+    cameras = list(_camera_rows(found.cameras, group, models))
+    verdict = _judge(weak, tuple(found.facts["verdict"]["reasons"]), group, models)
+    focal_length_px, unit = float(np.median(model.focal_lengths_px)), UNITS[gauge.scale]
+    error_deg = found.facts["figures"]["pair_error_deg"]
+    facts: JoinedSummary = {
+        "schema_version": SCHEMA_VERSION,
+        "examined": True,
+        "inputs": {"model": IN_MEMORY, "database": str(database), "directions": inputs.statement},
+        "options": asdict(located.options) | {"known_distance": tuple(known)},
+        "verdict": verdict,
+        "models": [str(number) for number in group.world_from],
+        "joins": [join.summary(f"joined_{next(iter(group.world_from))}") for join in group.joins],
+        "num_images": len(cameras),
+        "num_placed": group.reconstruction.num_reg_images(),
+        "num_pairs": len(found.pairs),
+        "num_points": group.reconstruction.num_points3D(),
+        "figures": key_figures(cameras, np.nan if error_deg is None else error_deg, focal_length_px, unit),
+        "sigma_of": _SIGMA_OF,
+        "residual_level_deg": found.facts["residual_level_deg"],
+        "mean_reprojection_error_px": found.facts["mean_reprojection_error_px"],
+        "median_track_length": found.facts["median_track_length"],
+        "scale": gauge.statement,
+        "scale_sigma": gauge.scale_sigma,
+        "known_distances": told_distances(known, group.reconstruction),
+        "datum": None if gauge.datum is None else cast("EarthDatum", gauge.datum._asdict()),
+        "pieces": [],
+        "loose_groups": [],
+        "timings_s": own.seconds,
+        "warnings": [gauge.warning] if gauge.warning else [],
+        "versions": found.facts["versions"],
+    }
+    return JoinedModel(
+        reconstruction=group.reconstruction,
+        models=tuple(group.world_from),
+        cameras=cameras,
+        pairs=found.pairs,
+        facts=facts,
+    )
+
+
+def _choose_scale(
+    group: Group, first: Gauge, known: Sequence[KnownDistance]
+) -> tuple[Gauge, Similarity | None]:
+    """Return the gauge of joined models, and the similarity that leads to it, if it is not the first one's.
+
+    A scale that the first model knows stays. An arbitrary one gives way to known distances, be they within
+    one of the models or between two.
+    """
+    number = next(iter(group.world_from))
+    placed = {image.name: image for image in group.reconstruction.images.values() if image.has_pose}
+    there = [one for one in known if {*one[:2]} <= placed.keys()]
+    warning = ""
+    if first.scale in _ARBITRARY and there:
+        centers = np.array([image.projection_center() for image in placed.values()])
+        try:
+            gauge = gauge_of_distances(list(placed), centers, there)
+        except InputError as error:  # two cameras stand in one place
+            warning = str(error)
+        else:
+            return gauge, gauge.similarity
+    return replace(first, statement=f"that of model {number}: {first.statement}", warning=warning), None
+
+
+def _rescaled(group: Group, similarity: Similarity | None) -> Group:
+    """Return the models under a similarity of their world."""
+    if similarity is None:
+        return group
+    return group._replace(
+        reconstruction=transform_model(group.reconstruction, similarity),
+        world_from={number: compose(similarity, one) for number, one in group.world_from.items()},
+    )
+
+
+def _camera_rows(
+    examined: Sequence[CameraRow], group: Group, models: Sequence[MappedModel]
+) -> Iterator[CameraRow]:
+    """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
+    own = {row.name: (row, number) for number in group.world_from for row in models[number].located.cameras}
+    variances = _variances_of_joins(group)
+    for seen in examined:
+        if not seen.placed:
+            continue
+        row, number = own[seen.name]
+        sigma, correlation = _errors(row, group.world_from[number], variances[number])
+        reasons = [reason for reason in (row.reason, seen.reason) if reason]
+        yield replace(seen, reason="; ".join(reasons), trust=row.trust, sigma=sigma, correlation=correlation)
+    placed = {row.name for row in examined if row.placed}
+    for name, (row, _) in own.items():
+        if name not in placed:
+            yield CameraRow(name=name, reason=row.reason, trust=row.trust)
+
+
+def _variances_of_joins(group: Group) -> dict[int, float]:
+    """Return what the joins add to the variance of a center along an axis, by the number of its model."""
+    found = dict.fromkeys(group.world_from, 0.0)
+    for done in group.joins:  # ascending, so that the larger model is there
+        assert done.join is not None
+        sigma = group.world_from[done.to].scale * done.join.center_sigma
+        found[done.model] = found[done.to] + sigma**2 / 3.0
+    return found
+
+
+def _errors(
+    row: CameraRow, world_from: Similarity, variance: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return standard deviations and correlations of a center in the joined model; nothing if not known."""
+    own = covariance_of(row) if row.sigma else np.full((3, 3), np.nan)
+    if not np.isfinite(own).all():
+        return row.sigma, row.correlation
+    turned = world_from.scale**2 * world_from.rotation @ own @ world_from.rotation.T
+    covariance = (turned + variance * np.eye(3))[None]
+    sigmas = np.sqrt(np.diagonal(covariance[0]))
+    return tuple(sigmas.tolist()), tuple(correlations_of(covariance)[0].tolist())
+
+
+def _judge(
+    weak: Sequence[str], reasons: tuple[str, ...], group: Group, models: Sequence[MappedModel]
+) -> JudgedModel:
+    """Return the verdict: what was seen of the joined model, and those of its models."""
+    verdicts = {number: models[number].located.verdict for number in group.world_from}
+    grades = [verdict.grade for verdict in verdicts.values()]
+    grades += [Grade.DO_NOT_USE] if reasons else [Grade.LOOK] if weak else []
+    worst = max(grades, key=list(Grade).index)
+    cameras = dict.fromkeys([*(name for verdict in verdicts.values() for name in verdict.cameras), *weak])
+    said = tuple(f"model {k}: {reason}" for k, verdict in verdicts.items() for reason in verdict.reasons)
+    verdict = ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*reasons, *said))
+    return told_verdict(verdict)

@@ -1,0 +1,270 @@
+"""How much memory `locate` will take, told beforehand, and what is given up to stay below a limit.
+
+The peak is that of the worst stage, for memory is handed back between stages. Every stage is linear in what
+it works on: keypoints, matches, pairs, edges of the graph, and entries of the factor, which the symbolic
+analysis knows beforehand. The bytes per item below were fitted to runs on seven sets of 25 to 10,000 images:
+on them and four others, forecasts are 1.01 to 1.4 times the peaks.
+
+The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
+known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.colmap.database import BATCH, KEPT_MATCHES
+from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_BESIDE_TRACKS, MOST_MATCHES
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.laplacian.cholesky import analyze
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
+from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.solver.solve import choose_method
+from sfm_shapefit.solver.splitting.linear import predict_factor
+
+_MB = 1e6
+# The interpreter with all that `locate` imports.
+_STARTED_BYTES = 195e6
+# Compiled code, thread pools, pages of the database.
+_KERNELS_BYTES = 50e6
+# Of a keypoint of the input: while it is read, afterwards, and once only the colors of its points are left.
+_READ_BYTES, _MODEL_BYTES, _COLOR_BYTES = 95.0, 55.0, 8.0
+# Samples of each direction error, two numbers each.
+_SAMPLES = 96
+# Entries of a block of the factor.
+_BLOCK = 9
+# Observations of points that are adjusted, for each match, where keypoints are more: .45 to .66 on real sets.
+_OBSERVATIONS_OF_A_MATCH = 0.7
+# Of an observation: its track, and its part of the normal equations.
+_OBSERVATION_BYTES = 620.0
+# Unknowns of an adjusted camera, and up to how many of them their system is dense.
+_UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
+
+RAYS_BYTES = 1_000_000_000
+"""Of the rays of keypoints that are kept for the next pair, where memory is no concern."""
+_SMALL_BATCH, _FEW_RAYS_BYTES = 50_000, 50_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workload:
+    """What `locate` has to work on."""
+
+    num_images: int
+    num_keypoints: int
+    """Of all images."""
+    num_pairs: int
+    num_matches: int
+    num_edges: int
+    """Directions that are solved, those from cameras to points included."""
+    num_nodes: int
+    """Cameras and points that are solved."""
+    num_sampled: int = 0
+    """Directions whose errors are sampled; 0 where they count as independent."""
+    has_points: bool = False
+    """Whether 3D points join the graph."""
+    factor_entries: int = 0
+    """Blocks of the factor, its stack included; 0 where there is none."""
+    adjusts: bool = False
+    """Whether placed cameras are adjusted by their matches."""
+    adjusts_bundle: bool = False
+    """Whether the seed goes through bundle adjustment, which cannot be given up."""
+    needs_factor: bool = False
+    """Whether the factor cannot be given up, since the solve itself, or priors that pull, work with it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Economy:
+    """What is given up for memory."""
+
+    statement: str = ""
+    """What that is, for the user; empty for nothing."""
+    batch: int = BATCH
+    """Matches that are read at a time."""
+    rays_bytes: int = RAYS_BYTES
+    """Of the rays of keypoints that are kept for the next pair."""
+    samples: bool = True
+    """Whether the errors of directions are sampled together where keypoints are shared."""
+    points: bool = True
+    """Whether 3D points may join the graph."""
+    adjustment: bool = True
+    """Whether placed cameras may be adjusted by their matches."""
+    factor: bool = True
+    """Whether there is a factor for the refinement and the standard deviations."""
+
+
+def _list_economies() -> Iterator[Economy]:
+    """Yield what can be given up, the cheapest first, each with all that comes before it."""
+    economy = Economy()
+    yield economy
+    given_up: list[str] = []
+    for what, changes in (
+        ("matches are read in small batches", {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
+        ("directions count as independent in standard deviations", {"samples": False}),
+        ("no 3D points join the view graph", {"points": False}),
+        ("cameras are not adjusted by their matches", {"adjustment": False}),
+        ("locations are neither refined nor have they standard deviations", {"factor": False}),
+    ):
+        given_up.append(what)
+        economy = replace(economy, statement=", ".join(given_up), **changes)
+        yield economy
+
+
+ECONOMIES = tuple(_list_economies())
+"""The cheapest first."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forecast:
+    """Peak memory of `locate`, by stage."""
+
+    memory_mb: dict[str, float]
+    """Peak of each stage in millions of bytes."""
+
+    @property
+    def peak_mb(self) -> float:
+        """The largest of all stages."""
+        return max(self.memory_mb.values())
+
+    @property
+    def statement(self) -> str:
+        """What to expect, a sentence for the user."""
+        worst = max(self.memory_mb, key=self.memory_mb.__getitem__)
+        return f"about {self.peak_mb:.0f} MB at most (while {worst})"
+
+
+def forecast(work: Workload, economy: Economy = ECONOMIES[0]) -> Forecast:
+    """Return what a run will take, if so much is given up for memory."""
+    return Forecast(memory_mb={stage: size / _MB for stage, size in _peaks(work, economy).items()})
+
+
+def choose_economy(
+    work: Workload, without_points: Workload, limit_mb: float, least: Economy = ECONOMIES[0]
+) -> Economy:
+    """Return the cheapest economy, from `least` on, whose forecast stays below a limit.
+
+    Raises:
+        InputError: if none does; the message has the number needed.
+    """
+    needed = np.inf
+    for economy in ECONOMIES[ECONOMIES.index(least) :]:
+        needed = forecast(work if economy.points else without_points, economy).peak_mb
+        if needed <= limit_mb:
+            return economy
+    raise InputError(
+        f"this takes about {needed:.0f} MB even with every economy, and max_memory_mb allows {limit_mb:.0f}; "
+        f"raise it to {np.ceil(needed / 10.0) * 10.0:.0f} or more, or split the model"
+    )
+
+
+def keep_within_memory(
+    work: Workload, measured: MeasuredGraph, options: LocateOptions, least: Economy
+) -> tuple[Economy, MeasuredGraph, LocateOptions]:
+    """Return what is given up, `least` or more, to stay below `options.max_memory_mb`, if that is not 0.
+
+    The graph and the options come back as they are then; the work is what there is to do but for the graph.
+
+    Raises:
+        InputError: with the number needed, if there is no way.
+    """
+    if not options.max_memory_mb:
+        return least, measured, options
+    bare = measured.without_points()
+    economy = choose_economy(
+        describe_work(work, measured, options),
+        describe_work(work, bare, options),
+        options.max_memory_mb,
+        least,
+    )
+    if not economy.factor:
+        options = replace(options, factor_memory_mb=NO_FACTOR, refine=False)
+    if not economy.adjustment:
+        options = replace(options, adjust=False)
+    return economy, measured if economy.points else bare, options
+
+
+def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOptions) -> Workload:
+    """Return what there is to do once the graph is known: its factor is planned, nothing is solved."""
+    graph, entries = measured.graph, 0
+    needs_factor = measured.groups is not None or options.refine_with_priors
+    if graph.num_edges:
+        plan = _plan_factor(measured)
+        needs_factor = needs_factor or choose_method(graph, options).method == "newton"
+        max_bytes = np.inf if needs_factor else options.factor_memory_mb * 1_000_000
+        if plan is not None and plan.num_bytes(graph.dimension, np.float64) <= max_bytes:
+            entries = plan.num_bytes(1, np.uint8)
+    return replace(
+        work,
+        num_edges=graph.num_edges,
+        num_nodes=graph.num_nodes,
+        num_sampled=graph.num_edges if work.num_sampled else 0,
+        has_points=measured.num_points > 0,
+        adjusts=options.adjusts_cameras(work.num_images),
+        adjusts_bundle=options.bundle_adjust,
+        factor_entries=entries,
+        needs_factor=needs_factor,
+    )
+
+
+def _plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
+    """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
+    edges = np.ascontiguousarray(measured.graph.edges)
+    if measured.groups is not None:
+        ends = measured.groups.group_of[edges[measured.groups.joins(edges)]]
+        return analyze(measured.groups.num_groups, np.ascontiguousarray(ends))
+    if predict_factor(measured.graph).tree is None:
+        return None
+    neighbors = adjacency(measured.graph.num_nodes, edges)
+    return plan_factorization(neighbors, edges, best_order(neighbors))
+
+
+def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
+    """Return the bytes that are held at the peak of each stage."""
+    batch = 225.0 * min(economy.batch, work.num_matches)
+    model = 30e6 + (_COLOR_BYTES if work.num_matches else _MODEL_BYTES) * work.num_keypoints
+    rays = min(24.0 * work.num_keypoints, economy.rays_bytes)
+    results = 350.0 * work.num_pairs + 3000.0 * work.num_images
+    is_sorted = not economy.statement and work.num_matches <= MOST_MATCHES
+    in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
+    throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
+    peaks = {
+        "reading": _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints,
+        "measuring directions": throughout + batch,
+    }
+    if work.has_points and economy.points:
+        peaks["building tracks"] = throughout + batch + 125.0 * work.num_keypoints
+    samples = 16.0 * _SAMPLES * (work.num_sampled if economy.samples else 0)
+    solving = 900.0 * work.num_edges + 3000.0 * work.num_nodes
+    has_factor = economy.factor or work.needs_factor
+    copies = 2.2 if work.needs_factor else 1.2
+    factor = copies * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
+    moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
+    is_kept = work.num_matches <= KEPT_MATCHES and economy.batch >= min(BATCH, work.num_matches)
+    kept = 80.0 * work.num_matches if is_kept else 0.0
+    peaks["placing"] = throughout + kept + solving + samples + moved + factor + 0.5 * batch
+    tracks = 80.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
+    if work.num_matches > MOST_BESIDE_TRACKS:
+        tracks -= in_memory
+    seeded = throughout + kept + 300.0 * work.num_edges + tracks
+    if work.adjusts_bundle or (work.adjusts and economy.adjustment):
+        observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
+        adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
+        peaks["adjusting"] = seeded + adjusting
+    peaks["triangulating"] = seeded - rays
+    return peaks
+
+
+def _adjusted_cameras_bytes(work: Workload) -> float:
+    """Return the bytes of the system of the cameras in an adjustment: blocks of pairs, and a factor.
+
+    Beyond the size that is dense, its graph is about that of the pairs, and its factor that of the placement
+    with blocks of another size.
+    """
+    unknowns = _UNKNOWNS * work.num_images
+    blocks = 3.0 * 8.0 * _UNKNOWNS**2 * (work.num_pairs + work.num_images)
+    entries = unknowns**2 if unknowns <= _DENSE_UNKNOWNS else 1.2 * _UNKNOWNS**2 * work.factor_entries
+    return blocks + 8.0 * entries

@@ -1,0 +1,126 @@
+"""`place GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.result import GraphResult
+from sfm_shapefit.files.colmap.other_programs import relative_poses_of
+from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
+from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
+from sfm_shapefit.files.graph_text import read_graph
+from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.placement.place import place, place_further
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.rotations.rotation_averaging import average_rotations
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MAX_ROTATION_ERROR_DEG = 10.0
+
+
+def place_graph_file(
+    path: "Path | str | pycolmap.PoseGraph",
+    options: PlacementOptions | None = None,
+    *,
+    rotations: Path | str | None = None,
+    max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
+    reverse: bool = False,
+    progress: Progress | None = None,
+    **overrides: Any,
+) -> GraphResult:
+    """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
+
+    Args:
+        path: a text file, see `formats.read_graph`; or relative poses: a 1DSfM folder or EGs.txt, see
+            `formats.read_onedsfm`, GLOMAP's text, see `formats.read_relative_poses`, the edges of a g2o file,
+            see `formats.read_g2o`, or a pose graph.
+        options: settings; defaults if None.
+        rotations: of the cameras of relative poses: 1DSfM's rots.txt, see `formats.read_rotations`, or the
+            vertices of a g2o file; averaged by pycolmap if None.
+        max_rotation_error_deg: relative poses whose rotation contradicts those of the cameras by more are
+            left out, as `locate` leaves them out.
+        reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
+        progress: called as stages advance.
+        **overrides: single options by name.
+
+    Raises:
+        InputError: if a file is malformed; the message names the line.
+        UnsolvableError: if the directions determine nothing.
+    """
+    options = merge_options(options, PlacementOptions, overrides)
+    clock = Clock(progress) if progress else Clock()
+    cam_from_world, statement = None, "directions as given"
+    with clock("read"):
+        geometries = _relative_poses(path)
+    if geometries is not None:
+        if reverse:
+            raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
+        with clock("rotations"):
+            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg)
+    else:
+        assert isinstance(path, Path | str)
+        if rotations is not None:
+            raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
+        with clock("read"):
+            graph = read_graph(path)
+        if reverse:
+            graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
+    with clock("solve"):
+        placement = place(graph, options, on_iteration=clock.iteration)
+    with clock("further pieces"):
+        further = tuple(place_further(placement, options))
+    return GraphResult(
+        path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
+        statement=statement,
+        options=options,
+        placement=placement,
+        further=further,
+        timings_s=clock.seconds,
+        geometries=geometries,
+        rotations=cam_from_world,
+    )
+
+
+def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeometries | None:
+    """Return the relative poses of a source; None if it is a bare graph of directions."""
+    if not isinstance(source, Path | str):
+        return relative_poses_of(source)
+    if is_onedsfm(source):
+        return read_onedsfm(source)
+    if is_g2o(source):
+        return read_g2o(source)
+    return read_relative_poses(source) if is_relative_poses(source) else None
+
+
+def _orient(
+    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float
+) -> tuple[ViewGraph, FloatArray, str]:
+    """Return the directions of the pairs that agree with the rotations, of a file or averaged, and these."""
+    if path is not None:
+        read = read_g2o_rotations if is_g2o(path) else read_rotations
+        (rotations, known), origin = read(path, geometries.names), f"of {path}"
+    else:
+        total = len(geometries.names)
+        rotations, known = average_rotations(total, geometries.pairs, geometries.rotations)
+        origin = "averaged by pycolmap"
+    agreeing = np.flatnonzero(geometries.mismatch_deg(rotations) <= max_rotation_error_deg)
+    total, kept = len(geometries.pairs), len(agreeing)
+    if kept == 0:
+        raise InputError(
+            f"none of the {total} relative rotations agrees with those of the cameras; "
+            "check that they belong together"
+        )
+    statement = (
+        f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
+        f"contradict them by more than {max_rotation_error_deg:g} deg and are left out"
+    )
+    return geometries.subset(agreeing.tolist()).view_graph(rotations, known), rotations, statement

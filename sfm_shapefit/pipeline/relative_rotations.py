@@ -1,0 +1,136 @@
+"""`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from sfm_shapefit.facts.options import LEAST_MATCHES, MapOptions, Relative
+from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.pairs.essential import (
+    concatenate,
+    estimate_relative_rotations,
+    stored_relative_rotations,
+)
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+
+# About a second of work, be they many pairs of few matches or few of many.
+_MATCHES_PER_TASK = 100_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DatabaseRotations(RelativeRotations):
+    """Relative rotations, and the images that they are of."""
+
+    names: tuple[str, ...]
+    """(n,) all images of the database, by name in ascending order; `pairs` are positions in this list."""
+
+
+class Sharing(NamedTuple):
+    """Among whom work is shared out, and who hears of it."""
+
+    threads: int = 1
+    executor: Executor | None = None
+    """Its workers do the work instead of threads."""
+    advance: Callable[[int, int], None] = lambda _done, _total: None
+    """Called with the pairs that are done and their number."""
+
+
+def relative_rotations(
+    database: Path | str,
+    *,
+    min_matches: int = LEAST_MATCHES,
+    source: Relative = "matches",
+    threads: int = 0,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> DatabaseRotations:
+    """Return the relative rotation of every pair of a database's images that has one, ascending by pair.
+
+    The answer is the same, to the bit, for any number of threads and any executor.
+
+    Args:
+        database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
+        min_matches: pairs with fewer inlier matches are left out; at least 1.
+        source: "matches": estimated from the inlier matches; "stored": as the database stores them, see
+            `stored_relative_rotations`.
+        threads: among which the pairs are shared out; 0 for one per core.
+        executor: of `concurrent.futures`; its workers estimate instead, and open the database themselves. It
+            is not shut down.
+        progress: called with "relative rotations", the pairs that are done and their number.
+
+    Returns:
+        k pairs with rotation, information, number of matches, weight share, and the names of the images.
+        `found.are_sound()` says which pairs to believe.
+
+    Raises:
+        ValueError: if an option has no such value.
+        InputError: if the database cannot be used; the message says what to do.
+        WorkerError: if a worker died and the executor does not replace it.
+    """
+    options = MapOptions(relative_rotations=source, threads=threads)
+    if min_matches < 1:
+        raise ValueError(f"min_matches must be at least 1, got {min_matches}")
+    path, clock = Path(database), Clock(progress) if progress else Clock()
+    with clock("relative rotations"):
+        model = read_model(read_images(path).reconstruction)
+        sharing = Sharing(options.num_threads(), executor, clock.advance)
+        with open_database(path, model) as matches:
+            found = measure_rotations(matches, model, min_matches, source, sharing)
+    columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
+    return DatabaseRotations(**columns, names=model.names)
+
+
+def measure_rotations(
+    database: MatchDatabase,
+    model: PosedModel,
+    min_matches: int = LEAST_MATCHES,
+    source: Relative = "matches",
+    sharing: Sharing | None = None,
+) -> RelativeRotations:
+    """Return the relative rotations of a database; pairs are indices into the model's images.
+
+    Args:
+        database: open, of the model.
+        model: all its images, with the identity as their rotation (see `database_images`).
+        min_matches: pairs with fewer inlier matches are left out.
+        source: estimated from the matches, or as stored.
+        sharing: one thread if None.
+
+    Raises:
+        InputError: if the database cannot be read, or a row of it is damaged.
+        WorkerError: if a worker died and the executor does not replace it.
+    """
+    sharing = sharing or Sharing()
+    if source == "stored":
+        return stored_relative_rotations(database, model, min_matches)
+    if sharing.executor is None:
+        parts = _estimate_here(database, min_matches, sharing)
+    else:
+        work = PairWork(
+            estimate=partial(estimate_relative_rotations, num_pairs=database.num_pairs),
+            min_matches=min_matches,
+            matches_per_task=_MATCHES_PER_TASK,
+        )
+        parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
+    return concatenate(parts)
+
+
+def _estimate_here(database: MatchDatabase, min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
+    """Return the relative rotations of each batch."""
+    parts, before, total = [], 0, database.num_pairs
+    for batch in database.iter_matches(min_matches):
+
+        def advance(done: int, before: int = before) -> None:
+            sharing.advance(before + done, total)
+
+        parts.append(estimate_relative_rotations(batch, sharing.threads, advance, num_pairs=total))
+        before += len(batch.pairs)
+    sharing.advance(total, total)
+    return parts

@@ -1,0 +1,162 @@
+"""Rigs and fixed cameras in `locate`: which images form rigid groups, and how these are placed.
+
+The frames of a model with rigs are groups with metric offsets. Cameras that are fixed stand where the input
+has them: two or more are one group, whose offsets are their centers; of a single one only the origin can be
+taken.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.facts.options import FIX_SOLVED, LocateOptions
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.lines import text_of
+from sfm_shapefit.graph.groups import RigidGroups, separate
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
+from sfm_shapefit.solver.rigs.tied import largest_tied
+
+# Extent of the fixed centers, of their distance from the origin, that counts as none.
+_COINCIDENT = 1e-9
+
+
+class Rigid(NamedTuple):
+    """What of a model is rigid."""
+
+    fixed: BoolArray
+    """(n,) images that stay exactly where the input has them."""
+    groups: RigidGroups | None
+    """The images in groups; None where each moves by itself."""
+    fixed_group: int | None
+    """The group of the fixed images."""
+
+    def apply(self, measured: MeasuredGraph) -> MeasuredGraph:
+        """Return a measured graph of the images with these groups; each of its points is one more."""
+        if self.groups is None:
+            return measured
+        groups = self.groups.with_separate(measured.num_points)
+        return replace(measured, groups=groups, fixed_group=self.fixed_group)
+
+
+def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
+    """Return what moves together and what not at all; priors, if there are any, set scale and axes.
+
+    Raises:
+        InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
+            asked for than rigs or fixed images have.
+    """
+    fixed = _read_fixed_images(model, options.fix)
+    count = int(np.sum(fixed))
+    if options.scale == "rig" and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
+    if options.refine_rigs and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to refine; leave out refine_rigs")
+    if count and has_priors:
+        raise InputError(
+            "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"
+        )
+    if not model.has_rigs and count < 2:
+        return Rigid(fixed, None, None)
+    if (
+        options.scale not in ("auto", "input", "rig")
+        or options.known_distance
+        or has_priors
+        or options.control_points
+    ):
+        source = "rigs" if model.has_rigs else "fixed cameras"
+        raise InputError(
+            f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
+            "points"
+        )
+    refuse_options_of_groups(options)
+    groups = model.groups if model.has_rigs else separate(model.num_images, 3)
+    if count == 0:
+        return Rigid(fixed, groups, None)
+    centers = model.centers[fixed]
+    extent = float(np.ptp(centers, axis=0).max())
+    if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not model.has_rigs:
+        raise InputError(
+            f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
+        )
+    return Rigid(fixed, groups.with_fixed(fixed, model.centers), 0)
+
+
+def group_frames(model: PosedModel, measured: MeasuredGraph) -> MeasuredGraph:
+    """Return the measured graph of a model's images with the frames of its rigs, if it has any."""
+    groups = model.groups if model.has_rigs else None
+    return Rigid(np.zeros(model.num_images, dtype=np.bool_), groups, None).apply(measured)
+
+
+def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
+    """Say how many frames a model has, and how many of them the pairs tie to one another."""
+    groups, edges = measured.groups, measured.graph.edges
+    if groups is None:
+        return "none: every image is a frame of its own"
+    frames = f"{model.groups.num_groups} frames of {model.num_images} images"
+    if not is_scaled(groups, edges):
+        return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
+    sizes = measured.cameras_per_group
+    tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
+    return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
+
+
+def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock) -> Placement:
+    """Place the measured graph; with rigid groups, 3D points take part only where they are needed.
+
+    Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
+    take part with groups only if they are wanted always, or if cameras hang loose without them.
+    """
+    hand_back_memory()  # of what the graph was made of
+    if measured.groups is None or not measured.num_points or options.points == "always":
+        return place(measured, options, on_iteration=clock.iteration)
+    try:
+        first = place(measured.without_points(), options, on_iteration=clock.iteration)
+    except UnsolvableError:
+        return place(measured, options, on_iteration=clock.iteration)
+    if not first.assessment.loose_groups:
+        return first
+    try:
+        second = place(measured, options, on_iteration=clock.iteration)
+    except UnsolvableError:
+        return first
+    return second if _count_held(second) > _count_held(first) else first
+
+
+def _count_held(placement: Placement) -> int:
+    """Return how many of the placed cameras do not hang loose."""
+    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+    return len(placement.cameras) - loose
+
+
+def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
+    """Return which images are to stay where they are."""
+    if not fix:
+        return np.zeros(model.num_images, dtype=np.bool_)
+    if fix == FIX_SOLVED:
+        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
+        if not solved.any():
+            raise InputError(
+                "no image of the model observes a 3D point, so none is solved; name those to fix"
+            )
+        return solved
+    path, index = Path(fix), {name: k for k, name in enumerate(model.names)}
+    fixed = np.zeros(model.num_images, dtype=np.bool_)
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
+        name = line.strip()
+        if not name or name.startswith("#"):
+            continue
+        if name not in index:
+            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}")
+        fixed[index[name]] = True
+    if not fixed.any():
+        raise InputError(f"{path} names no image; give the name of one image per line")
+    return fixed

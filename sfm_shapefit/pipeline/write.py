@@ -1,0 +1,134 @@
+"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`, scenes if wanted.
+
+Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each. A
+bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `map.json` beside them; models
+that were joined stand in `joined_0` in one world too.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
+from sfm_shapefit.base.settings import Settings, explained, merge_options, option
+from sfm_shapefit.facts.joins import JoinedModel
+from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.result import FurtherPiece, GraphResult, LocateResult
+from sfm_shapefit.facts.rows import folder_of, own_camera_rows
+from sfm_shapefit.facts.tables import CameraRow, PairRow, write_json, write_rows
+from sfm_shapefit.files.colmap.seed import write_model
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class WriteOptions(Settings):
+    """How a result is written."""
+
+    overwrite: bool = option(False, "Replace an earlier output of this package.")
+    protect: tuple[Path | str, ...] = option(
+        (), "Paths that the folder must not be or contain, beside the inputs of the result."
+    )
+    report: bool = option(True, "Write report.html, one page that explains the result and works offline.")
+    scene: bool = option(False, "Write scene.glb and scene.ply, cameras and points for any 3D viewer.")
+    images: Path | str = option("", "Folder of the images, of which report.html is to have small pictures.")
+
+
+def write_result(
+    found: LocateResult | GraphResult | MapResult,
+    out: Path | str,
+    *,
+    options: WriteOptions | None = None,
+    further_files: Mapping[str, str] | None = None,
+    **overrides: Any,
+) -> None:
+    """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
+
+    Args:
+        found: what `locate`, `map_database` or `place_graph_file` returned.
+        out: the folder to be made.
+        options: settings, see `help(WriteOptions)`; defaults if None.
+        further_files: the text of more files, by their path in the folder.
+        **overrides: single options by name: `write_result(found, "out", overwrite=True)`.
+
+    Raises:
+        InputError: if the folder exists, cannot be written, or would hit a protected path.
+    """
+    options = merge_options(options, WriteOptions, overrides)
+    protect = [*_inputs_of(found), *options.protect]
+    with atomic_folder(out, overwrite=options.overwrite, protect=protect) as folder:
+        for name, text in (further_files or {}).items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text, encoding="utf-8")
+        if isinstance(found, MapResult):
+            for number, model in enumerate(found.models):
+                (folder / str(number)).mkdir()
+                _write_files(model.located, folder / str(number), options)
+            for joined in found.joined:
+                (folder / joined.folder).mkdir()
+                _write_joined(joined, folder / joined.folder, options)
+            write_json(found.summary(), folder / MAP_MARKER)
+        else:
+            _write_files(found, folder, options)
+
+
+write_map_result = write_result
+"""The same by another name."""
+
+
+def _inputs_of(found: LocateResult | GraphResult | MapResult) -> list[Path]:
+    if isinstance(found, LocateResult):
+        return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
+    return [found.database if isinstance(found, MapResult) else found.path]
+
+
+def _write_files(found: LocateResult | GraphResult, folder: Path, options: WriteOptions) -> None:
+    """Write the files of one placed model or graph."""
+    dimension, facts = found.placement.graph.dimension, found.summary()
+    if isinstance(found, LocateResult):
+        write_model(found.reconstruction, folder)
+    for piece in found.further:
+        placement = piece.placement if isinstance(piece, FurtherPiece) else piece
+        subfolder = folder / folder_of(placement.piece)
+        subfolder.mkdir(parents=True)
+        if isinstance(piece, FurtherPiece):
+            write_model(piece.reconstruction, subfolder)
+            rows = piece.camera_rows
+        else:
+            rows = own_camera_rows(piece, piece.locations, 1.0)
+        write_rows(rows, CameraRow, dimension, subfolder / "cameras.csv")
+    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    if isinstance(found, LocateResult) and found.doubtful_pairs:
+        write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
+    write_json(facts, folder / MARKER)
+    if options.report or options.scene:
+        _draw(found, folder, options)
+
+
+def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
+    """Write the files of models that were joined."""
+    write_model(found.reconstruction, folder)
+    write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
+    write_json(found.summary(), folder / MARKER)
+    if options.report or options.scene:
+        _draw(found, folder, options)
+
+
+def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
+    """Write the report and the scenes that are wanted."""
+    from sfm_shapefit.report.mesh import write_meshes
+    from sfm_shapefit.report.page import write_report
+    from sfm_shapefit.report.read_back import draw_result, read_output
+    from sfm_shapefit.report.thumbnails import thumbnails_of
+
+    if isinstance(found, JoinedModel):
+        drawing, facts = read_output(folder)
+    else:
+        drawing, facts = draw_result(found), found.summary()
+    if options.report:
+        pictures = thumbnails_of(drawing, options.images)
+        write_report(drawing, facts, folder / "report.html", pictures)
+    if options.scene:
+        write_meshes(drawing, folder)

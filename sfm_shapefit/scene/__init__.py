@@ -1,0 +1,1 @@
+"""Images, matches, poses and what is told of them, as arrays; no files, no solver."""

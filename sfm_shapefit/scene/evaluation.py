@@ -1,0 +1,456 @@
+"""Errors of camera poses against a reference, after a robust alignment of positions and one of rotations.
+
+A reconstruction is known up to a similarity. The centers are aligned by the similarity with the least sum of
+min(distance, cap), cap = half of the reference's median spread: an L1 fit for which a camera that has flown
+away is lost and pulls no more, so that half of the cameras may be anywhere (`geometry.fit_similarity_l1`).
+The rotations are compared independently of that: with ref_from_model = Q, a perfect camera has
+R_ref = R_model Q^T, so Q is the L1 mean of the R_ref^T R_model, and the error is the angle of what remains.
+
+Recall at a threshold is the share of *all* reference cameras whose position error is at most the threshold;
+a camera that the model misses counts as a failure. AUC of relative poses, ATE and RPE are those of
+`pose_errors`, on which the alignment has no influence, or one of their own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import (
+    Similarity,
+    fit_similarity_l1,
+    mean_rotation_l1,
+    median_spread,
+    rotation_angles_deg,
+)
+from sfm_shapefit.scene.pose_errors import (
+    ErrorSummary,
+    Poses,
+    TrajectoryErrors,
+    area_under_recall,
+    relative_pose_errors,
+    summarize_errors,
+    trajectory_errors,
+)
+
+_ON_A_LINE = (
+    "the camera centers lie on a line, so the alignment's rotation about it is arbitrary; position errors "
+    "across the line are a lower bound"
+)
+
+AUC_THRESHOLDS_DEG = (0.5, 1.0, 5.0, 10.0)
+"""Errors of relative poses up to which the area under the recall is given."""
+RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
+"""Position errors at which recall is always given, as fractions of the reference's extent."""
+
+# So many of the worst cameras are named.
+_WORST = 10
+# Fewer centers never determine a similarity.
+_MIN_COMMON = 3
+# Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
+# failed on some sets of 7 and 11 cameras.
+_CAP_OF_SPREAD = 0.5
+# Centers count as a line if the ratio of their second to their first singular value is smaller.
+_COLLINEAR_RATIO = 1e-3
+# Published references printed with 6 digits are off by 2e-6 in R R^T - I.
+_ORTHOGONALITY_TOLERANCE = 1e-4
+
+
+class CameraPoses(NamedTuple):
+    """n cameras, known by their names."""
+
+    names: Sequence[str]
+    """Each distinct."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3) in world axes."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recall:
+    """The share of the reference's cameras that are placed to within a threshold."""
+
+    threshold: Annotated[float, "Position error, in the reference's units."]
+    fraction_of_extent: Annotated[
+        float | None,
+        "The threshold as a fraction of the reference's extent; null for one given in the reference's units.",
+    ]
+    recall: Annotated[float, "In [0, 1]; cameras that the model misses count as failures."]
+    auc: Annotated[float, "Area under the recall up to the threshold, divided by it, in [0, 1]."]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativePoseAuc:
+    """How well the relative poses of all pairs of the reference's cameras are known."""
+
+    threshold_deg: Annotated[float, "The larger of the angles of rotation and of translation direction."]
+    auc: Annotated[
+        float, "Area under the recall up to the threshold, divided by it; pairs that the model misses fail."
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Evaluation(Displayed):
+    """Errors of a model's camera poses against a reference. Arrays are read-only."""
+
+    names: tuple[str, ...]
+    """The k common cameras, in the reference's order."""
+    missing: tuple[str, ...]
+    """Cameras of the reference that the model does not have."""
+    extra: tuple[str, ...]
+    """Cameras of the model that the reference does not have."""
+    position_errors: FloatArray
+    """(k,) distances between aligned and reference centers, in the reference's units."""
+    rotation_errors_deg: FloatArray
+    """(k,) angles that remain after the best global rotation."""
+    aligned_centers: FloatArray
+    """(k, 3) the model's centers in the reference's frame."""
+    ref_from_model: Similarity
+    """The alignment of the centers."""
+    rotation_ref_from_model: FloatArray
+    """(3, 3) the alignment of the rotations, found without the centers."""
+    extent: float
+    """Diagonal of the bounding box of all reference centers, in the reference's units."""
+    recalls: tuple[Recall, ...]
+    """Recall at the relative thresholds, then at the absolute ones that were asked for."""
+    relative_pose_errors_deg: FloatArray
+    """(p,) of the pairs of common cameras: the larger of the angles of rotation and translation direction."""
+    relative_pose_aucs: tuple[RelativePoseAuc, ...]
+    """The area under the recall of these errors at 0.5, 1, 5 and 10 degrees."""
+    trajectory: TrajectoryErrors | None
+    """ATE and RPE of the common cameras in the order of their names; None if not asked for."""
+    warnings: tuple[str, ...]
+    """What a reader of the numbers must know; one sentence each."""
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether the centers lie on a line: the rotation of `ref_from_model` about it is arbitrary."""
+        return _ON_A_LINE in self.warnings
+
+    @property
+    def position(self) -> ErrorSummary:
+        """Statistics of the position errors, in the reference's units."""
+        return summarize_errors(self.position_errors)
+
+    @property
+    def rotation_deg(self) -> ErrorSummary:
+        """Statistics of the rotation errors, in degrees."""
+        return summarize_errors(self.rotation_errors_deg)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
+        return {
+            "num_reference": len(self.names) + len(self.missing),
+            "num_model": len(self.names) + len(self.extra),
+            "num_common": len(self.names),
+            "num_missing": len(self.missing),
+            "num_extra": len(self.extra),
+            "missing": list(self.missing),
+            "extra": list(self.extra),
+            "extent": self.extent,
+            "position_error": asdict(self.position),
+            "rotation_error_deg": asdict(self.rotation_deg),
+            "recall": [asdict(recall) for recall in self.recalls],
+            "relative_pose_auc": [asdict(auc) for auc in self.relative_pose_aucs],
+            "trajectory": None if self.trajectory is None else asdict(self.trajectory),
+            "worst": self.worst(),
+            "ref_from_model": {
+                "scale": self.ref_from_model.scale,
+                "rotation": self.ref_from_model.rotation.tolist(),
+                "translation": self.ref_from_model.translation.tolist(),
+            },
+            "rotation_ref_from_model": self.rotation_ref_from_model.tolist(),
+            "degenerate": self.degenerate,
+            "warnings": list(self.warnings),
+        }
+
+    def _headline(self) -> str:
+        median, worst = self.position.median, self.position.max
+        return f"{len(self.names)} cameras in common, position error {median:.3g} (median), {worst:.3g} (max)"
+
+    def worst(self, count: int = _WORST) -> list[dict[str, Any]]:
+        """Return name, position error and rotation error in degrees of the cameras that are farthest off."""
+        return [
+            {
+                "name": self.names[k],
+                "position_error": float(self.position_errors[k]),
+                "rotation_error_deg": float(self.rotation_errors_deg[k]),
+            }
+            for k in np.argsort(-self.position_errors, kind="stable")[:count].tolist()
+        ]
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return one row per common camera, for a table: errors and the aligned center."""
+        keys = ("name", "position_error", "rotation_error_deg", "x", "y", "z")
+        errors = np.column_stack([self.position_errors, self.rotation_errors_deg, self.aligned_centers])
+        return [
+            dict(zip(keys, (name, *row), strict=True))
+            for name, row in zip(self.names, errors.tolist(), strict=True)
+        ]
+
+
+def evaluate_poses(
+    model: CameraPoses,
+    reference: CameraPoses,
+    thresholds: Sequence[float] = (),
+    *,
+    trajectory: bool = False,
+) -> Evaluation:
+    """Compare a model's camera poses with a reference's; cameras correspond by name.
+
+    Args:
+        model, reference: the two.
+        thresholds: position errors in the reference's units at which recall and its AUC are given too.
+        trajectory: also compute ATE and RPE of the common cameras in the order of their names.
+
+    Raises:
+        InputError: if an array has a wrong shape, is not finite or holds a matrix that is no rotation, a name
+            stands twice, a threshold is not positive, fewer than 3 cameras are common, or all common
+            centers of either side coincide.
+    """
+    _check_poses("the model", model)
+    _check_poses("the reference", reference)
+    for threshold in thresholds:
+        if not (np.isfinite(threshold) and threshold > 0.0):
+            raise InputError(f"a recall threshold must be a positive number, got {threshold}")
+    in_model, in_ref = _common_cameras(model.names, reference.names)
+    x, y = model.centers[in_model], reference.centers[in_ref]
+    _refuse_coincident("the model", x)
+    _refuse_coincident("the reference", y)
+
+    cap = _CAP_OF_SPREAD * median_spread(y)
+    ref_from_model = fit_similarity_l1(x, y, cap=cap)
+    aligned = ref_from_model.apply(x)
+    errors = np.linalg.norm(aligned - y, axis=1)
+    turns = np.swapaxes(reference.rotations[in_ref], 1, 2) @ model.rotations[in_model]
+    global_rotation = mean_rotation_l1(turns)
+
+    close = errors < cap
+    degenerate = _on_a_line(x, close) or _on_a_line(y, close)
+    extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
+    ours, theirs = Poses(model.rotations[in_model], x), Poses(reference.rotations[in_ref], y)
+    pair_errors = relative_pose_errors(ours, theirs, extent)
+    in_time = np.argsort(np.array([reference.names[k] for k in in_ref]), kind="stable")
+    return Evaluation(
+        names=tuple(reference.names[k] for k in in_ref),
+        missing=_only_in(reference.names, model.names),
+        extra=_only_in(model.names, reference.names),
+        position_errors=frozen(errors),
+        rotation_errors_deg=frozen(rotation_angles_deg(turns @ global_rotation.T)),
+        aligned_centers=frozen(aligned),
+        ref_from_model=ref_from_model,
+        rotation_ref_from_model=frozen(global_rotation),
+        extent=extent,
+        recalls=_recalls(errors, len(reference.names), extent, thresholds),
+        relative_pose_errors_deg=frozen(pair_errors),
+        relative_pose_aucs=_relative_pose_aucs(pair_errors, len(in_ref), len(reference.names)),
+        trajectory=trajectory_errors(ours.taken(in_time), theirs.taken(in_time)) if trajectory else None,
+        warnings=_warnings(degenerate, close, cap),
+    )
+
+
+def _check_poses(owner: str, poses: CameraPoses) -> None:
+    """Raise InputError unless names, rotations and centers are distinct, matching, finite and orthogonal."""
+    names, rotations, centers = poses.names, poses.rotations, poses.centers
+    count = len(names)
+    if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
+        raise InputError(
+            f"{owner} has {count} names, rotations of shape {rotations.shape} and centers of shape"
+            f" {centers.shape}; give ({count}, 3, 3) and ({count}, 3)"
+        )
+    if len(set(names)) < count:
+        repeated = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"{owner} has two cameras named '{repeated}'; names must be distinct")
+    finite = np.isfinite(centers).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+    _refuse(np.asarray(~finite), owner, names, "has a pose that is not finite; repair or remove it")
+    product = rotations @ np.swapaxes(rotations, 1, 2)
+    skewed = np.abs(product - np.eye(3)).max(axis=(1, 2), initial=0.0) > _ORTHOGONALITY_TOLERANCE
+    mirrored = np.linalg.det(rotations) < 0.0
+    _refuse(np.asarray(skewed | mirrored), owner, names, "has a matrix that is no rotation; repair it")
+
+
+def _refuse(bad: BoolArray, owner: str, names: Sequence[str], reason: str) -> None:
+    """Raise InputError for the first camera that is bad."""
+    if bad.any():
+        raise InputError(f"camera '{names[int(np.argmax(bad))]}' of {owner} {reason}")
+
+
+def _only_in(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that are not among others."""
+    known = set(others)
+    return tuple(name for name in names if name not in known)
+
+
+def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[IntArray, IntArray]:
+    """Return the indices of the common cameras in both lists, in the reference's order."""
+    position = {name: k for k, name in enumerate(names)}
+    in_ref = [k for k, name in enumerate(ref_names) if name in position]
+    if len(in_ref) < _MIN_COMMON:
+        only = {"model": _only_in(names, ref_names), "reference": _only_in(ref_names, names)}
+        examples = [f"only the {owner} has '{missed[0]}'" for owner, missed in only.items() if missed]
+        shown = f": {', '.join(examples)}" if examples else ""
+        raise InputError(
+            f"the model ({len(names)} cameras) and the reference ({len(ref_names)}) share {len(in_ref)} image"
+            f" names{shown}; at least {_MIN_COMMON} must be equal"
+        )
+    in_model = [position[ref_names[k]] for k in in_ref]
+    return np.array(in_model, dtype=np.int64), np.array(in_ref, dtype=np.int64)
+
+
+def _refuse_coincident(owner: str, centers: FloatArray) -> None:
+    """Raise InputError if all centers are the same to rounding."""
+    rounding = 1e-12 * float(np.abs(centers).max())
+    if float(np.ptp(centers, axis=0).max()) <= rounding:
+        raise InputError(
+            f"all common cameras of {owner} stand at one point, so nothing can be aligned; place them first"
+        )
+
+
+def _on_a_line(centers: FloatArray, close: BoolArray) -> bool:
+    """Whether the centers that the alignment rests on lie on a line; of all, if too few are close."""
+    used = centers[close] if close.sum() >= _MIN_COMMON else centers
+    spreads = np.linalg.svd(used - used.mean(axis=0), compute_uv=False)
+    return bool(spreads[1] <= _COLLINEAR_RATIO * spreads[0])
+
+
+def _recalls(
+    errors: FloatArray, num_reference: int, extent: float, thresholds: Sequence[float]
+) -> tuple[Recall, ...]:
+    """Return the recall at the relative thresholds and at the given absolute ones."""
+    relative = [(fraction * extent, fraction) for fraction in RELATIVE_THRESHOLDS]
+    absolute = [(float(threshold), None) for threshold in thresholds]
+    both = [*relative, *absolute]
+    num_missing = num_reference - len(errors)
+    aucs = area_under_recall(errors, num_missing, [threshold for threshold, _ in both])
+    return tuple(
+        Recall(
+            threshold=threshold,
+            fraction_of_extent=fraction,
+            recall=float(np.count_nonzero(errors <= threshold)) / num_reference,
+            auc=auc,
+        )
+        for (threshold, fraction), auc in zip(both, aucs, strict=True)
+    )
+
+
+def _relative_pose_aucs(
+    errors: FloatArray, num_common: int, num_reference: int
+) -> tuple[RelativePoseAuc, ...]:
+    """Return the areas of all pairs of the reference's cameras, of which the model has those of `errors`."""
+    of_common = num_common * (num_common - 1) / (num_reference * (num_reference - 1))
+    num_missing = round(len(errors) * (1.0 / of_common - 1.0))
+    areas = area_under_recall(errors, num_missing, AUC_THRESHOLDS_DEG)
+    return tuple(
+        RelativePoseAuc(threshold_deg=threshold, auc=area)
+        for threshold, area in zip(AUC_THRESHOLDS_DEG, areas, strict=True)
+    )
+
+
+def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]:
+    """Return the sentences that a reader of the figures must know."""
+    found = []
+    if degenerate:
+        found.append(_ON_A_LINE)
+    if 2 * int(close.sum()) <= len(close):
+        found.append(
+            f"only {int(close.sum())} of {len(close)} common cameras lie within {cap:.3g} of the reference;"
+            " the alignment may rest on the wrong ones"
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class PositionEvaluation(Displayed):
+    """Errors of a model's camera centers against positions measured otherwise, such as by GPS."""
+
+    names: tuple[str, ...]
+    """The k common cameras, in the reference's order."""
+    missing: tuple[str, ...]
+    """Cameras of the reference that the model does not have."""
+    offsets: FloatArray | None
+    """(k, 3) model minus reference as they stand, in the reference's axes and units; None if these are not
+    the model's."""
+    aligned_errors: FloatArray
+    """(k,) distances after the robust similarity that fits best, in the reference's units."""
+    ref_from_model: Similarity
+    """That similarity."""
+    statement: str
+    """What is compared with what, in words."""
+
+    @property
+    def position(self) -> ErrorSummary | None:
+        """Statistics of the distances as they stand; None if they mean nothing."""
+        return None if self.offsets is None else summarize_errors(np.linalg.norm(self.offsets, axis=1))
+
+    @property
+    def aligned(self) -> ErrorSummary:
+        """Statistics of the distances after the alignment."""
+        return summarize_errors(self.aligned_errors)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
+        return {
+            "statement": self.statement,
+            "num_reference": len(self.names) + len(self.missing),
+            "num_common": len(self.names),
+            "missing": list(self.missing),
+            "position_error": None if self.position is None else asdict(self.position),
+            "median_offset": None if self.offsets is None else np.median(self.offsets, axis=0).tolist(),
+            "aligned_position_error": asdict(self.aligned),
+            "ref_from_model": {
+                "scale": self.ref_from_model.scale,
+                "rotation": self.ref_from_model.rotation.tolist(),
+                "translation": self.ref_from_model.translation.tolist(),
+            },
+        }
+
+    def _headline(self) -> str:
+        return (
+            f"{len(self.names)} cameras in common, position error {self.aligned.median:.3g} (median, aligned)"
+        )
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return one row per common camera, for a table."""
+        offsets = np.full((len(self.names), 3), np.nan) if self.offsets is None else self.offsets
+        errors = np.column_stack([offsets, self.aligned_errors]).tolist()
+        keys = ("name", "offset_x", "offset_y", "offset_z", "aligned_error")
+        return [
+            dict(zip(keys, (name, *row), strict=True)) for name, row in zip(self.names, errors, strict=True)
+        ]
+
+
+def evaluate_positions(
+    model: tuple[Sequence[str], FloatArray],
+    reference: tuple[Sequence[str], FloatArray],
+    statement: str,
+    *,
+    as_they_stand: bool,
+) -> PositionEvaluation:
+    """Compare camera centers (n, 3) with known positions, each by distinct names.
+
+    Args:
+        model, reference: names and positions.
+        statement: what is compared with what.
+        as_they_stand: whether both are in the same axes and units.
+
+    Raises:
+        InputError: if fewer than 3 cameras are common, or those of either side coincide.
+    """
+    in_model, in_ref = _common_cameras(model[0], reference[0])
+    x, y = model[1][in_model], reference[1][in_ref]
+    _refuse_coincident("the model", x)
+    _refuse_coincident("the reference", y)
+    ref_from_model = fit_similarity_l1(x, y, cap=_CAP_OF_SPREAD * median_spread(y))
+    return PositionEvaluation(
+        names=tuple(reference[0][k] for k in in_ref),
+        missing=_only_in(reference[0], model[0]),
+        offsets=frozen(x - y) if as_they_stand else None,
+        aligned_errors=frozen(np.linalg.norm(ref_from_model.apply(x) - y, axis=1)),
+        ref_from_model=ref_from_model,
+        statement=statement,
+    )

@@ -1,0 +1,143 @@
+"""Errors of camera poses as the field measures them: AUC of relative poses, ATE and RPE of a trajectory.
+
+The error of a pair of cameras is the larger of the angle between its two relative rotations and the angle
+between its two translation directions (Jin et al., "Image matching across wide baselines", 2021; so measure
+SuperGlue, GLOMAP and others). No alignment has a part in it. The area under the curve (AUC) is that under the
+recall as a function of the error, by trapezoids between the sorted errors, divided by the threshold.
+
+ATE and RPE are those of evo and of Sturm et al. ("A benchmark for the evaluation of RGB-D SLAM systems",
+2012): with poses P_k of the model, moved by the similarity of least squares (Umeyama) onto the reference's
+Q_k, ATE is the distance of the centers, and RPE the translation and the angle of
+
+    (Q_k^-1 Q_k+1)^-1 (P_k^-1 P_k+1)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, rotation_angles_deg
+
+MAX_PAIRS = 2_000_000
+"""Of more pairs so many are drawn, by a fixed seed."""
+# Cameras that are closer, relative to the extent of all, have no direction from one to the other.
+_COINCIDENT = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorSummary:
+    """Statistics of one kind of error over the common cameras."""
+
+    median: Annotated[float, "Of all errors."]
+    mean: Annotated[float, "Of all errors."]
+    rms: Annotated[float, "Root of the mean square."]
+    max: Annotated[float, "The largest error."]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrajectoryErrors:
+    """Errors of cameras that follow one another in the order of their names, as evo defines them."""
+
+    ate: Annotated[ErrorSummary, "Absolute trajectory error, in the reference's units."]
+    rpe: Annotated[ErrorSummary, "Translation of the relative pose error of neighbors, in these units."]
+    rpe_rotation_deg: Annotated[ErrorSummary, "Angle of the relative pose error of neighbors."]
+
+
+class Poses(NamedTuple):
+    """n cameras."""
+
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3) in world axes."""
+
+    def taken(self, order: IntArray) -> "Poses":
+        """Return some of the cameras, in another order."""
+        return Poses(self.rotations[order], self.centers[order])
+
+
+def summarize_errors(errors: FloatArray) -> ErrorSummary:
+    """Return the statistics of errors of shape (k,)."""
+    return ErrorSummary(
+        median=float(np.median(errors)),
+        mean=float(errors.mean()),
+        rms=float(np.sqrt(np.mean(errors**2))),
+        max=float(errors.max()),
+    )
+
+
+def area_under_recall(errors: FloatArray, num_missing: int, thresholds: Sequence[float]) -> list[float]:
+    """Return the area under the recall of errors (k,) up to each threshold, divided by it.
+
+    Args:
+        errors: of what there is.
+        num_missing: how many more there should be; their errors are infinite.
+        thresholds: positive.
+    """
+    total = len(errors) + num_missing
+    known = np.concatenate([[0.0], np.sort(errors)])
+    recall = np.arange(len(known)) / max(total, 1)
+    areas = []
+    for threshold in thresholds:
+        count = int(np.searchsorted(known, threshold, side="right"))
+        x = np.append(known[:count], threshold)
+        y = np.append(recall[:count], recall[count - 1])
+        areas.append(float(np.trapezoid(y, x)) / threshold)
+    return areas
+
+
+def relative_pose_errors(model: Poses, reference: Poses, extent: float) -> FloatArray:
+    """Return the error of each pair of n corresponding cameras in degrees, at most `MAX_PAIRS` of them.
+
+    Args:
+        model, reference: the same cameras in two worlds.
+        extent: of the reference's cameras, which says when two of them stand at one place; then their
+            rotations alone are compared.
+    """
+    first, second = _pairs(len(model.centers))
+    turns = [poses.rotations[second] @ _transposed(poses.rotations[first]) for poses in (model, reference)]
+    errors = rotation_angles_deg(turns[0] @ _transposed(turns[1]))
+    baselines = [
+        np.einsum("kab,kb->ka", poses.rotations[first], poses.centers[second] - poses.centers[first])
+        for poses in (model, reference)
+    ]
+    apart = np.linalg.norm(baselines[1], axis=1) > _COINCIDENT * extent
+    angles = angle_between_deg(normalized(baselines[0][apart]), normalized(baselines[1][apart]))
+    # What has no baseline at all in the model has no direction either: that is no small error.
+    angles = np.nan_to_num(angles, nan=180.0)
+    errors[apart] = np.maximum(errors[apart], angles)
+    return np.asarray(errors)
+
+
+def trajectory_errors(model: Poses, reference: Poses) -> TrajectoryErrors:
+    """Return ATE and RPE of n corresponding cameras in the order of time."""
+    onto = fit_similarity(model.centers, reference.centers)
+    moved = Poses(model.rotations @ onto.rotation.T, onto.apply(model.centers))
+    turns, shifts = [], []
+    for poses in (moved, reference):
+        before, after = poses.rotations[:-1], poses.rotations[1:]
+        turns.append(before @ _transposed(after))
+        shifts.append(np.einsum("kab,kb->ka", before, np.diff(poses.centers, axis=0)))
+    return TrajectoryErrors(
+        ate=summarize_errors(np.linalg.norm(moved.centers - reference.centers, axis=1)),
+        rpe=summarize_errors(np.linalg.norm(shifts[0] - shifts[1], axis=1)),
+        rpe_rotation_deg=summarize_errors(rotation_angles_deg(_transposed(turns[1]) @ turns[0])),
+    )
+
+
+def _pairs(n: int) -> tuple[IntArray, IntArray]:
+    """Return the cameras of all pairs i < j of n, or of as many as are looked at."""
+    if n * (n - 1) // 2 <= MAX_PAIRS:
+        first, second = np.triu_indices(n, 1)
+        return first, second
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, n, MAX_PAIRS)
+    second = (first + rng.integers(1, n, MAX_PAIRS)) % n
+    return np.minimum(first, second), np.maximum(first, second)
+
+
+def _transposed(matrices: FloatArray) -> FloatArray:
+    return np.swapaxes(matrices, 1, 2)

@@ -1,0 +1,78 @@
+"""Observations joined to tracks by the matches that agree with an epipolar geometry, compiled.
+
+Who is joined with whom is a forest over compact arrays (union by the smaller number, paths halved as they are
+walked: Tarjan and van Leeuwen 1984): eight bytes an observation, whatever the number of matches, which pass
+by once and are not held. Every root is the smallest number of its tree, so that the answer does not depend
+on the order of matches.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.jit import inner_kernel, kernel
+
+
+@inner_kernel
+def sampson_px(a: Any, b: Any, d: Any, pixel_angle: float) -> float:
+    """Return the Sampson error in pixels of two unit rays against the unit direction of their baseline.
+
+    To first order it is the least movement of both image points together that makes the rays meet:
+    |(a x b) . d| / sqrt(|a x d|^2 + |b x d|^2), over the angle of a pixel. It is NaN with a ray of NaN.
+    """
+    along_a = a[0] * d[0] + a[1] * d[1] + a[2] * d[2]
+    along_b = b[0] * d[0] + b[1] * d[1] + b[2] * d[2]
+    volume = (
+        (a[1] * b[2] - a[2] * b[1]) * d[0]
+        + (a[2] * b[0] - a[0] * b[2]) * d[1]
+        + (a[0] * b[1] - a[1] * b[0]) * d[2]
+    )
+    gradient = np.sqrt(max(2.0 - along_a * along_a - along_b * along_b, 1e-12))
+    return float(abs(volume) / (gradient * pixel_angle))
+
+
+@inner_kernel
+def _root(parents: Any, k: int) -> int:
+    """Return the root of a node."""
+    while parents[k] != k:
+        parents[k] = parents[parents[k]]
+        k = parents[k]
+    return k
+
+
+@inner_kernel
+def unite(parents: Any, i: int, j: int) -> None:
+    """Join the trees of two nodes."""
+    i, j = _root(parents, i), _root(parents, j)
+    if i < j:
+        parents[j] = i
+    else:
+        parents[i] = j
+
+
+@kernel
+def _number_trees(parents: Any, order: Any, numbers: Any) -> int:
+    """Write the number of the tree of each node by the first node of it in `order`; return how many."""
+    count = 0
+    for k in range(len(numbers)):
+        numbers[k] = -1
+    for position in range(len(order)):
+        root = _root(parents, order[position])
+        if numbers[root] < 0:
+            numbers[root] = count
+            count += 1
+        numbers[order[position]] = numbers[root]
+    return count
+
+
+def number_trees(parents: IntArray, order: IntArray) -> IntArray:
+    """Return the number of the tree of each node (k,), trees numbered by their first node in `order`.
+
+    Args:
+        parents: (k,) the forest; paths in it become shorter.
+        order: (m,) nodes; those of other trees get -1.
+    """
+    numbers = np.empty(len(parents), dtype=np.int64)
+    _number_trees(parents, order, numbers)
+    return numbers

@@ -1,0 +1,209 @@
+"""Tracks: which keypoints of which cameras are taken for the same point, before any point is known."""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
+
+Int32Array = npt.NDArray[np.int32]
+
+# Between two slices Python can be interrupted: about 50 ms.
+_MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraPoses:
+    """Where cameras stand; what tracks and their triangulation must know of them."""
+
+    rotations: FloatArray
+    """(c, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(c, 3)"""
+    focal_lengths_px: FloatArray
+    """(c,)"""
+    images: IntArray
+    """(c,) the image of each; views of one image follow one another."""
+
+
+class JoinedRows(NamedTuple):
+    """Tracks by the rows of their keypoints: track t has rows[offsets[t]:offsets[t + 1]]."""
+
+    offsets: IntArray
+    """(t + 1,)"""
+    rows: IntArray
+    """(m,) rows of other arrays."""
+
+    def subset(self, chosen: IntArray) -> "JoinedRows":
+        """Return the given tracks, in that order."""
+        lengths = np.diff(self.offsets)[chosen]
+        offsets = np.append(0, np.cumsum(lengths))
+        return JoinedRows(
+            offsets,
+            self.rows[np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])],
+        )
+
+    def of_points(self, points_seen: IntArray) -> "JoinedRows":
+        """Return the tracks of points, one each: what rows (m,) see, -1 for those to be left out."""
+        order = np.argsort(points_seen, kind="stable")[np.sum(points_seen < 0) :]
+        offsets = np.append(0, np.cumsum(np.bincount(points_seen[order]))).astype(np.int64)
+        return JoinedRows(offsets, self.rows[order])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ObservedTracks:
+    """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera."""
+
+    offsets: IntArray
+    """(t + 1,)"""
+    cameras: IntArray
+    """(m,) the camera of each observation."""
+    keypoints: IntArray
+    """(m,) which of the camera's keypoints it is."""
+    pixels: FloatArray
+    """(m, 2) as the adjustment's lens takes them."""
+    on_plane: FloatArray
+    """(m, 2) x/z and y/z of the ray in axes of the camera; NaN for rays that do not point ahead."""
+    ids: IntArray
+    """(t,) a number by which each track is known."""
+    may_split: bool = True
+    """Whether a track may be of several points, as one that wrong matches have joined; else it is of one."""
+
+    @property
+    def num_tracks(self) -> int:
+        """Number of tracks, t."""
+        return len(self.offsets) - 1
+
+    def lengths(self) -> IntArray:
+        """Return the number of observations of each track, (t,)."""
+        return np.diff(self.offsets)
+
+    def subset(self, chosen: IntArray) -> "ObservedTracks":
+        """Return the given tracks, in that order."""
+        return self._of_rows(self._by_rows().subset(chosen), self.ids[chosen])
+
+    def of_points(self, points_seen: IntArray) -> "ObservedTracks":
+        """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
+        joined = self._by_rows().of_points(points_seen)
+        return self._of_rows(joined, np.arange(len(joined.offsets) - 1))
+
+    def _by_rows(self) -> JoinedRows:
+        return JoinedRows(self.offsets, np.arange(len(self.cameras)))
+
+    def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
+        """Return tracks of these observations."""
+        rows = joined.rows
+        return replace(
+            self,
+            offsets=joined.offsets,
+            cameras=self.cameras[rows],
+            keypoints=self.keypoints[rows],
+            pixels=self.pixels[rows],
+            on_plane=self.on_plane[rows],
+            ids=ids,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchedKeypoints:
+    """Keypoints of cameras, and which of them are matched with which."""
+
+    cameras: Int32Array
+    """(K,) ascending by image."""
+    keypoints: Int32Array
+    """(K,) which of the image's keypoints it is."""
+    pixels: FloatArray
+    """(K, 2) as the adjustment's lens takes them."""
+    on_plane: FloatArray
+    """(K, 2) see `ObservedTracks`."""
+    matches: npt.NDArray[np.integer]
+    """(m, 2) rows of the above, of any type of integer."""
+
+    def count_partners(self) -> Int32Array:
+        """Return how many matches each keypoint has, (K,)."""
+        counts = np.zeros(len(self.cameras), dtype=np.int32)
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            ends = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
+            counts += np.bincount(ends.ravel(), minlength=len(counts)).astype(np.int32)
+        return counts
+
+    def among(self, chosen: BoolArray) -> "MatchedKeypoints":
+        """Return the chosen ones of the keypoints (K,), and the matches between them."""
+        if chosen.all():
+            return self
+        row_of = np.cumsum(chosen, dtype=self.matches.dtype)
+        row_of -= 1
+        return MatchedKeypoints(
+            cameras=self.cameras[chosen],
+            keypoints=self.keypoints[chosen],
+            pixels=self.pixels[chosen],
+            on_plane=self.on_plane[chosen],
+            matches=row_of[self.matches[chosen[self.matches].all(axis=1)]],
+        )
+
+    def join(self, poses: CameraPoses, limit_px: float) -> JoinedRows:
+        """Return the connected components under the matches that agree with the poses.
+
+        A wrong match would join two tracks; nearly all wrong ones miss their epipolar line.
+
+        Args:
+            poses: of the cameras.
+            limit_px: largest Sampson error of a match that joins.
+        """
+        parents = np.arange(len(self.cameras))
+        given = self._rays(poses), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
+        for first in range(0, len(self.matches), _MATCHES_A_SLICE):
+            block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
+            _join(block, *given, parents)
+        del given  # the rays
+        track = number_trees(parents, np.arange(len(parents)))
+        rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
+        rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
+        return JoinedRows(np.append(0, np.cumsum(lengths)), rows)
+
+    def observed(self, joined: JoinedRows) -> ObservedTracks:
+        """Return tracks that are known by their rows."""
+        rows = joined.rows
+        return ObservedTracks(
+            offsets=joined.offsets,
+            cameras=self.cameras[rows].astype(np.int64),
+            keypoints=self.keypoints[rows].astype(np.int64),
+            pixels=self.pixels[rows],
+            on_plane=self.on_plane[rows],
+            ids=np.arange(len(joined.offsets) - 1),
+        )
+
+    def _rays(self, poses: CameraPoses) -> FloatArray:
+        """Return the unit rays (K, 3) in axes of the world."""
+        rays = np.empty((len(self.cameras), 3))
+        # The rotations of all at once would take five times what the rays do.
+        for first in range(0, len(rays), _KEYPOINTS_A_SLICE):
+            own = slice(first, first + _KEYPOINTS_A_SLICE)
+            ahead = np.concatenate([self.on_plane[own], np.ones((len(rays[own]), 1))], axis=1)
+            rays[own] = normalized(np.einsum("kba,kb->ka", poses.rotations[self.cameras[own]], ahead))
+        return rays
+
+
+@kernel
+def _join(
+    matches: Any, rays: Any, cameras: Any, centers: Any, focal_lengths_px: Any, limit_px: float, parents: Any
+) -> None:
+    """Join the keypoints of the matches that agree with the poses."""
+    d = np.empty(3)
+    for m in range(len(matches)):
+        k, other = matches[m, 0], matches[m, 1]
+        i, j = cameras[k], cameras[other]
+        square = 0.0
+        for c in range(3):
+            d[c] = centers[j, c] - centers[i, c]
+            square += d[c] * d[c]
+        for c in range(3):
+            d[c] /= np.sqrt(square)
+        angle = 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])
+        if sampson_px(rays[k], rays[other], d, angle) <= limit_px:
+            unite(parents, k, other)

@@ -1,0 +1,238 @@
+"""Matches to tracks, and a covering set of them as extra nodes of the view graph.
+
+With the rotations known, an observation of a 3D point X by camera i is a measured direction of C_i - X: the
+ray, turned round. A point seen by three cameras or more ties their distances together where the directions
+between the cameras cannot: on a straight road all baselines are parallel, rays to the roadside are not.
+
+A track is a connected component of observations under matches that agree with their pair's direction; one
+that meets an image twice is wrong and dropped. Where there are too many matches to hold, only those of a
+random share of the keypoints are kept, and with them whole stars of matches around these. Of the tracks, a
+covering set is chosen: so many that every camera, if it can, sees a given number of them.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
+
+# These are about 3 tracks started per camera, of 6 views each: what determines a straight road.
+_PER_CAMERA = 20
+# A small scene can afford so many observations, in all and per camera.
+_IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
+_MIN_VIEWS = 3
+# The keypoints of so many matches are held at a time, in 0.4 GB.
+_MAX_MATCHES = 10_000_000
+# Rays farther apart gain nothing more, and are often wrong.
+_WIDEST_RAD = 0.5
+Int32Array = npt.NDArray[np.int32]
+_MIX = np.uint64(0x9E3779B97F4A7C15)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tracks:
+    """Points seen by several cameras, as rays. Point p has the observations offsets[p]:offsets[p + 1]."""
+
+    offsets: IntArray
+    """(p + 1,)"""
+    cameras: IntArray
+    """(k,) the camera of each observation; a track meets each at most once."""
+    rays: FloatArray
+    """(k, 3) unit rays from the camera, world axes."""
+
+    @property
+    def num_tracks(self) -> int:
+        """Number of points, p."""
+        return len(self.offsets) - 1
+
+    def lengths(self) -> IntArray:
+        """Return the number of observations of each point, (p,)."""
+        return np.diff(self.offsets)
+
+    def subset(self, chosen: IntArray) -> "Tracks":
+        """Return the given tracks, in that order."""
+        lengths = self.lengths()[chosen]
+        offsets = np.concatenate([[0], np.cumsum(lengths)])
+        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        return Tracks(offsets=offsets, cameras=self.cameras[rows], rays=self.rays[rows])
+
+
+def build_tracks(
+    batches: Iterable[MatchBatch],
+    directions: PairDirections,
+    threshold_px: float,
+    num_keypoints: IntArray,
+    max_matches: int = _MAX_MATCHES,
+) -> Tracks:
+    """Return the tracks of at least three views that the matches of usable pairs form.
+
+    The tracks and their order do not depend on the order of pairs.
+
+    Args:
+        batches: the matches of all pairs; they pass by once, none is held.
+        directions: what was measured of the same pairs.
+        threshold_px: largest Sampson error of a match that is kept.
+        num_keypoints: (n,) of each image.
+        max_matches: whose keypoints are held in memory; beyond, a share of the keypoints is drawn.
+    """
+    usable = directions.usable()
+    share = min(1.0, max_matches / max(float(directions.num_inliers[usable].sum()), 1.0))
+    pairs = map(tuple, directions.pairs[usable].tolist())
+    rows = dict(zip(pairs, usable.tolist(), strict=True))
+    begins = np.append(0, np.cumsum(num_keypoints))
+    places = np.full(int(begins[-1]), -1, dtype=np.int32)
+    parents, rays, count = np.empty(0, dtype=np.int64), [], 0
+    for batch in batches:
+        row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
+        counts = np.diff(batch.offsets)
+        drawn = _draw_matches(batch, counts, share)
+        keypoints = begins[np.repeat(batch.pairs, counts, axis=0)] + batch.keypoints
+        new_rays = np.empty((min(2 * len(keypoints), len(places) - count), 3))
+        if count + len(new_rays) > len(parents):
+            parents = np.concatenate([parents, np.arange(len(parents), 2 * (count + len(new_rays)))])
+        number = _join_batch(
+            row, batch.offsets, keypoints, drawn, np.ascontiguousarray(batch.rays_i),
+            np.ascontiguousarray(batch.rays_j), directions.directions, batch.pixel_angles, threshold_px,
+            places, parents, count, new_rays,
+        )  # fmt: skip
+        rays.append(new_rays[: number - count].copy())
+        count = number
+    return _collect(places, begins, parents[:count], np.concatenate([np.zeros((0, 3)), *rays]))
+
+
+@kernel
+def _join_batch(
+    row: Any, offsets: Any, keypoints: Any, drawn: Any, rays_i: Any, rays_j: Any, directions: Any,
+    pixel_angles: Any, threshold_px: float, places: Any, parents: Any, count: int, rays: Any,
+) -> int:  # fmt: skip
+    """Join the observations of matches that agree with their pair's direction; return how many there are.
+
+    `places` has the number of the observation of each keypoint of all images, -1 for none; new ones are
+    numbered from `count` on, and their rays written to `rays`.
+    """
+    first = count
+    for p in range(len(row)):
+        if row[p] < 0:
+            continue
+        for m in range(offsets[p], offsets[p + 1]):
+            if not drawn[m]:
+                continue
+            if not sampson_px(rays_i[m], rays_j[m], directions[row[p]], pixel_angles[p]) <= threshold_px:
+                continue
+            for side in range(2):
+                if places[keypoints[m, side]] < 0:
+                    places[keypoints[m, side]] = count
+                    for c in range(3):
+                        rays[count - first, c] = rays_i[m, c] if side == 0 else rays_j[m, c]
+                    count += 1
+            unite(parents, places[keypoints[m, 0]], places[keypoints[m, 1]])
+    return count
+
+
+def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
+    """Return the matches one of whose keypoints belongs to a random share of all, always the same one."""
+    if share >= 1.0:
+        return np.ones(len(batch.keypoints), dtype=np.bool_)
+    image = np.repeat(batch.pairs, counts, axis=0).astype(np.uint64)
+    mixed = (image << np.uint64(32)) + batch.keypoints.astype(np.uint64)
+    for shift in (30, 27, 31):  # the finalizer of splitmix64
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * _MIX
+    drawn = (mixed >> np.uint64(11)).astype(np.float64) < share / 2.0 * 2.0**53
+    return np.asarray(drawn.any(axis=1))
+
+
+def _collect(places: Int32Array, begins: IntArray, parents: IntArray, rays: FloatArray) -> Tracks:
+    """Return the tracks of joined observations, see `_join_batch`; (k,) `parents`, (k, 3) `rays`."""
+    keypoints = np.flatnonzero(places >= 0)
+    seen = places[keypoints].astype(np.int64)
+    camera = np.searchsorted(begins, keypoints, side="right") - 1
+    track = number_trees(parents, seen)[seen]
+    order = np.argsort(track, kind="stable")  # of a track by ascending camera, as keypoints are
+    track, camera, seen = track[order], camera[order], seen[order]
+    lengths = np.bincount(track)
+    repeated = np.zeros(len(lengths), dtype=np.bool_)
+    again = (track[1:] == track[:-1]) & (camera[1:] == camera[:-1])
+    repeated[track[1:][again]] = True
+    good = ~repeated & (lengths >= _MIN_VIEWS)
+    kept = good[track]
+    return Tracks(
+        offsets=np.append(0, np.cumsum(lengths[good])).astype(np.int64),
+        cameras=camera[kept].astype(np.int64),
+        rays=rays[seen[kept]],
+    )
+
+
+def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None) -> IntArray:
+    """Return tracks such that every camera sees at least `per_camera` of them, if it can; ascending.
+
+    Greedy: the best tracks first, each if some camera of it still needs one. Best are those that many cameras
+    see from far apart. None: 20 per camera, and up to 60 where the cameras are few.
+    """
+    if per_camera is None:
+        per_camera = max(_PER_CAMERA, min(_PER_CAMERA_OF_FEW, _IN_ALL // num_cameras))
+    order = np.argsort(-_worth(tracks), kind="stable")
+    taken = np.zeros(len(order), dtype=np.bool_)
+    _cover(order, tracks.offsets, tracks.cameras, per_camera, np.zeros(num_cameras, dtype=np.int64), taken)
+    return np.sort(order[taken])
+
+
+def _worth(tracks: Tracks) -> FloatArray:
+    """Return how much a track says: the root of its length times the widest angle of its rays, limited."""
+    first = tracks.rays[np.repeat(tracks.offsets[:-1], tracks.lengths())]
+    apart = np.linalg.norm(tracks.rays - first, axis=1)
+    widest = np.maximum.reduceat(apart, tracks.offsets[:-1])
+    return np.asarray(np.sqrt(tracks.lengths()) * np.minimum(widest, _WIDEST_RAD))
+
+
+@kernel
+def _cover(
+    order: IntArray, offsets: IntArray, cameras: IntArray, per_camera: int, seen: IntArray, taken: BoolArray
+) -> None:
+    """Write, in the given order, which tracks are taken; both outputs come as zeros.
+
+    `seen` counts how many of these each camera sees.
+    """
+    for k in range(len(order)):
+        first, last = offsets[order[k]], offsets[order[k] + 1]
+        for row in range(first, last):
+            if seen[cameras[row]] < per_camera:
+                taken[k] = True
+        if taken[k]:
+            for row in range(first, last):
+                seen[cameras[row]] += 1
+
+
+def join_points(
+    graph: ViewGraph, covariance: FloatArray, tracks: Tracks, pixel_angles: FloatArray, noise_px: float = 1.0
+) -> MeasuredGraph:
+    """Return the view graph with the tracks as further nodes.
+
+    Args:
+        graph: n cameras and their directions.
+        covariance: (m, 2, 2) of these.
+        tracks: what to add.
+        pixel_angles: (n,) angle of one pixel of each camera in radians.
+        noise_px: standard deviation of an observation, per axis.
+    """
+    n = graph.num_nodes
+    points = n + np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
+    own = (noise_px * pixel_angles[tracks.cameras]) ** 2
+    names = None if graph.names is None else [*graph.names, *(f"point {k}" for k in range(tracks.num_tracks))]
+    joint = ViewGraph(
+        n + tracks.num_tracks,
+        np.concatenate([graph.edges, np.stack([tracks.cameras, points], axis=1)]),
+        np.concatenate([graph.directions, -tracks.rays]),
+        np.concatenate([graph.weights, np.ones(len(points))]),
+        names,
+    )
+    known = np.concatenate([covariance, own[:, None, None] * np.eye(2)])
+    return MeasuredGraph(joint, covariance=known, num_points=tracks.num_tracks)

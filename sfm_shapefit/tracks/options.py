@@ -1,0 +1,52 @@
+"""What a 3D point must satisfy. Pure data, and cheap to import."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sfm_shapefit.base.settings import Settings, explained, option
+
+Adjuster = Literal["own", "ceres"]
+"""What adjusts bundles: our own, or pycolmap's Ceres."""
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class StructureOptions(Settings):
+    """What a 3D point must satisfy to stand in the output."""
+
+    max_reprojection_error_px: float = option(
+        4.0, "Observations with a larger reprojection error are removed, and points that lose all but one."
+    )
+    min_triangulation_angle_deg: float = option(
+        1.5, "Points that no two cameras see under at least this angle are removed; their depth means little."
+    )
+    min_track_length: int = option(2, "Points seen in fewer images than this are removed; 2 or more.")
+    min_points_per_image: int = option(
+        0,
+        "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
+        "keeps all.",
+    )
+    ignore_two_view_tracks: bool = option(
+        True,
+        "Make no points of matches that only two images share: a wrong one is not noticed, since one "
+        "epipolar constraint is all that checks it. Our own adjustment moves cameras by them all the same, "
+        "through a robust loss. Concerns matches of a database, not a model's own tracks, "
+        "and only models of three images or more: two have no other matches.",
+    )
+
+    def fewest_views(self, num_images: int) -> int:
+        """Return how many images must share a match of a database before it may make a point, 2 or 3."""
+        return 3 if self.ignore_two_view_tracks and num_images >= 3 else 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.max_reprojection_error_px < float("inf"):
+            raise ValueError(
+                f"max_reprojection_error_px must be positive and finite, got {self.max_reprojection_error_px}"
+            )
+        if not 0.0 <= self.min_triangulation_angle_deg < 90.0:
+            raise ValueError(
+                f"min_triangulation_angle_deg must lie in [0, 90), got {self.min_triangulation_angle_deg}"
+            )
+        self.check_range("min_track_length", 2)
+        self.check_range("min_points_per_image", 0)

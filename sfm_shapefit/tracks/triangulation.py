@@ -1,0 +1,383 @@
+"""Points of tracks at known poses, robust against wrong observations in them.
+
+For each track: two observations at a time give a point (the middle of the shortest line between their rays),
+of which the one with the least truncated squares over all observations wins; up to 15 pairs are tried, all of
+six observations. Gauss-Newton on the squared errors of those within the limit then finds the point. What
+stays within the limit, in front of its camera and the best of its image, is the point's; the point counts if
+these are enough and two of them see it under the least angle. Where a track may be of several points, what is
+left over is tried again.
+
+An error is that of an ideal camera of the same focal length, f |(x/z, y/z) - (u, v)|, in pixels.
+
+Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.2 (robust
+triangulation of tracks with wrong observations, and its recursion); Beardsley, Zisserman and Murray (1997)
+for the middle point.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+
+# Observations between which Python can be interrupted: about 0.1 s.
+_SLICE = 100_000
+# Pairs of observations that are tried for each point, and Gauss-Newton steps.
+_PAIRS = 15
+_STEPS = 5
+# Of the distance of a point that a step may go before the steps end.
+_STILL = 1e-9
+# Keypoints of a track for each of its images, from which it is a chain of several points.
+_CHAIN = 1.5
+# Of so many rays one makes the widest angle with another, nearly always.
+_WIDE_AMONG = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointLimits:
+    """What a point must satisfy."""
+
+    max_error_px: float
+    """Of an observation."""
+    min_angle_deg: float
+    """Between the rays of two of its observations."""
+    min_length: int
+    """Its fewest observations."""
+    most_points: int = 50
+    """So many points a track may be of: wrong matches join true tracks to long chains."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TriangulatedPoints:
+    """Points and which observations are of them; by ascending track."""
+
+    points: FloatArray
+    """(k, 3)"""
+    tracks: IntArray
+    """(k,) the track of each."""
+    points_seen: IntArray
+    """(m,) the point of each observation of the tracks, -1 for those that are of none."""
+
+    def of_length(self, least: int) -> "TriangulatedPoints":
+        """Return the points with so many observations; those of the others are of none."""
+        seen = self.points_seen
+        kept = np.bincount(seen[seen >= 0], minlength=len(self.points)) >= least
+        place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)
+        return TriangulatedPoints(points=self.points[kept], tracks=self.tracks[kept], points_seen=place[seen])
+
+
+def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> TriangulatedPoints:
+    """Return the points of tracks; the same bits whatever else is triangulated with them.
+
+    Args:
+        tracks: observations; those without a ray ahead are of no point.
+        poses: of the cameras that the tracks' observations index.
+        limits: what a point must satisfy.
+    """
+    lengths = tracks.lengths()
+    seen = np.full(len(tracks.cameras), -1)
+    points = np.empty((int((lengths // max(limits.min_length, 2)).sum()), 3))
+    track_of = np.empty(len(points), dtype=np.int64)
+    figures = np.array(
+        [limits.max_error_px**2, math.cos(math.radians(limits.min_angle_deg)), limits.min_length]
+    )
+    most = limits.most_points if tracks.may_split else 1
+    given = (
+        tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
+        poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
+    )  # fmt: skip
+    cuts = np.searchsorted(tracks.offsets, np.arange(0, len(seen), _SLICE)[1:]).tolist()
+    count = 0
+    for begin, end in zip([0, *cuts], [*cuts, tracks.num_tracks], strict=True):
+        count = _triangulate(begin, end, count, given, points, track_of, seen)
+    return TriangulatedPoints(points=points[:count], tracks=track_of[:count], points_seen=seen)
+
+
+def joining_limits_px(threshold_px: float, widest_px: float) -> Iterator[float]:
+    """Yield the errors that matches may have to join tracks: half the threshold, and twice as much each time.
+
+    What agrees best is joined first, and what no point was found for is joined again.
+    """
+    limit_px = 0.5 * threshold_px
+    while limit_px <= widest_px:
+        yield limit_px
+        limit_px *= 2.0
+
+
+def triangulate_matches(
+    matched: MatchedKeypoints, poses: CameraPoses, limits: PointLimits, threshold_px: float
+) -> tuple[ObservedTracks, TriangulatedPoints]:
+    """Return the points of matches, and a track for each of what it is seen by.
+
+    Where a twentieth of the matches is wrong, those within 4 px join half of all observations of a ring of
+    300 images to chains of many points, and those within 16 px all but a twentieth. The keypoints of chains,
+    and only these, are joined anew: what agrees best first.
+
+    Args:
+        matched: keypoints and their matches.
+        poses: of their cameras.
+        limits: what a point must satisfy.
+        threshold_px: the pixel threshold; the widest error of a match is `limits.max_error_px`.
+    """
+    joined = matched.join(poses, limits.max_error_px)
+    is_chain = np.diff(joined.offsets) > _CHAIN * _count_images(joined, poses.images[matched.cameras])
+    is_left: BoolArray = np.zeros(len(matched.cameras), dtype=np.bool_)
+    is_left[joined.subset(np.flatnonzero(is_chain)).rows] = True
+    parts = [_triangulate_joined(matched, joined.subset(np.flatnonzero(~is_chain)), poses, limits)]
+    for limit_px in joining_limits_px(threshold_px, limits.max_error_px) if is_chain.any() else ():
+        rows, left = np.flatnonzero(is_left), matched.among(is_left)
+        points, seen = _triangulate_joined(left, left.join(poses, limit_px), poses, limits)
+        parts.append((points, JoinedRows(seen.offsets, rows[seen.rows])))
+        is_left[rows[seen.rows]] = False
+    lengths = np.concatenate([np.diff(seen.offsets) for _, seen in parts])
+    tracks = JoinedRows(np.append(0, np.cumsum(lengths)), np.concatenate([seen.rows for _, seen in parts]))
+    every = np.arange(len(lengths))
+    return matched.observed(tracks), TriangulatedPoints(
+        points=np.concatenate([points for points, _ in parts]),
+        tracks=every,
+        points_seen=np.repeat(every, lengths),
+    )
+
+
+def _count_images(joined: JoinedRows, images: IntArray) -> IntArray:
+    """Return how many images the keypoints of each track are of, whose own images (K,) ascend."""
+    own, is_new = images[joined.rows], np.ones(len(joined.rows), dtype=np.int64)
+    is_new[1:] = own[1:] != own[:-1]
+    is_new[joined.offsets[:-1]] = 1
+    return np.asarray(np.add.reduceat(is_new, joined.offsets[:-1])) if len(own) else np.zeros(0, np.int64)
+
+
+def _triangulate_joined(
+    matched: MatchedKeypoints, joined: JoinedRows, poses: CameraPoses, limits: PointLimits
+) -> tuple[FloatArray, JoinedRows]:
+    """Return the points (k, 3) of joined keypoints, and the rows that see each."""
+    found = triangulate_tracks(matched.observed(joined), poses, limits)
+    return found.points, joined.of_points(found.points_seen)
+
+
+@inner_kernel
+def _step(
+    rows: Any, k: int, cameras: Any, plane: Any, rotations: Any, centers: Any, weights: Any, point: Any
+) -> float:
+    """Move a point by one Gauss-Newton step of weighted squares; return how far, of its distance, or -1."""
+    h00 = h01 = h02 = h11 = h12 = h22 = b0 = b1 = b2 = 0.0
+    far = 0.0
+    for q in range(k):
+        if weights[q] == 0.0:
+            continue
+        row = rows[q]
+        rotation, center = rotations[cameras[row]], centers[cameras[row]]
+        x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        far = max(far, depth)
+        for axis in range(2):
+            value = (rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2] * z) / depth
+            residual = value - plane[row, axis]
+            g0 = (rotation[axis, 0] - value * rotation[2, 0]) / depth
+            g1 = (rotation[axis, 1] - value * rotation[2, 1]) / depth
+            g2 = (rotation[axis, 2] - value * rotation[2, 2]) / depth
+            w = weights[q]
+            h00 += w * g0 * g0
+            h01 += w * g0 * g1
+            h02 += w * g0 * g2
+            h11 += w * g1 * g1
+            h12 += w * g1 * g2
+            h22 += w * g2 * g2
+            b0 -= w * g0 * residual
+            b1 -= w * g1 * residual
+            b2 -= w * g2 * residual
+    c00, c01, c02 = h11 * h22 - h12 * h12, h02 * h12 - h01 * h22, h01 * h12 - h02 * h11
+    determinant = h00 * c00 + h01 * c01 + h02 * c02
+    if not determinant > 0.0:
+        return -1.0
+    c11, c12, c22 = h00 * h22 - h02 * h02, h01 * h02 - h00 * h12, h00 * h11 - h01 * h01
+    s0 = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
+    s1 = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
+    s2 = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
+    point[0] += s0
+    point[1] += s1
+    point[2] += s2
+    return float(np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)) / far
+
+
+@inner_kernel
+def _gather(
+    first: int, last: int, cameras: Any, plane: Any, rotations: Any, seen: Any, rows: Any, rays: Any
+) -> int:
+    """Write the observations of no point yet and their rays in axes of the world; return how many."""
+    k = 0
+    for row in range(first, last):
+        u, v = plane[row, 0], plane[row, 1]
+        if seen[row] != -1 or np.isnan(u + v):
+            continue
+        rotation, size = rotations[cameras[row]], np.sqrt(1.0 + u * u + v * v)
+        for a in range(3):
+            rays[k, a] = (u * rotation[0, a] + v * rotation[1, a] + rotation[2, a]) / size
+        rows[k] = row
+        k += 1
+    return k
+
+
+@inner_kernel
+def _pair(s: int, k: int) -> Any:
+    """Return the s-th pair of k observations that is tried."""
+    if k * (k - 1) > 2 * _PAIRS:
+        i = s * k // _PAIRS
+        return i, (i + 1 + (7 * s + 3) % 16 * (k - 1) // 16) % k
+    i = 0
+    while s >= k - 1 - i:
+        s -= k - 1 - i
+        i += 1
+    return i, i + 1 + s
+
+
+@inner_kernel
+def _middle(p: Any, along_p: Any, q: Any, along_q: Any, cosine: float, point: Any) -> bool:
+    """Write the middle of the shortest line between two rays; return whether their angle is enough."""
+    d = along_p[0] * along_q[0] + along_p[1] * along_q[1] + along_p[2] * along_q[2]
+    if d > cosine:
+        return False
+    by_p = by_q = 0.0
+    for a in range(3):
+        by_p += along_p[a] * (q[a] - p[a])
+        by_q += along_q[a] * (q[a] - p[a])
+    sine = max(1.0 - d * d, 1e-12)
+    far_p, far_q = (by_p - d * by_q) / sine, (d * by_p - by_q) / sine
+    for a in range(3):
+        point[a] = 0.5 * (p[a] + far_p * along_p[a] + q[a] + far_q * along_q[a])
+    return True
+
+
+@inner_kernel
+def _weigh(
+    rows: Any, k: int, cameras: Any, plane: Any, rotations: Any, centers: Any, focals: Any, limit: float,
+    point: Any, errors: Any, weights: Any,
+) -> int:  # fmt: skip
+    """Write squared errors in pixels, and weights: focal^2 within the limit, else 0; return how many are."""
+    inside = 0
+    for o in range(k):
+        row = rows[o]
+        at = cameras[row]
+        scale = focals[at] ** 2
+        x, y, z = point[0] - centers[at, 0], point[1] - centers[at, 1], point[2] - centers[at, 2]
+        depth = rotations[at, 2, 0] * x + rotations[at, 2, 1] * y + rotations[at, 2, 2] * z
+        errors[o] = np.inf
+        if depth > 0.0:
+            du = rotations[at, 0, 0] * x + rotations[at, 0, 1] * y + rotations[at, 0, 2] * z
+            dv = rotations[at, 1, 0] * x + rotations[at, 1, 1] * y + rotations[at, 1, 2] * z
+            du, dv = du / depth - plane[row, 0], dv / depth - plane[row, 1]
+            errors[o] = scale * (du * du + dv * dv)
+        weights[o] = 0.0
+        if errors[o] <= limit:
+            weights[o] = scale
+            inside += 1
+    return inside
+
+
+@inner_kernel
+def _look_back(
+    rows: Any, k: int, cameras: Any, centers: Any, images: Any, errors: Any, weights: Any, point: Any,
+    rays: Any,
+) -> int:  # fmt: skip
+    """Keep the best observation of each image, others get weight -1; write the rays back, return how many."""
+    length = 0
+    for o in range(k):
+        if weights[o] == 0.0:
+            continue
+        image = images[cameras[rows[o]]]
+        other = o + 1
+        while other < k and images[cameras[rows[other]]] == image and weights[o] > 0.0:
+            if weights[other] > 0.0:
+                weights[o if errors[other] < errors[o] else other] = -1.0
+            other += 1
+        if weights[o] > 0.0:
+            center = centers[cameras[rows[o]]]
+            x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
+            size = np.sqrt(x * x + y * y + z * z)
+            rays[length, 0], rays[length, 1], rays[length, 2] = x / size, y / size, z / size
+            length += 1
+    return length
+
+
+@inner_kernel
+def _is_wide(rays: Any, length: int, cosine: float) -> bool:
+    """Return whether two of the rays make the least angle; of very many, one is among the first."""
+    for o in range(length):
+        for other in range(min(o, _WIDE_AMONG)):
+            d = rays[o, 0] * rays[other, 0] + rays[o, 1] * rays[other, 1] + rays[o, 2] * rays[other, 2]
+            if d <= cosine:
+                return True
+    return False
+
+
+@inner_kernel
+def _search(
+    rows: Any, rays: Any, k: int, cameras: Any, plane: Any, rotations: Any, centers: Any, focals: Any,
+    limit: float, cosine: float, point: Any, best: Any, errors: Any, weights: Any,
+) -> bool:  # fmt: skip
+    """Write the point of two observations with the least truncated squares; return whether there is one."""
+    least = np.inf
+    for s in range(min(k * (k - 1) // 2, _PAIRS)):
+        i, j = _pair(s, k)
+        p, q = centers[cameras[rows[i]]], centers[cameras[rows[j]]]
+        if not _middle(p, rays[i], q, rays[j], cosine, point):
+            continue
+        _weigh(rows, k, cameras, plane, rotations, centers, focals, limit, point, errors, weights)
+        cost = 0.0
+        for o in range(k):
+            cost += min(errors[o], limit)
+        if cost < least:
+            least = cost
+            best[0], best[1], best[2] = point[0], point[1], point[2]
+    return bool(least < np.inf)
+
+
+@kernel
+def _triangulate(begin: int, end: int, count: int, given: Any, points: Any, track_of: Any, seen: Any) -> int:
+    """Write the points of the tracks begin..end-1 from number `count` on; return their number then."""
+    offsets, cameras, plane, rotations, centers, focals, images, figures, most, longest = given
+    limit, cosine, fewest = figures[0], figures[1], figures[2]
+    rows, rays = np.empty(longest, np.int64), np.empty((longest, 3))
+    weights, errors = np.empty(longest), np.empty(longest)
+    best, point = np.empty(3), np.empty(3)
+    for t in range(begin, end):
+        for _ in range(most):
+            k = _gather(offsets[t], offsets[t + 1], cameras, plane, rotations, seen, rows, rays)
+            if k < fewest:
+                break
+            found = _search(
+                rows, rays, k, cameras, plane, rotations, centers, focals, limit, cosine, point, best, errors,
+                weights,
+            )  # fmt: skip
+            moved, inside = 1.0, 0
+            for step in range(_STEPS + 1 if found else 0):
+                inside = _weigh(
+                    rows, k, cameras, plane, rotations, centers, focals, limit, best, errors, weights
+                )  # fmt: skip
+                if inside < fewest or step == _STEPS or moved < _STILL:
+                    break
+                moved = _step(rows, k, cameras, plane, rotations, centers, weights, best)
+                if moved < 0.0:
+                    inside = 0
+                    break
+            if inside < fewest:
+                break
+            length = _look_back(rows, k, cameras, centers, images, errors, weights, best, rays)
+            if length < fewest or not _is_wide(rays, length, cosine):
+                break
+            for o in range(k):
+                if weights[o] != 0.0:
+                    seen[rows[o]] = count if weights[o] > 0.0 else -2
+            points[count, 0], points[count, 1], points[count, 2] = best[0], best[1], best[2]
+            track_of[count] = t
+            count += 1
+    # An observation that another of its image surpasses is of no point either.
+    for row in range(offsets[begin], offsets[end]):
+        if seen[row] == -2:
+            seen[row] = -1
+    return count

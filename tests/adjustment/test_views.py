@@ -1,0 +1,329 @@
+"""A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import InputError
+from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
+from sfm_shapefit.adjustment import run as adjustment_run
+from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly, bundle_adjust
+from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
+from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks, read_bundle
+from sfm_shapefit.adjustment.views import lens_of, read_frames, with_points, with_poses
+from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.tracks.options import StructureOptions
+from tests.scenes import BUNDLED
+
+DISTORTIONS = {
+    "SIMPLE_PINHOLE": [],
+    "PINHOLE": [],
+    "SIMPLE_RADIAL": [-0.05],
+    "RADIAL": [-0.05, 0.01],
+    "OPENCV": [-0.05, 0.01, 1e-3, -1e-3],
+    "FULL_OPENCV": [-0.05, 0.01, 1e-3, -1e-3, 0.0, 0.01, 0.0, 0.0],
+    "FOV": [0.4],
+    "SIMPLE_RADIAL_FISHEYE": [-0.02],
+    "RADIAL_FISHEYE": [-0.02, 0.005],
+    "OPENCV_FISHEYE": [-0.02, 0.005, 1e-3, 0.0],
+    "THIN_PRISM_FISHEYE": [-0.02, 0.005, 1e-4, 1e-4, 0.0, 0.0, 1e-4, 1e-4],
+}
+EXACT = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+
+
+def camera_of(model):
+    """A camera of 640 x 480 with focal lengths of 400 and distortion."""
+    camera = pycolmap.Camera.create_from_model_id(1, getattr(pycolmap.CameraModelId, model), 400.0, 640, 480)
+    if DISTORTIONS[model]:
+        camera.params = np.concatenate(
+            [camera.params[: len(camera.params) - len(DISTORTIONS[model])], DISTORTIONS[model]]
+        )
+    return camera
+
+
+def scene(model="PINHOLE", *, rigs=False, noise_px=0.3, seed=0):
+    """A made reconstruction whose images see all points through a lens, with noise on their pixels."""
+    pycolmap.set_random_seed(seed)
+    made = pycolmap.SyntheticDatasetOptions()
+    made.num_rigs, made.num_frames_per_rig, made.num_points3D = (2, 4, 80) if rigs else (1, 7, 80)
+    made.num_cameras_per_rig = 2 if rigs else 1
+    made.sensor_from_rig_translation_stddev, made.sensor_from_rig_rotation_stddev = 0.2, 5.0
+    camera = camera_of(model)
+    made.camera_width, made.camera_height = camera.width, camera.height
+    made.camera_model_id, made.camera_params = camera.model, camera.params.tolist()
+    made.camera_has_prior_focal_length = True
+    made.num_points2D_without_point3D = 5
+    found = pycolmap.synthesize_dataset(made)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = noise_px
+    pycolmap.synthesize_noise(noise, found)
+    found.update_point_3d_errors()
+    return found
+
+
+def centers_of(model):
+    return np.array([model.image(i).projection_center() for i in sorted(model.reg_image_ids())])
+
+
+def disturbed(model, size=0.02, seed=1):
+    """A copy whose frames and points are moved, and the frames turned."""
+    rng, copy = np.random.default_rng(seed), pycolmap.Reconstruction(model)
+    for frame_id in sorted(copy.reg_frame_ids()):
+        pose = copy.frame(frame_id).rig_from_world
+        turn = pycolmap.Rotation3d(0.1 * size * rng.standard_normal(3))
+        copy.frame(frame_id).rig_from_world = pycolmap.Rigid3d(
+            turn * pose.rotation, pose.translation + size * rng.standard_normal(3)
+        )
+    for point_id in sorted(copy.point3D_ids()):
+        copy.point3D(point_id).xyz = copy.point3D(point_id).xyz + size * rng.standard_normal(3)
+    return copy
+
+
+@pytest.mark.parametrize("model", DISTORTIONS)
+@pytest.mark.parametrize("rigs", [False, True])
+def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
+    given = scene(model, rigs=rigs)
+    ids, problem = read_bundle(given, read_frames(given))
+    assert ids.tolist() == sorted(given.point3D_ids())
+    assert problem.num_observations == given.compute_num_observations()
+    errors = reprojection_errors_px(problem)
+    sums = np.bincount(problem.points_seen, errors)
+    ours = sums / np.bincount(problem.points_seen)
+    theirs = np.array([given.point3D(i).error for i in ids.tolist()])
+    if model in EXACT:
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    else:  # an ideal camera's error is up to 1 / cos(28 deg)^2 times the fisheye's; distortion does its part
+        assert (ours / theirs).min() > 0.7
+        assert (ours / theirs).max() < 1.6
+
+
+@pytest.mark.parametrize("model", DISTORTIONS)
+def test_the_round_trip_changes_no_bit_and_moves_are_written_back(model):
+    given = scene(model)
+    frames = read_frames(given)
+    ids, problem = read_bundle(given, frames)
+    same = with_points(with_poses(given, frames, frames), ids, problem.points)
+    for image_id in given.reg_image_ids():
+        ours, theirs = (m.image(image_id).cam_from_world() for m in (same, given))
+        np.testing.assert_array_equal(ours.matrix(), theirs.matrix())
+        assert same.image(image_id).name == given.image(image_id).name
+    for point_id, point in given.points3D.items():
+        np.testing.assert_array_equal(same.point3D(point_id).xyz, point.xyz)
+        assert same.point3D(point_id).track.length() == point.track.length()
+    moved = with_poses(given, frames, replace(frames, centers=frames.centers + 1.0))
+    np.testing.assert_allclose(centers_of(moved), centers_of(given) + 1.0, atol=1e-12)
+    for image_id in given.reg_image_ids():  # rotations that did not change keep their bits
+        ours, theirs = (m.image(image_id).cam_from_world().rotation.quat for m in (moved, given))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("model", DISTORTIONS)
+@pytest.mark.parametrize("rigs", [False, True])
+def test_a_disturbed_model_of_any_lens_is_adjusted_back(model, rigs):
+    truth = scene(model, rigs=rigs, noise_px=0.0)
+    start = disturbed(truth)
+    given = centers_of(start)
+    found = sfm_shapefit.bundle_adjust(start, cost_tolerance=0.0)
+    assert found.adjusted.converged
+    np.testing.assert_array_equal(centers_of(start), given)
+    centers, true = centers_of(found.reconstruction), centers_of(truth)
+    error = np.abs(fit_similarity(centers, true).apply(centers) - true).max()
+    assert (
+        error < 1e-6 < np.abs(fit_similarity(centers_of(start), true).apply(centers_of(start)) - true).max()
+    )
+    assert found.reconstruction.compute_mean_reprojection_error() < 1e-5
+    for i, camera in truth.cameras.items():
+        assert bytes(found.reconstruction.camera(i).params) == bytes(camera.params)
+
+
+def test_the_optimum_is_that_of_pycolmap_through_our_lenses():
+    start = disturbed(scene("OPENCV"))
+    found = sfm_shapefit.bundle_adjust(start, cost_tolerance=0.0, loss_scale_px=1.0)
+    from tests.adjustment.made import adjust_by_pycolmap
+
+    theirs = pycolmap.Reconstruction(start)
+    adjust_by_pycolmap(theirs, 1.0)
+    ours, them = centers_of(found.reconstruction), centers_of(theirs)
+    np.testing.assert_allclose(fit_similarity(them, ours).apply(them), ours, atol=1e-6 * np.ptp(ours))
+
+
+@pytest.mark.parametrize("rigs", [False, True])
+def test_fixed_frames_keep_their_bits_and_held_rotations_theirs(rigs):
+    start = disturbed(scene(rigs=rigs))
+    fixed = sorted(start.reg_frame_ids())[:2]
+    found = sfm_shapefit.bundle_adjust(start, fixed_frames=fixed).reconstruction
+    held = sfm_shapefit.bundle_adjust(start, hold_rotations=True).reconstruction
+    for frame_id in sorted(start.reg_frame_ids()):
+        poses = [model.frame(frame_id).rig_from_world for model in (start, found, held)]
+        assert (poses[0].matrix() == poses[1].matrix()).all() == (frame_id in fixed)
+        np.testing.assert_array_equal(poses[0].rotation.quat, poses[2].rotation.quat)
+        assert (poses[0].translation != poses[2].translation).any()
+
+
+def test_rotations_with_a_standard_deviation_lie_between_held_and_free_ones():
+    start = disturbed(scene(noise_px=1.0))
+
+    def turned(**options):
+        after = sfm_shapefit.bundle_adjust(start, **options).reconstruction
+        images = sorted(start.reg_image_ids())
+        pairs = [[m.image(i).cam_from_world().rotation for m in (start, after)] for i in images]
+        return sum((a * b.inverse()).angle() for a, b in pairs)
+
+    assert turned(hold_rotations=True) == pytest.approx(0.0, abs=1e-7)
+    assert 0.0 < turned(rotation_sigma_deg=1e-3) < 0.2 * turned(rotation_sigma_deg=0.3)
+    assert turned(rotation_sigma_deg=0.3) < turned()
+
+
+def test_free_lenses_are_written_back_and_covariances_given():
+    truth = scene("SIMPLE_RADIAL", noise_px=0.0)
+    start = disturbed(truth)
+    start.camera(1).params = start.camera(1).params * [1.02, 1.0, 1.0, 0.5]
+    options = {"free_focal_lengths": True, "free_distortion": True, "cost_tolerance": 0.0}
+    found = sfm_shapefit.bundle_adjust(start, **options, covariances=True)
+    np.testing.assert_allclose(found.reconstruction.camera(1).params, truth.camera(1).params, rtol=1e-6)
+    assert found.covariances.centers.shape == (7, 3, 3)
+    assert found.frame_ids == tuple(sorted(start.reg_frame_ids()))
+    assert "7 frames adjusted" in repr(found)
+    assert found.summary()["converged"]
+
+
+def test_a_model_without_points_is_refused():
+    empty = scene()
+    for point_id in list(empty.point3D_ids()):
+        empty.delete_point3D(point_id)
+    with pytest.raises(InputError, match="nothing to adjust"):
+        sfm_shapefit.bundle_adjust(empty)
+
+
+def matches_of(model, images_of=None):
+    """The matches of a model's own tracks, or of those of `images_of` in these images only."""
+    images = sorted(model.reg_image_ids())
+    seen = [
+        {p.point3D_id: k for k, p in enumerate(model.image(i).points2D) if p.has_point3D()} for i in images
+    ]
+    for image, own in zip(images, seen, strict=True):
+        for point, among in (images_of or {}).items():
+            if image not in among:
+                own.pop(point, None)
+    pairs, parts = [], []
+    for a, b in itertools.combinations(range(len(images)), 2):
+        common = sorted(seen[a].keys() & seen[b].keys())
+        if common:
+            pairs.append([a, b])
+            parts.append(np.array([[seen[a][p], seen[b][p]] for p in common]))
+    offsets = np.append(0, np.cumsum([len(part) for part in parts]))
+    batch = KeypointMatches(pairs=np.array(pairs), offsets=offsets, keypoints=np.concatenate(parts))
+    return collect_matches(model, np.array(images), [batch], len(batch.keypoints))
+
+
+def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
+    model = scene()
+    frames = read_frames(model)
+    own = collect_tracks(frames, model, model)
+    matched = matches_of(model)
+    joined = matched.observed(matched.join(frames.poses(), 4.0))
+
+    def tracks(found):
+        ends = zip(found.offsets[:-1], found.offsets[1:], strict=True)
+        return {tuple(zip(found.cameras[a:b], found.keypoints[a:b], strict=True)) for a, b in ends}
+
+    assert tracks(joined) == {track for track in tracks(own) if len(track) > 1}
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
+    truth = pycolmap.Reconstruction(BUNDLED / "courtyard" / "truth")
+    fixed = sorted(truth.reg_frame_ids())[:1]
+    start = pycolmap.Reconstruction(truth)
+    coarse = disturbed(truth, size=0.02)
+    for frame_id in sorted(truth.reg_frame_ids()):
+        if frame_id not in fixed:
+            start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
+    tracks = truth if source == "tracks" else matches_of(truth)
+    found = adjust_thinly(start, lambda: tracks, fixed_frames=fixed).reconstruction
+    assert found.num_points3D() == 0
+    true, before, after = centers_of(truth), centers_of(start), centers_of(found)
+    errors = [np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean() for x in (before, after)]
+    assert errors[1] < 0.2 * errors[0]
+    poses = [m.frame(fixed[0]).rig_from_world.matrix() for m in (found, truth)]
+    np.testing.assert_array_equal(*poses)
+
+
+def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch):
+    dampings = []
+
+    def noting(problem, **options):
+        dampings.append(options["first_damping"])
+        return adjust(problem, **options)
+
+    monkeypatch.setattr(adjustment_run, "adjust", noting)
+    truth = scene()
+    adjust_thinly(disturbed(truth), lambda: matches_of(truth))
+    assert dampings == [1e-4, 1e-8]
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(source, monkeypatch):
+    truth = scene("RADIAL")
+    start = disturbed(truth)
+    start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
+    tracks = start if source == "tracks" else matches_of(truth)
+    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
+    found = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
+    # 0.3 px on 7 views of 80 points
+    assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
+    assert found.lenses.undetermined == ()
+    assert 0.0 < found.lenses.sigmas[1] < 0.01
+    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
+    assert held.lenses.undetermined == (1,)
+    assert 1 not in held.lenses.sigmas
+    given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
+    assert kept[:3] == given[:3]
+    assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
+    again = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=held.lenses.free))
+    assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
+    monkeypatch.setattr(free_lenses, "_MOST_DISTORTION", 0.0)
+    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
+    assert held.lenses.undetermined == (1,)
+    assert held.reconstruction.camera(1).params.tolist() == given
+
+
+def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monkeypatch):
+    truth = scene("PINHOLE")
+    start = disturbed(truth)
+    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
+    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    found = adjust_placement(
+        start, matches_of(truth), StructureOptions(), None, given=GivenPoses(lenses=free)
+    )
+    assert found.lenses.undetermined == (1,)
+    given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))
+    assert kept == given
+
+
+def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():
+    truth = scene(noise_px=0.5, seed=1)
+    images, points = sorted(truth.reg_image_ids()), sorted(truth.point3D_ids())
+    rng = np.random.default_rng(1)
+    pairs = {p: rng.choice(images, 2, replace=False).tolist() for p in points[6:]}
+    graph, start = matches_of(truth, pairs), disturbed(truth)
+    true = centers_of(truth)
+    errors = []
+    for least in (2, 3):
+        options = StructureOptions(min_track_length=least)
+        found = bundle_adjust(start, graph, options).reconstruction
+        assert 0 < found.num_points3D() <= 6
+        assert all(point.track.length() >= 3 for point in found.points3D.values())
+        x = centers_of(found)
+        errors.append(np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean())
+    # 7 images leave 11 residuals of each of 6 points, and 2 images one of each of 74: twice as much in all.
+    assert errors[0] < 0.8 * errors[1]
+    with_all = bundle_adjust(start, graph, StructureOptions(ignore_two_view_tracks=False)).reconstruction
+    assert with_all.num_points3D() > 40

@@ -1,0 +1,60 @@
+"""Work is shared out in order, a few tasks ahead of the answers, and what is not needed is cancelled."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
+import pytest
+
+from sfm_shapefit.base import executors
+from sfm_shapefit.base.executors import WorkerError, answers
+
+
+def square(number):
+    return number * number
+
+
+@pytest.mark.parametrize("workers", [0, 1, 3])
+def test_answers_come_with_their_tasks_in_order(workers):
+    if not workers:
+        assert list(answers(None, square, range(100))) == [(k, k * k) for k in range(100)]
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        assert list(answers(pool, square, range(100))) == [(k, k * k) for k in range(100)]
+
+
+def test_tasks_are_made_only_a_few_ahead_of_the_answers(monkeypatch):
+    monkeypatch.setattr(executors, "_TASKS_AT_ONCE", 4)
+    made = []
+    with ThreadPoolExecutor(2) as pool:
+        for task, _ in answers(pool, square, (made.append(k) or k for k in range(50))):
+            assert len(made) <= task + 4
+    assert made == list(range(50))
+
+
+def test_what_is_not_asked_for_any_more_is_cancelled():
+    begun, go_on = [], Event()
+
+    def wait(task):
+        begun.append(task)
+        go_on.wait(10.0)
+        return task
+
+    with ThreadPoolExecutor(1) as pool:
+        found = answers(pool, wait, range(20))
+        go_on.set()
+        assert next(found) == (0, 0)
+        go_on.clear()
+        found.close()
+        go_on.set()
+    assert len(begun) < 20
+
+
+def test_a_worker_that_fails_is_reported_in_one_sentence():
+    def fail(_task):
+        raise MemoryError("no room\nand more")
+
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(WorkerError, match=r"a worker failed \(no room\); check"),
+    ):
+        list(answers(pool, fail, [1]))

@@ -1,0 +1,264 @@
+"""Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
+
+import sys
+from weakref import WeakValueDictionary
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+import pytest
+from numba.core import config
+from numba.core.codegen import JITCodeLibrary
+from numba.core.environment import Environment
+
+from sfm_shapefit.base import kernel_cache
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.kernel_cache import KernelCache, hear_of_kernels, is_noted, note, on_miss, stamp_of
+from sfm_shapefit.base.kernel_code import LoadedLibrary
+from tests.program import run_python
+
+
+def double(x):
+    return 2 * x
+
+
+def allocate(n):
+    return np.empty(n).size
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def kept(folder):
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def compile_double():
+    """Call a new kernel, as another process would have it; return whether it had to be compiled."""
+    missed = []
+    with on_miss(lambda: missed.append("missed")):
+        assert kernel(double)(21) == 42
+    return missed == ["missed"]
+
+
+def test_a_kernel_is_compiled_once_and_found_again(folder):
+    heard = []
+    with hear_of_kernels(heard.append):
+        assert compile_double()
+        (file,) = kept(folder)
+        assert not compile_double()
+    assert kept(folder) == [file]
+    assert heard == ["test_kernel_cache.double"] * 2
+    with on_miss(lambda: pytest.fail("missed")):
+        assert kernel(double)(21) == 42
+    assert kernel(double)(1.5) == 3.0
+    assert len(kept(folder)) == 2
+
+
+def loaded_double():
+    """Return a kernel that was compiled and is now loaded, and its library."""
+    compile_double()
+    loaded = kernel(double)
+    assert loaded(21) == 42
+    (overload,) = loaded.overloads.values()
+    return loaded, overload.library
+
+
+def test_a_kernel_is_loaded_without_its_llvm_code_and_taken_into_another_with_it(folder):
+    loaded, library = loaded_double()
+    assert type(library) is LoadedLibrary
+    assert library._shared_module is None
+    assert numba.njit(lambda x: loaded(x) + 1)(21) == 43
+    assert library._shared_module is not None
+
+
+def test_a_kernel_is_loaded_without_the_modules_of_the_functions_that_it_calls(folder, monkeypatch):
+    kernel(allocate)(3)
+    monkeypatch.setattr(Environment, "_memo", WeakValueDictionary())  # as in another process
+    monkeypatch.delitem(sys.modules, "numba.np.arrayobj")
+    with on_miss(lambda: pytest.fail("missed")):
+        loaded = kernel(allocate)
+        assert loaded(3) == 3
+    with pytest.raises(ValueError, match="negative"):
+        loaded(-1)
+    assert "numba.np.arrayobj" not in sys.modules
+
+
+def test_where_numba_is_not_as_expected_it_loads_kernels_its_own_way(folder, monkeypatch):
+    def load(*_arguments):
+        raise AttributeError("another numba")
+
+    monkeypatch.setattr(LoadedLibrary, "load", load)
+    _, library = loaded_double()
+    assert type(library) is JITCodeLibrary
+
+
+@pytest.mark.parametrize("content", [b"", b"no pickle", b"cut"])
+def test_a_damaged_file_is_compiled_anew(folder, content):
+    compile_double()
+    (file,) = kept(folder)
+    whole = file.read_bytes()
+    file.write_bytes(content if content != b"cut" else whole[: len(whole) // 2])
+    assert compile_double()
+    assert not compile_double()
+    assert kept(folder) == [file]
+
+
+def test_another_source_leaves_nothing_of_the_earlier_one(folder, monkeypatch):
+    compile_double()
+    (file,) = kept(folder)
+    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
+    assert compile_double()
+    (now,) = kept(folder)
+    assert now != file
+
+
+def test_a_kernel_works_where_nothing_can_be_kept(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert compile_double()
+    assert compile_double()
+
+
+def test_a_kernel_without_a_source_works(folder):
+    scope = {}
+    exec("def triple(x): return 3 * x", scope)
+    assert kernel(scope["triple"])(14) == 42
+    assert kept(folder) == []
+
+
+def test_kernels_of_a_wheel_are_read_and_nothing_is_written(folder, tmp_path, monkeypatch):
+    compile_double()
+    (file,) = kept(folder)
+    shipped = tmp_path / "shipped" / "_kernels"
+    shipped.mkdir(parents=True)
+    file.rename(shipped / file.name)
+    own = kernel_cache.Path(__file__).resolve().parent
+    monkeypatch.setattr(kernel_cache, "PACKAGE", own)
+    monkeypatch.setattr(kernel_cache, "SHIPPED", shipped)
+    assert not compile_double()
+    assert kept(folder) == []
+
+
+def test_what_is_missed_once_is_looked_for_again(folder):
+    compile_double()
+    (file,) = kept(folder)
+    aside = file.with_suffix(".aside")
+    file.rename(aside)
+    with on_miss(lambda: aside.rename(file)):  # as another process, which compiles it meanwhile
+        assert kernel(double)(21) == 42
+    assert kept(folder) == [file]
+
+
+def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path)
+    (tmp_path / "room").mkdir()
+    files = {
+        "top.py": "from sfm_shapefit.room import pair\nfrom os import path\n",
+        "room/__init__.py": "from sfm_shapefit.room.pairs import Pair\n",
+        "room/pairs.py": "class Pair: ...\n",
+        "other.py": "",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+
+    def stamp():
+        stamp_of.cache_clear()
+        kernel_cache._read.cache_clear()
+        return stamp_of(tmp_path / "top.py")
+
+    first = stamp()
+    (tmp_path / "other.py").write_text("# it has no part in it")
+    assert stamp() == first
+    (tmp_path / "room" / "pairs.py").write_text("class Renamed: ...\n")
+    assert stamp() != first
+    stamp_of.cache_clear()
+    kernel_cache._read.cache_clear()
+
+
+def test_a_note_holds_for_its_sources_only(folder, monkeypatch):
+    own = kernel_cache.PACKAGE / "commands"
+    assert not is_noted("an example", own)
+    note("an example", own)
+    assert is_noted("an example", own)
+    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
+    assert not is_noted("an example", own)
+
+
+IMPORT = "import sfm_shapefit.base.jit; from numba.core import config; print(config.CPU_NAME)"
+COMPILE_BEFORE = "import numba; numba.njit(lambda x: x)(1)\n"
+
+
+@pytest.mark.parametrize(
+    ("program", "environment", "expected"),
+    [
+        (IMPORT, {}, kernel_cache._portable_target()),
+        (IMPORT, {"NUMBA_CPU_NAME": "host"}, "None"),
+        (IMPORT, {"NUMBA_CPU_NAME": "generic"}, "generic"),
+        (COMPILE_BEFORE + IMPORT, {}, "None"),
+    ],
+    ids=["as a rule", "host", "named", "after other code"],
+)
+def test_the_processor_is_the_portable_one_unless_something_else_is_asked_for(program, environment, expected):
+    done = run_python("-c", program, **environment)
+    assert done.stdout == f"{expected}\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("machine", "system", "missing", "expected"),
+    [
+        ("x86_64", "linux", "", "x86-64-v3"),
+        ("AMD64", "linux", "fma", "generic"),
+        ("arm64", "darwin", "", "apple-m1"),
+        ("aarch64", "linux", "", "generic"),
+    ],
+)
+def test_the_portable_target_is_the_least_of_its_kind(monkeypatch, machine, system, missing, expected):
+    features = {name: name != missing for name in kernel_cache._X86_64_V3}
+    monkeypatch.setattr(kernel_cache.platform, "machine", lambda: machine)
+    monkeypatch.setattr(kernel_cache.sys, "platform", system)
+    monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: features)
+    assert kernel_cache._portable_target() == expected
+
+
+START = """
+import hashlib
+from sfm_shapefit.solver.newton import steps
+from sfm_shapefit.solver.newton.irls_start import approach
+from sfm_shapefit.synthetic import random_graph_problem
+graph = random_graph_problem(60, 0.3, sigma=0.02, q=0.1, seed=1).view_graph
+problem, iterate, _, step = steps.allocate(graph)
+assert approach(problem, iterate, step)
+print(hashlib.sha256(iterate.t.tobytes() + iterate.y.tobytes()).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_two_processors_give_the_same_bits(tmp_path):
+    """The portable one and one that cannot fuse products with sums: kernels have all their options in common,
+    so that one with long sums stands for them."""
+    another = "generic" if kernel_cache._portable_target() != "generic" else "host"
+    portable = run_python("-c", START)
+    other = run_python("-c", START, NUMBA_CPU_NAME=another, NUMBA_CACHE_DIR=str(tmp_path))
+    assert other.returncode == 0, other.stderr[-500:]
+    assert other.stdout == portable.stdout
+    assert len(other.stdout.split()) == 1
+
+
+def test_who_calls_from_python_is_told_once_that_kernels_are_compiled(monkeypatch, capsys):
+    monkeypatch.setattr(kernel_cache, "_said", [])
+    of_package, of_others = KernelCache(kernel_cache.here), KernelCache(double)
+    of_package._say_once()  # the program, which these tests load, says it itself
+    monkeypatch.delitem(sys.modules, "sfm_shapefit.cli")
+    of_others._say_once()
+    with hear_of_kernels(print):
+        of_package._say_once()
+    assert capsys.readouterr().err == ""
+    of_package._say_once()
+    of_package._say_once()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "compiling kernels, once" in said

@@ -1,0 +1,204 @@
+"""Options: stated once, refused by name, set by keyword; and the public names that take them."""
+
+import csv
+import dataclasses
+import inspect
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.base.settings import _fits, groups_of, merge_options
+from sfm_shapefit.facts import key_figures
+from sfm_shapefit.facts.columns import columns_of
+from sfm_shapefit.facts.options import LocateOptions, MapOptions
+from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.refinement.options import PlacementOptions, Scale
+from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
+from sfm_shapefit.tracks.options import StructureOptions
+from tests.scenes import RING
+
+NAN = float("nan")
+ALL = (SolverOptions, PlacementOptions, DirectionOptions, StructureOptions, LocateOptions, MapOptions)
+
+
+@pytest.mark.parametrize("settings", ALL)
+def test_every_option_has_a_sentence_that_help_shows(settings):
+    shown = " ".join(settings.__doc__.split())
+    for item in dataclasses.fields(settings):
+        assert item.metadata["help"].endswith(".")
+        assert f"{item.name} = {item.default!r} {item.metadata['help']}" in shown
+    assert "LocateOptions" in inspect.getdoc(sfm_shapefit.locate)
+
+
+@pytest.mark.parametrize("settings", ALL)
+def test_every_default_is_what_its_option_takes(settings):
+    """Settings trust their defaults, and look at other values only."""
+    kinds = get_type_hints(settings)
+    wrong = [item.name for item in dataclasses.fields(settings) if not _fits(item.default, kinds[item.name])]
+    assert not wrong
+
+
+def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
+    names = [item.name for group in groups_of(MapOptions) for item in group.fields]
+    assert sorted(names) == sorted(item.name for item in dataclasses.fields(MapOptions))
+    again = {"adjust", "min_points_per_image"}  # for rotations that were averaged
+    own = [name for one in ALL for name in inspect.get_annotations(one)]
+    assert {name for name in own if own.count(name) > 1} == again
+
+
+OUT_OF_RANGE = {
+    DirectionOptions: [(item.name, -1) for item in dataclasses.fields(DirectionOptions)],
+    SolverOptions: [("solver", "magic"), ("threads", -1), ("tol", 0.0), ("max_iterations", 0)],
+    StructureOptions: [
+        *(("max_reprojection_error_px", 0.0), ("max_reprojection_error_px", NAN)),
+        *(("min_triangulation_angle_deg", 90.0), ("min_track_length", 1)),
+    ],
+    LocateOptions: [("min_inlier_ratio", 3.0), ("tol", 2.0), ("threads", -1)],
+    SceneOptions: [
+        *(("shape", "torus"), ("num_images", 1), ("pixel_noise_px", NAN), ("focal_length_px", 0.0)),
+        *(("wrong_match_fraction", 1.5), ("corrupted_pair_fraction", -0.1)),
+    ],
+    RenderOptions: [
+        *(("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0))
+    ],
+}
+REFUSED = [
+    *(
+        (settings, {name: value}, rf"\b{name} must")
+        for settings in OUT_OF_RANGE
+        for name, value in OUT_OF_RANGE[settings]
+    ),
+    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
+    (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
+    (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
+    (LocateOptions, {"refine": 1}, "refine must be of type bool"),
+    (LocateOptions, {"max_iterations": 1.5}, "max_iterations must be of type int"),
+    (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
+    (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
+    (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
+    (LocateOptions, {"filter": "mfas"}, "triangles"),
+    (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
+    (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
+    (LocateOptions, {"rotations": "free", "adjust": False}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
+    (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),
+    (MapOptions, {"rotations": "measured"}, "map finds the rotations itself"),
+    (MapOptions, {"fix": "names.txt"}, "a database has no positions that cameras could stay at"),
+    (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
+    (LocateOptions, {"scale": "distance"}, "needs known_distance"),
+    (LocateOptions, {"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),
+    (LocateOptions, {"known_distance": ("a", "b", -1.0)}, "must be positive"),
+    (LocateOptions, {"known_distance": ("a", "a", 1.0)}, "two different images"),
+    (LocateOptions, {"known_distance": ("a", "b")}, "two image names and a number"),
+    (LocateOptions, {"known_distance": 3.0}, "known_distance must be of type tuple"),
+    (MapOptions, {"min_matches": 5}, "min_matches must be at least 15"),
+    (MapOptions, {"directions": "tracks"}, "a database has no tracks"),
+    (MapOptions, {"relative_rotations": "guessed"}, "relative_rotations must be one of"),
+    (WorkspaceOptions, {"model": "rotations", "database": False}, "model = 'rotations' needs database"),
+]
+
+
+@pytest.mark.parametrize(("settings", "wrong", "message"), REFUSED, ids=str)
+def test_a_wrong_value_is_refused_by_name(settings, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        settings(**wrong)
+
+
+def test_integers_serve_as_floats_and_numpy_numbers_as_their_kind():
+    assert LocateOptions(tol=np.float64(1e-6), min_inliers=np.int64(20), min_trust=1).min_inliers == 20
+    assert LocateOptions(directions="relative-poses", max_rotation_error_deg=5.0).max_rotation_error_deg == 5
+
+
+def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
+    given = LocateOptions(min_trust=0.2, points="never")
+    merged = merge_options(given, LocateOptions, {"min_trust": 0.0})
+    assert (merged.min_trust, merged.points) == (0.0, "never")
+    assert merge_options(None, LocateOptions, {}) == LocateOptions()
+    with pytest.raises(
+        TypeError, match=r"options must be LocateOptions\(\.\.\.\), got a dict; or give single"
+    ):
+        merge_options({"min_trust": 0.0}, LocateOptions, {})
+    with pytest.raises(TypeError, match="'min_trus' is no option of LocateOptions; did you mean min_trust"):
+        merge_options(given, LocateOptions, {"min_trus": 0.0})
+    with pytest.raises(TypeError, match="known are"):
+        merge_options(None, SolverOptions, {"color": 3})
+
+
+def test_completion_shows_public_names_only_and_after_two_arguments_all_are_given_by_name():
+    public = {name: getattr(sfm_shapefit, name) for name in dir(sfm_shapefit) if not name.startswith("_")}
+    assert set(public) == set(sfm_shapefit.__all__)
+    assert all(value is not None for value in public.values())
+    for name, function in public.items():
+        if inspect.isfunction(function):
+            kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
+            by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
+            assert by_position <= {"certify": 3, "average_rotations": 3}.get(name, 2), name
+
+
+@pytest.fixture(scope="module")
+def located():
+    return sfm_shapefit.locate(RING / "sparse" / "0", min_trust=0.0)
+
+
+def test_an_option_by_name_reaches_the_run_rows_are_made_once_and_errors_have_a_summary(located):
+    assert located.options == LocateOptions(min_trust=0.0)
+    with pytest.raises(TypeError, match="did you mean min_trust"):
+        sfm_shapefit.locate(RING / "sparse" / "0", mintrust=0.0)
+    assert located.cameras is located.cameras
+    assert located.pairs is located.pairs
+    assert located.summary() == located.summary()
+    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
+    assert errors.summary()["num_common"] == 8
+    assert "8 cameras in common" in repr(errors)
+    assert not errors.degenerate
+
+
+def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(located):
+    assert repr(located).startswith("<LocateResult: good: 8 of 8 images placed")
+    problem = random_graph_problem(12, p=0.8, seed=1)
+    solved = sfm_shapefit.solve(problem.view_graph, tol=1e-6)
+    assert solved.converged
+    assert repr(solved).startswith("<SolverResult: 12 locations, converged")
+    placed = sfm_shapefit.place(problem.view_graph, refine=False)
+    assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
+    assert repr(placed).startswith("<Placement: 12 of 12 nodes placed, 0 of")
+    located.timings_s["<script>"] = 1.0
+    table = located._repr_html_()
+    del located.timings_s["<script>"]
+    assert "&lt;script&gt;" in table
+    assert "<script>" not in table
+    assert "8 of 8 images" in table
+    assert "good</b>" in table
+    assert "<iframe sandbox='allow-scripts'" in table
+    assert "method</th><td>newton<" in solved._repr_html_()
+
+
+def test_every_scale_has_its_unit():
+    assert set(key_figures.UNITS) == {*get_args(Scale), "fixed", "control points"} - {"auto"}
+
+
+def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):
+    sfm_shapefit.write_result(located, tmp_path / "out", report=False)
+    for name, rows in (("cameras", located.cameras), ("pairs", located.pairs)):
+        columns = located.table(name)
+        with (tmp_path / f"out/{name}.csv").open(newline="", encoding="utf-8") as stream:
+            written = list(csv.DictReader(stream))
+        assert list(columns) == list(written[0])
+        assert {len(column) for column in columns.values()} == {len(rows)}
+        assert columns["x" if name == "cameras" else "vx"][0] == float(
+            written[0]["x" if name == "cameras" else "vx"]
+        )
+    cameras = located.table("cameras")
+    assert cameras["name"][0] == located.cameras[0].name
+    assert cameras["placed"].dtype == np.bool_
+    assert cameras["degree"].dtype == np.int64
+    unplaced = columns_of([CameraRow(name="a.jpg")], CameraRow, 2)
+    assert list(unplaced)[4:6] == ["x", "y"]
+    assert np.isnan(
+        [unplaced["x"][0], unplaced["trust"][0], unplaced["piece"][0], unplaced["sigma_y"][0]]
+    ).all()

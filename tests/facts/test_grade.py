@@ -1,0 +1,124 @@
+"""One verdict for a model, by rules that are written down."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import synthetic
+from sfm_shapefit.facts.grade import Grade, judge_graph
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
+from sfm_shapefit.placement.place import place
+from tests.program import run
+from tests.scenes import BUNDLED, RING
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sfm_shapefit.locate(RING / "sparse" / "0")
+
+
+def altered(found, **changes):
+    """Return the result with other facts, its verdict not yet made."""
+    return replace(found, **changes)
+
+
+def with_assessment(found, **changes):
+    placement = found.placement
+    return altered(found, placement=replace(placement, assessment=replace(placement.assessment, **changes)))
+
+
+def test_a_sound_model_is_good(found):
+    assert found.verdict.grade is Grade.GOOD
+    assert found.verdict.statement == "good"
+    assert found.summary()["verdict"] == {
+        "grade": "good",
+        "statement": "good",
+        "cameras": [],
+        "reasons": [],
+    }
+
+
+def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
+    trust = np.ones(len(found.kept))
+    trust[[1, 2]] = 0.7, 0.65
+    kept = np.ones(len(found.kept), dtype=bool)
+    kept[5] = False
+    verdict = altered(with_assessment(found, trust=trust), kept=kept).verdict
+    names = found.model.names
+    assert verdict.grade is Grade.LOOK
+    assert verdict.cameras == (names[5], names[2], names[1])
+    assert verdict.statement == f"look at 3 cameras ({names[5]}, {names[2]}, {names[1]})"
+
+
+@pytest.mark.parametrize(
+    ("share", "contradicting", "grade"),
+    [
+        (0.76, 0.1, Grade.GOOD),
+        (0.74, 0.1, Grade.LOOK),
+        (0.1, 0.49, Grade.LOOK),
+        (0.4, 0.51, Grade.DO_NOT_USE),
+    ],
+)
+def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_is_to_be_looked_at(
+    found, share, contradicting, grade
+):
+    verdict = altered(found, agreeing_observations=share, contradicting_observations=contradicting).verdict
+    assert verdict.grade is grade
+    assert bool(verdict.reasons) is (grade is not Grade.GOOD)
+
+
+def test_a_model_whose_directions_are_far_off_is_not_to_be_used(found):
+    assert with_assessment(found, level_deg=4.9).verdict.grade is Grade.GOOD
+    verdict = with_assessment(found, level_deg=5.1).verdict
+    assert verdict.statement == "do not use: the directions are 5 degrees off the cameras"
+
+
+def test_a_model_most_of_whose_cameras_are_not_trusted_is_not_to_be_used(found):
+    kept = np.arange(len(found.kept)) < len(found.kept) // 2 - 1
+    assert altered(found, kept=kept).verdict.is_bad
+
+
+def test_pairs_that_contradict_the_rotations_count_against_a_model(found):
+    """Three of four pairs of the ring say that the rotations are wrong."""
+    status = tuple(
+        DirectionStatus.LOW_INLIER_RATIO if k % 8 else one for k, one in enumerate(found.directions.status)
+    )
+    told = altered(found, directions=replace(found.directions, status=status))
+    assert told.agreeing_pairs < found.agreeing_pairs
+
+
+def test_matches_that_agree_on_two_directions_make_a_look_worthwhile(found):
+    twofold = tuple(
+        DirectionStatus.TWO_MOTIONS if k % 3 == 0 else one for k, one in enumerate(found.directions.status)
+    )
+    verdict = altered(found, directions=replace(found.directions, status=twofold)).verdict
+    assert verdict.grade is Grade.LOOK
+    assert "facade repeats" in verdict.statement
+
+
+def test_a_graph_of_noise_is_not_to_be_used():
+    """Directions drawn at random agree with no placement."""
+    problem = synthetic.random_graph_problem(30, 0.5, 3, q=1.0, seed=2)
+    placed = place(problem.view_graph)
+    assert judge_graph(SimpleNamespace(placement=placed)).is_bad
+
+
+def test_strict_ends_with_code_4_where_the_verdict_is_do_not_use_and_writes_the_output(tmp_path):
+    lines = (BUNDLED / "graph40.txt").read_text().splitlines()
+    rng = np.random.default_rng(0)
+    drawn = []
+    for line in lines:
+        cells = line.split()
+        if len(cells) == 5 and not line.startswith("#"):
+            vector = rng.standard_normal(3)
+            cells[2:] = [repr(float(v)) for v in vector / np.linalg.norm(vector)]
+        drawn.append(" ".join(cells))
+    graph = tmp_path / "noise.txt"
+    graph.write_text("\n".join(drawn) + "\n")
+    assert "do not use" in run("place", graph, tmp_path / "free", "--no-report", code=0).stdout
+    run("place", graph, tmp_path / "strict", "--no-report", "--strict", code=4)
+    assert (tmp_path / "strict" / "locate.json").exists()
+    run("place", BUNDLED / "graph40.txt", tmp_path / "sound", "--no-report", "--strict", code=0)

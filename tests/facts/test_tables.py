@@ -1,0 +1,76 @@
+"""Tables and JSON as files: what stands in a cell, and names and paths that are no UTF-8."""
+
+import csv
+import json
+import math
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sfm_shapefit.facts.tables import CameraRow, PairRow, dumps, write_json, write_rows
+from tests.program import run, run_python
+from tests.scenes import RING
+
+SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]
+RHOS = ["rho_xy", "rho_xz", "rho_yz"]
+NOT_UTF8 = os.fsdecode(b"mod\xe8le")
+
+
+def lines_of(path):
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.reader(stream))
+
+
+def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_path):
+    placed = CameraRow(
+        name='a,"b',
+        placed=True,
+        piece=0,
+        center=(0.1, -2.0, 1e-30),
+        degree=3,
+        trust=0.5,
+        sigma=(math.nan,) * 3,
+        correlation=(0.25, -1.0, 0.0),
+    )
+    write_rows([placed, CameraRow(name="c", reason="why")], CameraRow, 3, tmp_path / "cameras.csv")
+    assert lines_of(tmp_path / "cameras.csv") == [
+        ["name", "placed", "reason", "piece", "x", "y", "z", "degree", "trust", *SIGMAS, *RHOS],
+        ['a,"b', "true", "", "0", "0.1", "-2.0", "1e-30", "3", "0.5", "", "", "", "0.25", "-1.0", "0.0"],
+        ["c", "false", "why", "", "", "", "", "0", "", "", "", "", "", "", ""],
+    ]
+
+
+@pytest.mark.parametrize(("dimension", "axes"), [(2, ["vx", "vy"]), (4, ["vx1", "vx2", "vx3", "vx4"])])
+def test_a_pair_has_one_column_per_dimension(tmp_path, dimension, axes):
+    row = PairRow(name1="1", name2="2", direction=(0.5,) * dimension)
+    write_rows([row], PairRow, dimension, tmp_path / "pairs.csv")
+    header, cells = lines_of(tmp_path / "pairs.csv")
+    assert header[2 : 2 + dimension] == axes
+    assert cells[2 : 2 + dimension] == ["0.5"] * dimension
+    assert len(header) == len(cells)
+
+
+def test_bytes_that_are_no_utf8_come_back_from_the_json_and_are_escaped_in_a_table(tmp_path):
+    text = dumps({"path": NOT_UTF8, "name": "é"})
+    write_json({"path": NOT_UTF8, "name": "é"}, tmp_path / "out.json")
+    assert (tmp_path / "out.json").read_bytes() == text.encode("utf-8") + b"\n"
+    assert "é" in text
+    assert os.fsencode(json.loads(text)["path"]) == b"mod\xe8le"
+    write_rows([CameraRow(name=NOT_UTF8)], CameraRow, 3, tmp_path / "cameras.csv")
+    assert lines_of(tmp_path / "cameras.csv")[1][0] == r"mod\udce8le"
+
+
+def test_a_model_whose_path_is_no_utf8_is_located_and_reported(tmp_path):
+    try:
+        scene = Path(shutil.copytree(RING, tmp_path / NOT_UTF8))
+    except OSError:
+        pytest.skip("this file system takes names in UTF-8 only")
+    locate = ("locate", scene / "sparse" / "0", tmp_path / "out")
+    done = run_python("-m", "sfm_shapefit.cli", *locate, "--json", PYTHONIOENCODING="utf-8:strict")
+    assert (done.returncode, done.stderr) == (0, "")
+    written = json.loads((tmp_path / "out" / "locate.json").read_text(encoding="utf-8"))
+    assert os.fsencode(written["inputs"]["model"]) == os.fsencode(scene / "sparse" / "0")
+    assert json.loads(done.stdout)["inputs"] == written["inputs"]
+    assert run(*locate, "--overwrite", code=0).stderr == ""

@@ -1,0 +1,942 @@
+"""COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
+
+import dataclasses
+import itertools
+import os
+import shutil
+import sqlite3
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.files.colmap import sqlite_file
+from sfm_shapefit.files.colmap.check import check_model_files
+from sfm_shapefit.files.colmap.database import find_database, open_database
+from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
+from sfm_shapefit.files.colmap.model import PosedModel, camera_rays, read_model, track_matches, world_rays
+from sfm_shapefit.pipeline.evaluate import evaluate
+from tests.scenes import edit_database, fingerprint, real_scene
+
+EPS = np.finfo(np.float64).eps
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+
+
+def synthesize(seed: int, *database: pycolmap.Database, **settings: object) -> pycolmap.Reconstruction:
+    """Make a scene without noise, and its database if one is given."""
+    pycolmap.set_random_seed(seed)
+    options = pycolmap.SyntheticDatasetOptions()
+    for name, value in settings.items():
+        setattr(options, name, value)
+    return pycolmap.synthesize_dataset(options, *database)
+
+
+@pytest.fixture(scope="module")
+def scene() -> pycolmap.Reconstruction:
+    """Six posed images of two cameras around twelve points that all of them see, without noise."""
+    rigs = {"num_rigs": 2, "num_cameras_per_rig": 1, "num_frames_per_rig": 3}
+    return synthesize(1, **rigs, num_points3D=12, num_points2D_without_point3D=2)
+
+
+@pytest.fixture(scope="module")
+def model(scene: pycolmap.Reconstruction) -> PosedModel:
+    return read_model(scene)
+
+
+@pytest.fixture
+def folder(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
+    """The scene as a binary model."""
+    path = tmp_path / "model"
+    path.mkdir()
+    scene.write_binary(path)
+    return path
+
+
+IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_POINT = 2**64 - 1
+
+
+def tiny_model() -> dict[str, list]:
+    """A sound model of two images and two points as plain records; tests break one of them."""
+    return {
+        "cameras": [[1, 1, 640, 480, [500.0, 500.0, 320.0, 240.0]]],
+        "images": [
+            [1, IDENTITY_POSE, 1, b"a.jpg", [(1.0, 2.0, 7), (3.0, 4.0, NO_POINT)]],
+            [2, IDENTITY_POSE, 1, b"b.jpg", [(5.0, 6.0, 7)]],
+        ],
+        "points3D": [[7, (0.0, 0.0, 4.0), [(1, 0), (2, 0)]], [9, (0.0, 0.0, 5.0), []]],
+        "rigs": [[1, [(0, 1)]]],
+        "frames": [[1, 1, IDENTITY_POSE, [(0, 1, 1)]], [2, 1, IDENTITY_POSE, [(0, 1, 2)]]],
+    }
+
+
+def write_tiny(folder: Path, records: dict[str, list]) -> Path:
+    """Write records in COLMAP's binary layouts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    packed = {
+        "cameras": lambda i, m, w, h, p: struct.pack(f"<IiQQ{len(p)}d", i, m, w, h, *p),
+        "images": lambda i, pose, camera, name, points: (
+            struct.pack("<I7dI", i, *pose, camera)
+            + name
+            + b"\0"
+            + struct.pack("<Q", len(points))
+            + b"".join(struct.pack("<ddQ", *point) for point in points)
+        ),
+        "points3D": lambda i, xyz, track: (
+            struct.pack("<Q3d3BdQ", i, *xyz, 9, 9, 9, 0.5, len(track))
+            + b"".join(struct.pack("<II", *element) for element in track)
+        ),
+        "rigs": lambda i, sensors: (
+            struct.pack("<II", i, len(sensors))
+            + struct.pack("<iI", *sensors[0])
+            + b"".join(struct.pack("<iIB7d", *sensor, 1, *IDENTITY_POSE) for sensor in sensors[1:])
+        ),
+        "frames": lambda i, rig, pose, data: (
+            struct.pack("<II7dI", i, rig, *pose, len(data)) + b"".join(struct.pack("<iIQ", *d) for d in data)
+        ),
+    }
+    for name, rows in records.items():
+        body = b"".join(packed[name](*row) for row in rows)
+        (folder / f"{name}.bin").write_bytes(struct.pack("<Q", len(rows)) + body)
+    return folder
+
+
+def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_path):
+    text, legacy = tmp_path / "text", tmp_path / "legacy"
+    text.mkdir()
+    scene.write_text(text)
+    shutil.copytree(folder, legacy)
+    (legacy / "rigs.bin").unlink()
+    (legacy / "frames.bin").unlink()
+
+    models = [read_model(source) for source in (scene, folder, str(text), legacy)]
+
+    for model in models:
+        assert model.image_ids.tolist() == sorted(scene.images)
+        assert model.names == tuple(scene.image(i).name for i in sorted(scene.images))
+        for k, i in enumerate(model.image_ids.tolist()):
+            pose = scene.image(i).cam_from_world()
+            np.testing.assert_allclose(model.rotations[k], pose.rotation.matrix(), atol=8 * EPS)
+            np.testing.assert_allclose(
+                model.centers[k], scene.image(i).projection_center(), atol=64 * EPS * 5.0
+            )
+            assert model.focal_lengths_px[k] == 1280.0
+
+
+def test_the_tiny_model_of_these_tests_is_sound_and_needs_no_points(tmp_path):
+    records = tiny_model()
+    model = read_model(write_tiny(tmp_path / "m", records))
+    assert model.names == ("a.jpg", "b.jpg")
+    assert not model.centers.any()  # all centers at the origin are fine
+    records["points3D"] = []
+    for image in records["images"]:
+        image[4] = []
+    model = read_model(write_tiny(tmp_path / "m", records))
+    assert model.num_images == 2
+    assert list(track_matches(model)) == []
+
+
+def test_binary_files_win_over_text_files_and_poses_in_frames_over_those_in_images(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("not a model")
+    records = tiny_model()
+    records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
+    model = read_model(write_tiny(tmp_path, records))
+    np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
+
+
+def test_images_without_a_pose_are_left_out_and_arrays_are_read_only(scene):
+    copy = pycolmap.Reconstruction(scene)
+    copy.deregister_frame(copy.image(3).frame_id)
+    model = read_model(copy)
+    assert 3 not in model.image_ids
+    with pytest.raises(ValueError, match="read-only"):
+        model.rotations[0, 0, 0] = 2.0
+
+
+def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
+    scene, folder, tmp_path, capfd
+):
+    before = fingerprint(folder)
+    copy = pycolmap.Reconstruction(scene)
+    for source in (folder, copy):
+        list(track_matches(read_model(source)))
+    (tmp_path / "again").mkdir()
+    copy.write_binary(tmp_path / "again")
+    assert fingerprint(folder) == before == fingerprint(tmp_path / "again")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_a_binary_file_cut_at_any_byte_is_refused_at_once(tmp_path, name):
+    folder = write_tiny(tmp_path / "m", tiny_model())
+    check_model_files(folder)  # compiles the kernels, so that the clock below sees only the check
+    data = (folder / name).read_bytes()
+    for length in range(len(data)):
+        (folder / name).write_bytes(data[:length])
+        start = time.process_time()
+        with pytest.raises(InputError, match=rf"{name}: the file ends inside .* truncated"):
+            check_model_files(folder)
+        assert time.process_time() - start < 2.0  # it takes under a millisecond; a hang would not end
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
+    data = (folder / name).read_bytes()
+    rng = np.random.default_rng(MODEL_FILES.index(name))
+    refused = 0
+    for _ in range(60):
+        changed = bytearray(data)
+        changed[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
+        (folder / name).write_bytes(changed)
+        try:
+            check_model_files(folder)
+        except InputError:
+            refused += 1
+    assert refused > 5  # most bytes of a model are digits of floats, where a change is a sound model
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_an_absurd_count_and_bytes_after_the_last_record_are_refused(folder, name):
+    data = (folder / name).read_bytes()
+    counted = [(struct.pack("<Q", count) + data[8:], "truncated") for count in (2**63, 2**64 - 1, 10**6)]
+    for damaged, reason in [*counted, (data + b"\0", "1 bytes follow")]:
+        (folder / name).write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{name}.*{reason}"):
+            check_model_files(folder)
+
+
+def _set(*path_and_value):
+    """Return a function that sets one nested entry of the tiny model's records."""
+    *path, last, value = path_and_value
+
+    def change(records):
+        for key in path:
+            records = records[key]
+        records[last] = value
+
+    return change
+
+
+def _append(name, record):
+    return lambda records: records[name].append(record)
+
+
+NAN, INF = float("nan"), float("inf")
+BROKEN_RECORDS = {
+    "unknown camera model": (_set("cameras", 0, 1, 99), "camera 1 has the unknown camera model 99"),
+    "NaN parameter": (_set("cameras", 0, 4, [NAN, 1.0, 1.0, 1.0]), "camera 1 has a parameter that is not"),
+    "camera twice": (_append("cameras", [1, 0, 9, 9, [1.0, 1.0, 1.0]]), "camera 1 stands twice"),
+    "NaN pose": (_set("images", 1, 1, (1.0, 0, 0, 0, NAN, 0, 0)), "image 2 has a pose that is not finite"),
+    "zero rotation": (_set("images", 1, 1, (0.0,) * 7), "image 2 has a rotation quaternion of norm 0 "),
+    "long rotation": (_set("images", 1, 1, (2.0, *(0.0,) * 6)), "image 2 has a rotation .* of norm 2 "),
+    "no camera": (_set("images", 1, 2, 5), "image 2 refers to camera 5"),
+    "no name": (_set("images", 1, 3, b""), "image 2 has no name"),
+    "name twice": (_set("images", 1, 3, b"a.jpg"), r"image 2 \(a.jpg\) stands twice"),
+    "image twice": (_set("images", 1, 0, 1), r"image 1 \(b.jpg\) stands twice"),
+    "NaN pixel": (_set("images", 1, 4, [(5.0, NAN, 7)]), "image 2 has a point whose coordinates are not"),
+    "no such point": (_set("images", 1, 4, [(5.0, 6.0, 8)]), "an image observes 3D point 8"),
+    "NaN point": (_set("points3D", 0, 1, (0.0, NAN, 1.0)), "3D point 7 has coordinates that are not finite"),
+    "infinite point": (_set("points3D", 0, 1, (-INF, 0.0, 1.0)), "3D point 7 has coordinates that are not"),
+    "point twice": (_append("points3D", [7, (0.0, 0.0, 1.0), []]), "3D point 7 stands twice"),
+    "track of no image": (_set("points3D", 0, 2, [(1, 0), (9, 0)]), "refers to point 0 of image 9"),
+    "track of no pixel": (_set("points3D", 0, 2, [(1, 0), (2, 1)]), "refers to point 1 of image 2"),
+    "rig of no camera": (_set("rigs", 0, 1, [(0, 4)]), "rig 1 refers to camera 4"),
+    "rig twice": (_append("rigs", [1, [(0, 1)]]), "rig 1 stands twice"),
+    "sensor twice": (_set("rigs", 0, 1, [(0, 1), (0, 1)]), "rig 1 has a sensor that stands twice"),
+    "frame twice": (_set("frames", 1, 0, 1), "frame 1 stands twice"),
+    "frame of no rig": (_set("frames", 1, 1, 6), "frame 2 refers to rig 6"),
+    "NaN frame": (_set("frames", 1, 2, (1.0, 0, 0, 0, 0, 0, INF)), "frame 2 has a pose that is not finite"),
+    "frame of no sensor": (_set("frames", 1, 3, [(0, 3, 2)]), "frame 2 refers to sensor 3"),
+    "frame of no image": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 5)]), "a frame refers to image 5"),
+    "image in two frames": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 1)]), "image 1 stands in two frames"),
+    "image in no frame": (_set("frames", 1, 3, []), "image 2 of images.bin is in no frame"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN_RECORDS)
+def test_a_broken_record_is_named(tmp_path, case):
+    change, message = BROKEN_RECORDS[case]
+    records = tiny_model()
+    change(records)
+    with pytest.raises(InputError, match=message):
+        read_model(write_tiny(tmp_path / "m", records))
+
+
+TEXT_MODEL = {
+    "cameras": "# a comment\n1 PINHOLE 640 480 500 500 320 240\n",
+    "images": "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 7 3 4 -1\n2 1 0 0 0 0 0 0 1 b.jpg\n5 6 7\n",
+    "points3D": "7 0 0 4 9 9 9 0.5 1 0 2 0\n",
+}
+BROKEN_LINES = {
+    "unknown model": ("cameras", "PINHOLE", "PINHOLA", r"cameras.txt:2: expected"),
+    "parameter count": ("cameras", " 240", "", r"cameras.txt:2: PINHOLE has 4 parameters, but 3"),
+    "NaN parameter": ("cameras", "320", "nan", r"cameras.txt:2: the camera holds a number that is not fin"),
+    "name with a space": ("images", "b.jpg", "b 1.jpg", r"images.txt:3: .*a name with spaces"),
+    "NaN pose": ("images", "2 1 0 0 0 0", "2 1 0 0 0 inf", r"images.txt:3: the pose holds a number that"),
+    "not a number": ("images", "2 1 0 0 0 0", "2 1 0 0 0 x", r"images.txt:3: the pose holds something"),
+    "zero rotation": ("images", "2 1 0", "2 0 0", r"images.txt:3: image 2 has a rotation .* of norm 0"),
+    "name twice": ("images", "b.jpg", "a.jpg", r"images.txt:3: the name a.jpg stands in line 1"),
+    "line missing": ("images", "5 6 7\n", "", r"images.txt:3: the line of its points is missing"),
+    "no triples": ("images", "5 6 7", "5 6", r"images.txt:4: expected triples"),
+    "NaN pixel": ("images", "5 6 7", "nan 6 7", r"images.txt:4: a point holds a number that is not finite"),
+    "NaN point": ("points3D", "0 0 4", "0 nan 4", r"points3D.txt:1: the 3D point holds a number that is not"),
+    "odd track": ("points3D", " 2 0", " 2", r"points3D.txt:1: expected"),
+    "unknown point": ("images", "3 4 -1", "3 4 99", r"refers to an image, a frame or a 3D point that it"),
+    "other point": ("images", "5 6 7", "5 6 8", r"cannot be read as a COLMAP model"),
+    "unknown camera": ("images", "1 b.jpg", "4 b.jpg", r"cannot be read as a COLMAP model"),
+    "image twice": ("images", "2 1 0", "1 1 0", r"cannot be read as a COLMAP model"),
+    "no such pixel": ("points3D", " 2 0", " 2 9", r"cannot be read as a COLMAP model"),
+}
+
+
+def write_text_model(folder: Path, **changed: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in {**TEXT_MODEL, **changed}.items():
+        (folder / f"{name}.txt").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize("case", BROKEN_LINES)
+def test_a_broken_line_of_a_text_model_is_named_and_windows_line_ends_are_read(tmp_path, case):
+    windows = {name: text.replace("\n", "\r\n") for name, text in TEXT_MODEL.items()}
+    assert read_model(write_text_model(tmp_path / "m", **windows)).names == ("a.jpg", "b.jpg")
+    name, old, new, message = BROKEN_LINES[case]
+    assert old in TEXT_MODEL[name]
+    changed = new.join(TEXT_MODEL[name].rsplit(old, 1))
+    with pytest.raises(InputError, match=message):
+        read_model(write_text_model(tmp_path / "m", **{name: changed}))
+
+
+def test_a_folder_that_is_no_model_is_refused_with_advice_and_the_one_that_was_meant(folder, tmp_path):
+    (folder / "points3D.bin").rename(tmp_path / "elsewhere")
+    (tmp_path / "empty").mkdir()
+    write_tiny(tmp_path / "a" / "0", tiny_model())
+    write_tiny(tmp_path / "b" / "sparse" / "0", tiny_model())
+    for path, message in (
+        (folder, r"lacks points3D\.bin"),
+        (tmp_path / "nowhere", "does not exist"),
+        (folder / "cameras.bin", "is a file"),
+        (tmp_path / "empty", "holds no COLMAP model; give the folder with"),
+        (tmp_path / "a", rf"but {tmp_path / 'a' / '0'} does"),
+        (tmp_path / "b", rf"but {tmp_path / 'b' / 'sparse' / '0'} does"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_model(path)
+
+
+@pytest.mark.parametrize(("there", "missing"), [("rigs", "frames"), ("frames", "rigs")])
+def test_rigs_and_frames_come_together(folder, there, missing):
+    (folder / f"{missing}.bin").unlink()
+    with pytest.raises(InputError, match=rf"has {there}\.bin but no {missing}\.bin"):
+        read_model(folder)
+
+
+def test_a_file_that_cannot_be_read_is_refused(folder):
+    reasons = {"Is a directory": lambda file: (file.unlink(), file.mkdir())}
+    if os.geteuid() != 0:  # root may read everything
+        reasons = {"Permission denied": lambda file: file.chmod(0)} | reasons
+    for reason, damage in reasons.items():
+        damage(folder / "images.bin")
+        with pytest.raises(InputError, match=rf"images\.bin cannot be read: {reason}"):
+            read_model(folder)
+
+
+def test_fewer_than_two_posed_images_are_refused(tmp_path):
+    records = tiny_model()
+    records |= {"points3D": [], "images": records["images"][:1], "frames": records["frames"][:1]}
+    records["images"][0][4] = []
+    with pytest.raises(InputError, match="has only one image with a pose"):
+        read_model(write_tiny(tmp_path / "one", records))
+    with pytest.raises(InputError, match="has no image with a pose"):
+        read_model(pycolmap.Reconstruction())
+
+
+def rigid(qvec, tvec):
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(np.array(qvec)), np.array(tvec))
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value", "message"),
+    [
+        ("frame", "rig_from_world", rigid([0.0, 0, 0, 1], [0, NAN, 0]), "position of image 2 is not finite"),
+        ("frame", "rig_from_world", rigid([NAN] * 4, [0.0, 0, 0]), "image 2 has no valid rotation"),
+        ("point3D", "xyz", [NAN, 0.0, 0.0], "3D point 2 is not finite"),
+        ("point2D", "xy", [NAN, 0.0], "image 2 has a point"),
+        ("camera", "params", [INF, 1.0, 1.0, 0.0], "camera 2 is not finite"),
+        ("camera", "params", [0.0, 1.0, 1.0, 0.0], "camera 2 has focal length 0 px"),
+    ],
+)
+def test_values_that_are_not_finite_are_refused_in_memory(scene, part, name, value, message):
+    copy = pycolmap.Reconstruction(scene)
+    owner = copy.image(2).points2D[0] if part == "point2D" else getattr(copy, part)(2)
+    setattr(owner, name, value if part == "frame" else np.array(value))
+    with pytest.raises(InputError, match=message):
+        read_model(copy)
+
+
+def test_a_rig_of_two_cameras_is_read_with_the_poses_of_its_images(tmp_path):
+    rig = synthesize(2, num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=5)
+    rig.write(tmp_path)
+    model = read_model(tmp_path)
+    images = [rig.image(i) for i in model.image_ids.tolist()]
+    assert len(images) == 6
+    assert any(not image.is_ref_in_frame() for image in images)
+    groups = (model.frame_ids.tolist(), model.groups.group_of.tolist())
+    assert [len(set(group)) for group in groups] == [3, 3]
+    # roundings of unit rotations times distances of a few units
+    np.testing.assert_allclose(model.centers, [i.projection_center() for i in images], atol=1e-12)
+    errors = evaluate(rig, tmp_path)
+    assert len(errors.names) == 6
+    assert errors.position.max == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("camera_model", CAMERA_MODELS)
+def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
+    reconstruction = pycolmap.Reconstruction()
+    model_id = pycolmap.CameraModelId.__members__[camera_model]
+    camera = pycolmap.Camera.create_from_model_id(1, model_id, 500.0, 640, 480)
+    info = [name.strip() for name in camera.params_info.split(",")]
+    distortion = {"k", "k1", "k2", "k0", "p1", "p2", "sx1", "s0", "omega"} & set(info)
+    camera.params = [
+        value + (0.01 if name in distortion else 0.0) for name, value in zip(info, camera.params, strict=True)
+    ]
+    reconstruction.add_camera_with_trivial_rig(camera)
+    rng = np.random.default_rng(CAMERA_MODELS.index(camera_model))
+    for i in (1, 2):
+        image = pycolmap.Image(name=f"{i}.jpg", camera_id=1, image_id=i)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(normalized(rng.normal(size=4))), rng.normal(size=3))
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    model = read_model(reconstruction)
+    xy = rng.uniform([20.0, 20.0], [620.0, 460.0], size=(50, 2))
+
+    rays = world_rays(model, 1, xy)
+
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=8 * EPS)
+    back = np.array([camera.img_from_cam(model.rotations[1] @ ray) for ray in rays])
+    np.testing.assert_allclose(back, xy, atol=1e-6)  # undistortion iterates to about 1e-10 of f
+    focal_px = 640 / (2 * np.pi) if camera_model == "EQUIRECTANGULAR" else 500.0
+    assert model.focal_lengths_px[1] == pytest.approx(focal_px)
+    assert world_rays(model, 0, np.zeros((0, 2))).shape == (0, 3)
+
+
+def test_rays_that_a_fisheye_folds_back_are_none():
+    """A lens of 129 px per radian: 205 px are 85 degrees, and from 217 px on it looks behind itself."""
+    focal = [129.15, 129.26, 240.0, 240.0]
+    camera = pycolmap.Camera(
+        camera_id=1,
+        model="OPENCV_FISHEYE",
+        width=480,
+        height=480,
+        params=[*focal, 0.038, -0.008, 0.0083, -0.0027],
+    )
+    xy = np.array([[240.0 + radius, 240.0] for radius in (100.0, 205.0, 218.0, 230.0)])
+    assert np.isfinite(camera.cam_ray_from_img(xy)[:3]).all()  # wrong ones among them
+    assert np.isfinite(camera_rays(camera, xy)).all(axis=1).tolist() == [True, True, False, False]
+
+
+def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], set[tuple[int, int]]]:
+    """Matches between images (by index) from the tracks, one observation pair at a time."""
+    index = {i: k for k, i in enumerate(sorted(scene.images))}
+    matches: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    for point in scene.points3D.values():
+        seen = [(index[e.image_id], e.point2D_idx) for e in point.track.elements]
+        once = sorted(o for o in seen if sum(o[0] == other[0] for other in seen) == 1)
+        for (i, a), (j, b) in itertools.combinations(once, 2):
+            matches.setdefault((i, j), set()).add((a, b))
+    return matches
+
+
+def as_sets(batches) -> dict[tuple[int, int], set[tuple[int, int]]]:
+    """Matches of batches by pair; checks that no match and no pair stands twice."""
+    found = {}
+    for batch in batches:
+        assert batch.offsets[0] == 0
+        assert batch.offsets[-1] == len(batch.keypoints) == len(batch.rays_i) == len(batch.rays_j)
+        for p, (i, j) in enumerate(batch.pairs.tolist()):
+            rows = batch.keypoints[batch.offsets[p] : batch.offsets[p + 1]].tolist()
+            assert i < j
+            assert (i, j) not in found
+            found[i, j] = set(map(tuple, rows))
+            assert len(found[i, j]) == len(rows)
+    return found
+
+
+def thinned(scene: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy whose images see different subsets of the points, one of them twice in image 1."""
+    copy = pycolmap.Reconstruction(scene)
+    rng = np.random.default_rng(3)
+    for point_id in sorted(copy.points3D):
+        elements = [(e.image_id, e.point2D_idx) for e in copy.point3D(point_id).track.elements]
+        for k in rng.choice(6, size=int(rng.integers(0, 4)), replace=False):
+            copy.delete_observation(*elements[k])
+    free = next(k for k, p in enumerate(copy.image(1).points2D) if not p.has_point3D())
+    twice = next(p.point3D_id for p in copy.image(1).points2D if p.has_point3D())
+    copy.add_observation(twice, pycolmap.TrackElement(1, free))
+    return copy
+
+
+@pytest.mark.parametrize("limit", [1, 20, 10**6])
+def test_track_matches_are_those_of_a_plain_loop_whatever_the_batch_size(scene, limit):
+    copy = thinned(scene)
+    expected = brute_force_tracks(copy)
+    found = as_sets(track_matches(read_model(copy), limit))
+    assert found == expected
+    assert list(found) == sorted(found)
+    assert len(expected) == 15
+
+
+def test_track_matches_carry_the_rays_of_their_keypoints(scene, model):
+    (batch,) = track_matches(model)
+    for p, (i, j) in enumerate(batch.pairs.tolist()):
+        rows = slice(batch.offsets[p], batch.offsets[p + 1])
+        for side, (image, rays) in enumerate(((i, batch.rays_i), (j, batch.rays_j))):
+            points = scene.image(int(model.image_ids[image])).points2D
+            ids = [points[int(k)].point3D_id for k in batch.keypoints[rows, side]]
+            truth = normalized(np.array([scene.point3D(q).xyz for q in ids]) - model.centers[image])
+            # exact projections; undistorting the pixel iterates to about 1e-10
+            assert angle_between_deg(rays[rows], truth).max() < 1e-6
+
+
+SCHEMA = """
+CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, model INTEGER, params BLOB);
+CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT UNIQUE, camera_id INTEGER);
+CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB);
+CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB,
+                                  config INTEGER, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
+"""
+
+
+def pair_id(a: int, b: int) -> int:
+    return MAX_NUM_IMAGES * a + b
+
+
+def write_database(path: Path, scene: pycolmap.Reconstruction, id_of=lambda i: i, cols: int = 6) -> Path:
+    """Write the scene's keypoints, matches and exact relative poses, with ids renamed by `id_of`."""
+    connection = sqlite3.connect(path)
+    connection.executescript(SCHEMA)
+    for i, image in scene.images.items():
+        xy = np.zeros((len(image.points2D), cols), dtype="<f4")
+        xy[:, :2] = [p.xy for p in image.points2D]
+        connection.execute("INSERT INTO images VALUES (?, ?, 1)", (id_of(i), image.name))
+        connection.execute("INSERT INTO keypoints VALUES (?, ?, ?, ?)", (id_of(i), *xy.shape, xy.tobytes()))
+    ids = sorted(scene.images, key=id_of)
+    for a, b in itertools.combinations(ids, 2):
+        of_point = {p.point3D_id: k for k, p in enumerate(scene.image(b).points2D) if p.has_point3D()}
+        rows = [
+            (k, of_point[p.point3D_id])
+            for k, p in enumerate(scene.image(a).points2D)
+            if p.has_point3D() and p.point3D_id in of_point
+        ]
+        pose = scene.image(b).cam_from_world() * scene.image(a).cam_from_world().inverse()
+        add_pair(connection, id_of(a), id_of(b), rows, pose=pose)
+    connection.commit()
+    connection.close()
+    return path
+
+
+@pytest.fixture
+def path(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
+    """The scene as a database."""
+    return write_database(tmp_path / "d.db", scene)
+
+
+def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=None) -> None:
+    """Insert or replace one row of two_view_geometries."""
+    if pose is not None:
+        qvec, tvec = pose.rotation.quat[[3, 0, 1, 2]].tobytes(), pose.translation.tobytes()
+    data = np.array(rows, dtype="<u4").reshape(-1, 2).tobytes()
+    connection.execute(
+        "INSERT OR REPLACE INTO two_view_geometries VALUES (?, ?, 2, ?, ?, NULL, NULL, NULL, ?, ?)",
+        (pair_id(a, b), len(rows), data, config, qvec, tvec),
+    )
+
+
+def read_all(path: Path, model):
+    """Read everything a database offers."""
+    with open_database(path, model) as database:
+        return as_sets(database.iter_matches(1)), database.relative_poses()
+
+
+ID_ORDERS = {"same ids": lambda i: i, "reversed ids": lambda i: 100 - i, "mixed ids": lambda i: i * 5 % 7}
+
+
+@pytest.mark.parametrize("order", ID_ORDERS)
+@pytest.mark.parametrize("cols", [2, 4, 6])
+def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols):
+    thin = thinned(scene)
+    model = read_model(thin)
+    path = write_database(tmp_path / "d.db", thin, ID_ORDERS[order], cols)
+    with open_database(path, model) as database:
+        found = as_sets(database.iter_matches(1))
+        assert database.unmatched_names == ()
+        assert database.num_pairs == len(found)
+        for k, i in enumerate(model.image_ids.tolist()):
+            xy = np.array([p.xy for p in thin.image(i).points2D])
+            np.testing.assert_array_equal(database.keypoints(k), xy.astype(np.float32))
+    twice = {(i, j) for i, j in found if i == 0}  # image 1 sees one point twice, which a database may say
+    expected = brute_force_tracks(thin)
+    assert list(found) == sorted(found)
+    assert {p: m for p, m in found.items() if p not in twice} == {
+        p: m for p, m in expected.items() if p not in twice
+    }
+    assert all(found[p] >= expected[p] for p in twice)
+
+
+@pytest.mark.parametrize("order", ID_ORDERS)
+def test_relative_poses_point_from_camera_j_to_camera_i(scene, model, tmp_path, order):
+    _, poses = read_all(write_database(tmp_path / "d.db", scene, ID_ORDERS[order]), model)
+    assert poses.pairs.tolist() == [list(pair) for pair in itertools.combinations(range(6), 2)]
+    assert_poses_point_to_the_first_camera(poses, model)
+    i, j = poses.pairs.T
+    relative = model.rotations[j] @ model.rotations[i].transpose(0, 2, 1)
+    np.testing.assert_allclose(poses.rotations, relative, atol=64 * EPS)
+    assert poses.configs.tolist() == [2] * 15
+    assert poses.num_inliers.tolist() == [12] * 15
+
+
+@pytest.mark.parametrize("cache_bytes", [0, 10**6])
+def test_rays_of_database_matches_are_those_of_its_keypoints(scene, model, tmp_path, cache_bytes):
+    path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
+    with open_database(path, model) as database:
+        database.limit_rays(cache_bytes)
+        (batch,) = database.iter_matches(1)
+        for p, pair in enumerate(batch.pairs.tolist()):
+            rows = slice(batch.offsets[p], batch.offsets[p + 1])
+            for side, rays in enumerate((batch.rays_i, batch.rays_j)):
+                expected = world_rays(model, pair[side], database.keypoints(pair[side]))
+                np.testing.assert_array_equal(rays[rows], expected[batch.keypoints[rows, side]])
+
+
+def test_batches_of_any_size_join_to_the_same_matches(path, model):
+    with open_database(path, model) as database:
+        (whole,) = database.iter_matches(1)
+        for limit in (1, 12, 30, 10**6):
+            batches = list(database.iter_matches(1, limit))
+            assert all(len(batch.keypoints) <= max(limit, 12) for batch in batches)
+            assert len(batches) == -(-15 // max(limit // 12, 1))
+            for name in ("pairs", "rays_j"):
+                joined = np.concatenate([getattr(batch, name) for batch in batches])
+                np.testing.assert_array_equal(joined, getattr(whole, name))
+
+
+def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
+    def change(connection):
+        add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
+        add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
+
+    with open_database(edit_database(path, change), model) as database:
+        batch = next(database.iter_matches(3))
+    assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
+    assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
+
+
+def test_only_configurations_with_verified_matches_or_poses_are_used(path, model):
+    pairs = list(itertools.combinations(range(1, 6), 2))  # ten pairs, one per configuration
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 2.0]))
+
+    def change(connection):
+        connection.execute("DELETE FROM two_view_geometries")
+        for config, (a, b) in enumerate(pairs):
+            add_pair(connection, a, b, [(0, 0), (1, 1)], config=config, pose=pose)
+
+    matches, poses = read_all(edit_database(path, change), model)
+    config_of = {(a - 1, b - 1): config for config, (a, b) in enumerate(pairs)}
+    assert [config_of[pair] for pair in matches] == [2, 3, 4, 5, 6, 8, 9]
+    assert poses.configs.tolist() == [2, 3, 4, 6, 9]
+    np.testing.assert_array_equal(poses.translations, [[0.0, 0.0, 1.0]] * 5)
+
+
+def test_poses_that_mean_none_are_left_out(path, model):
+    def blob(*values):
+        return np.array(values, dtype="<f8").tobytes()
+
+    one, none = blob(1.0, 0.0, 0.0, 0.0), blob(0.0, 0.0, 0.0)
+    step = blob(0.1, 0.0, 0.0)
+    absent = [
+        (None, None), (one, None), (None, step), (one, none), (blob(0, 0, 0, 0), step),
+        (blob(0.6, 0.8, 0, 0), none), (blob(NAN, 0, 0, 1), step), (one, blob(1, INF, 0)),
+        (one, blob(1e200, 1e200, 0)),
+    ]  # fmt: skip
+
+    def change(connection):
+        connection.execute("DELETE FROM two_view_geometries")
+        pairs = itertools.combinations(range(1, 7), 2)
+        for (qvec, tvec), (a, b) in zip([*absent, (one, step)], pairs, strict=False):
+            add_pair(connection, a, b, [(0, 0)], qvec=qvec, tvec=tvec)
+
+    matches, poses = read_all(edit_database(path, change), model)
+    assert len(matches) == len(absent) + 1
+    assert len(poses.pairs) == 1
+    np.testing.assert_array_equal(poses.translations, [[1.0, 0.0, 0.0]])
+
+
+def test_an_old_database_without_pose_columns_has_no_relative_poses(path, model):
+    drop = "ALTER TABLE two_view_geometries DROP COLUMN "
+    matches, poses = read_all(edit_database(path, drop + "qvec", drop + "tvec", "DROP TABLE cameras"), model)
+    assert len(matches) == 15
+    assert poses.pairs.shape == (0, 2)
+    assert poses.rotations.shape == (0, 3, 3)
+
+
+def test_a_database_of_pycolmap_is_read(tmp_path):
+    settings = {"num_frames_per_rig": 4, "two_view_geometry_has_relative_pose": True}
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        scene = synthesize(4, database, num_rigs=1, num_points3D=20, **settings)
+    model = read_model(scene)
+    matches, poses = read_all(tmp_path / "database.db", model)
+    # In its database every pair of keypoints is a match of one point; the points2D carry the same order.
+    assert matches == brute_force_tracks(scene)
+    assert_poses_point_to_the_first_camera(poses, model)
+
+
+def assert_poses_point_to_the_first_camera(poses, model):
+    """R_j^T t_ij is the direction of C_i - C_j."""
+    i, j = poses.pairs.T
+    directions = np.einsum("nji,nj->ni", model.rotations[j], poses.translations)
+    np.testing.assert_allclose(directions, normalized(model.centers[i] - model.centers[j]), atol=256 * EPS)
+
+
+def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
+    edit_database(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
+    with open_database(path, model) as database:
+        assert database.unmatched_names == (model.names[1],)
+        assert database.keypoints(1).shape == (0, 2)
+        assert not any(1 in pair for pair in as_sets(database.iter_matches(1)))
+        assert database.num_pairs == 10
+    edit_database(path, "UPDATE images SET name = 'other/' || name")
+    first = model.names[0]
+    message = rf"has 0 of the model's 6 images: the model's {first} .*database's other/.*not in the model"
+    with pytest.raises(InputError, match=message), open_database(path, model):
+        pass
+
+
+GEOMETRY, KEYPOINTS = "UPDATE two_view_geometries SET ", "UPDATE keypoints SET "
+FIRST = f" WHERE pair_id = {pair_id(1, 2)}"
+BROKEN_ROWS = {
+    "short matches": (f"{GEOMETRY} data = x'00' {FIRST}", "pair camera.* and camera.* has matches of wrong"),
+    "no matches": (f"{GEOMETRY} data = NULL", "matches of wrong length"),
+    "three columns": (f"{GEOMETRY} cols = 3", "matches of wrong length"),
+    "huge rows": (f"{GEOMETRY} rows = {2**62}", "matches of wrong length"),
+    "rows as text": (f"{GEOMETRY} rows = 'many'", "pair 2147483649 is damaged"),
+    "negative pair": (f"{GEOMETRY} pair_id = -pair_id", "pair -.* is damaged"),
+    "unknown image": (f"{GEOMETRY} pair_id = {pair_id(1, 77)} {FIRST}", "joins the images with ids 1 and 77"),
+    "own image": (f"{GEOMETRY} pair_id = {pair_id(2, 2)} {FIRST}", "joins the images with ids 2 and 2"),
+    "short pose": (f"{GEOMETRY} qvec = x'00'", "a relative pose of wrong length"),
+    "text pose": (f"{GEOMETRY} tvec = 'north'", "a relative pose of wrong length"),
+    "few keypoints": (
+        f"{KEYPOINTS} rows = 3, data = substr(data, 1, 72) WHERE image_id = 2",
+        "has matches of keypoints that do not exist",
+    ),
+    "no keypoints": ("DELETE FROM keypoints", "has matches of keypoints that do not exist"),
+    "short keypoints": ("UPDATE keypoints SET data = substr(data, 2)", "keypoints of image .* are damaged"),
+    "three per keypoint": ("UPDATE keypoints SET cols = 3, rows = rows * 2", "keypoints of image .* are dam"),
+    "NaN keypoint": (f"{KEYPOINTS} data = CAST(x'0000c07f' || substr(data, 5) AS BLOB)", "not finite"),
+    "signaling NaN": (f"{KEYPOINTS} data = CAST(x'0100807f' || substr(data, 5) AS BLOB)", "not finite"),
+    "no table": ("DROP TABLE keypoints", "has no table keypoints"),
+    "no column": ("ALTER TABLE two_view_geometries DROP COLUMN config", "no column config in its table two_"),
+    "no images": ("DELETE FROM images", "has no images"),
+    "no name": ("UPDATE images SET name = NULL WHERE image_id = 3", "id 3 has no valid id and name"),
+    "bad id": (f"UPDATE images SET image_id = {MAX_NUM_IMAGES} WHERE image_id = 3", "no valid id and name"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN_ROWS)
+def test_a_broken_row_is_named(path, model, case):
+    statement, message = BROKEN_ROWS[case]
+    with pytest.raises(InputError, match=message) as caught:
+        read_all(edit_database(path, statement), model)
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_no_database_are_refused(model, tmp_path):
+    (tmp_path / "empty").touch()
+    (tmp_path / "garbage").write_bytes(bytes(range(256)) * 40)
+    edit_database(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
+    for name, message in (
+        ("missing", "does not exist"),
+        (".", "is a folder"),
+        ("empty", "is empty"),
+        ("garbage", "is not a COLMAP database"),
+        ("other", "is not a COLMAP database: it has no table images"),
+    ):
+        with pytest.raises(InputError, match=message), open_database(tmp_path / name, model):
+            pass
+    assert sorted(os.listdir(tmp_path)) == ["empty", "garbage", "other"]
+
+
+def test_a_truncated_database_is_an_input_error_at_any_length(path, model):
+    data, cut = path.read_bytes(), path.with_name("cut.db")
+    for length in np.linspace(1, len(data) - 1, 60).astype(int).tolist():
+        cut.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"cut\.db"):
+            read_all(cut, model)
+
+
+def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
+    assert 1.0 <= sqlite_file._LOCK_TIMEOUT_S <= 5.0
+    monkeypatch.setattr(sqlite_file, "_LOCK_TIMEOUT_S", 0.1)
+    writer = begin_writing(path, "BEGIN EXCLUSIVE")
+    with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
+        pass
+    writer.close()
+
+
+@pytest.mark.parametrize("journal_mode", ["delete", "wal", "persist", "truncate"])
+def test_reading_changes_no_byte_and_leaves_no_file(path, model, journal_mode):
+    edit_database(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
+    before = fingerprint(path.parent)
+    assert len(read_all(path, model)[0]) == 15
+    assert fingerprint(path.parent) == before
+
+
+def begin_writing(path: Path, *statements: str) -> sqlite3.Connection:
+    """Return a connection that has run some SQL and stays open."""
+    writer = sqlite3.connect(path, isolation_level=None)
+    for statement in statements:
+        writer.execute(statement)
+    return writer
+
+
+def copy_as_crashed(path: Path, suffix: str) -> Path:
+    """Copy a database and one of its companions as a crash would leave them."""
+    crashed = path.parent / "crashed"
+    crashed.mkdir()
+    for name in (path.name, path.name + suffix):
+        shutil.copyfile(path.parent / name, crashed / name)
+    return crashed / path.name
+
+
+DELETE_FIRST = f"DELETE FROM two_view_geometries WHERE pair_id = {pair_id(1, 2)}"
+
+
+def test_rows_that_sit_in_a_wal_file_are_read_with_or_without_its_shm_and_the_file_is_kept(path, model):
+    wal = ("PRAGMA journal_mode = wal", "PRAGMA wal_autocheckpoint = 0")
+    writer = begin_writing(path, *wal, DELETE_FIRST)
+    crashed = copy_as_crashed(path, "-wal")
+    for there, files in ((path, {"d.db", "d.db-wal", "d.db-shm"}), (crashed, {"d.db", "d.db-wal"})):
+        before = {name: content for name, content in fingerprint(there.parent).items() if "/" not in name}
+        assert set(before) == files
+        matches, _ = read_all(there, model)
+        assert (0, 1) not in matches
+        assert len(matches) == 14
+        assert before.items() <= fingerprint(there.parent).items()
+        assert {file.name for file in there.parent.iterdir() if file.is_file()} == files
+    writer.close()
+
+
+def test_a_hot_journal_is_rolled_back_in_a_copy_only(path, model):
+    spilling = ("PRAGMA cache_size = 1", "PRAGMA cache_spill = 1", "BEGIN")  # the transaction, into the file
+    changes = ("DELETE FROM two_view_geometries", "UPDATE keypoints SET data = zeroblob(50000)")
+    writer = begin_writing(path, *spilling, *changes)
+    crashed = copy_as_crashed(path, "-journal")
+    writer.execute("ROLLBACK")
+    writer.close()
+    assert crashed.read_bytes() != path.read_bytes()
+    before = fingerprint(crashed.parent)
+
+    assert len(read_all(crashed, model)[0]) == 15
+    assert fingerprint(crashed.parent) == before
+
+
+def test_paths_that_mean_something_in_a_uri_are_read(scene, model, tmp_path):
+    folder = tmp_path / "50%41 of #1? & Fotos für=alle"
+    folder.mkdir()
+    path = write_database(folder / "d?mode=rwc.db", scene)
+    assert len(read_all(path, model)[0]) == 15
+    assert os.listdir(folder) == [path.name]
+
+
+def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, monkeypatch):
+    model = tmp_path / "work" / "sparse" / "0"
+    model.mkdir(parents=True)
+    assert find_database(model) is None
+    for folder in (tmp_path / "work", model.parent, model):
+        (folder / "database.db").touch()
+        assert find_database(model) == folder / "database.db"
+    monkeypatch.chdir(model)
+    (model / "database.db").unlink()
+    assert find_database(Path(".")) == model.parent / "database.db"
+    assert find_database(Path("../../sparse/0")) == model.parent / "database.db"
+
+
+def test_a_real_scene_is_read_in_well_under_ten_seconds():
+    folder = real_scene("castle-P30") / "sparse" / "0"
+    start = time.process_time()
+    model = read_model(folder)
+    with open_database(find_database(folder), model) as database:
+        (batch,) = database.iter_matches(1)
+    (own,) = track_matches(model)
+    # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
+    assert time.process_time() - start < 10.0
+    assert model.num_images == 30
+    assert len(batch.pairs) == 378
+    assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
+    assert np.sum(np.diff(own.offsets) >= 15) == 273
+
+
+def test_what_was_read_once_is_not_read_again_by_any_model_of_the_database(path, model, monkeypatch):
+    with open_database(path, model) as database:
+        (whole,) = database.iter_matches(1)
+        monkeypatch.setattr(type(database), "_read_matches", None)  # nothing may be read from here on
+        other = database.among(model).turned(model)
+        few = np.unique(whole.pairs[:3])
+        (again,), (part,) = other.iter_keypoints(1), other.iter_keypoints(1, few)
+        (without,) = other.iter_keypoints(1, without=whole.pairs[:1, ::-1])
+    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
+    np.testing.assert_array_equal(again.offsets, whole.offsets)
+    np.testing.assert_array_equal(without.pairs, whole.pairs[1:])
+    np.testing.assert_array_equal(without.keypoints, whole.keypoints[whole.offsets[1] :])
+    inside = np.isin(whole.pairs, few).all(axis=1)
+    np.testing.assert_array_equal(part.pairs, whole.pairs[inside])
+    rows = np.repeat(inside, np.diff(whole.offsets))
+    np.testing.assert_array_equal(part.keypoints, whole.keypoints[rows])
+
+
+def test_turned_matches_have_the_rays_of_a_database_that_is_opened_with_those_rotations(path, model):
+    axis = np.linspace(0.1, 0.3, 3 * model.num_images).reshape(-1, 3)
+    turned = dataclasses.replace(model, rotations=Rotation.from_rotvec(axis).as_matrix() @ model.rotations)
+    with open_database(path, model) as database, open_database(path, turned) as other:
+        (before,) = database.iter_matches(1)
+        (found,), (expected,) = database.turned(turned).iter_matches(1), other.iter_matches(1)
+    assert not np.array_equal(before.rays_i, expected.rays_i)
+    for name in ("rays_i", "rays_j", "keypoints", "offsets", "pairs"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+def test_matches_that_are_forgotten_are_read_again(path, model):
+    with open_database(path, model) as database:
+        (whole,) = database.iter_matches(1)
+        database.forget_matches()
+        (again,) = database.iter_matches(1)
+    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
+    np.testing.assert_array_equal(again.rays_i, whole.rays_i)
+
+
+def test_many_matches_are_cleared_and_read_again_for_all_that_share_them_and_few_are_kept(
+    path, model, monkeypatch
+):
+    with open_database(path, model) as database:
+        other = database.turned(model)
+        (whole,) = database.iter_keypoints(1)
+        reads, read = [], type(database)._read_matches
+        monkeypatch.setattr(type(database), "_read_matches", lambda *a: reads.append(a) or read(*a))
+        database.clear_matches()
+        next(database.iter_keypoints(1))
+        assert not reads
+        monkeypatch.setattr("sfm_shapefit.files.colmap.database.MOST_BESIDE_TRACKS", database.num_matches - 1)
+        before = whole.keypoints.copy()
+        database.clear_matches()
+        np.testing.assert_array_equal(whole.keypoints, before)  # what was yielded stays
+        (again,), (shared,) = database.iter_keypoints(1), other.iter_keypoints(1)
+        assert len(reads) == 1
+    for found in (again, shared):
+        np.testing.assert_array_equal(found.keypoints, before)
+        np.testing.assert_array_equal(found.offsets, whole.offsets)

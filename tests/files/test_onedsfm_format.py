@@ -1,0 +1,232 @@
+"""The 1DSfM format and g2o: conventions, round trips, and malformed lines by their number."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.files.g2o import g2o_text, is_g2o, read_g2o, read_g2o_rotations
+from sfm_shapefit.files.onedsfm import is_onedsfm, onedsfm_files, read_onedsfm, read_rotations
+from sfm_shapefit.pipeline.place import place_graph_file
+from tests.scenes import real_scene
+
+IDENTITY = "1 0 0 0 1 0 0 0 1"
+GOOD = f"3 7 {IDENTITY} 1 0 0\n3 12 {IDENTITY} 0 1 0\n7 12 {IDENTITY} 0 0 1\n"
+
+
+def scene(n=6, seed=4):
+    """Bundler cameras: world-to-camera rotations (n, 3, 3), y up, looking along -z, and centers (n, 3)."""
+    rng = np.random.default_rng(seed)
+    return Rotation.random(n, random_state=rng).as_matrix(), rng.standard_normal((n, 3))
+
+
+def egs_text(rotations, centers):
+    """EGs.txt as its manual says: R_i R_j^T, and the direction to camera j in the axes of camera i."""
+    lines = []
+    for i in range(len(centers)):
+        for j in range(i + 1, len(centers)):
+            t = rotations[i] @ (centers[j] - centers[i])
+            row = [*(rotations[i] @ rotations[j].T).ravel(), *(t / np.linalg.norm(t))]
+            lines.append(f"{10 * i} {10 * j} {' '.join(map(repr, map(float, row)))}\n")
+    return "".join(lines)
+
+
+def rots_text(rotations):
+    return "".join(f"{10 * k} {' '.join(map(repr, R.ravel().tolist()))}\n" for k, R in enumerate(rotations))
+
+
+def folder_with(path, **files):
+    path.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (path / f"{name}.txt").write_text(text)
+    return path
+
+
+def write_scene(path, n=6, num_rotations=None):
+    """Write a scene as a 1DSfM folder, and return it with the rotations and centers."""
+    rotations, centers = scene(n)
+    rots = rots_text(rotations[:num_rotations])
+    return folder_with(path, EGs=egs_text(rotations, centers), rots=rots), rotations, centers
+
+
+def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_become_those_of_colmap(tmp_path):
+    folder, rotations, centers = write_scene(tmp_path)
+    found = read_onedsfm(folder)
+    cam_from_world, all_known = read_rotations(folder / "rots.txt", found.names)
+    graph = found.view_graph(cam_from_world, all_known)
+    i, j = graph.edges.T
+    assert graph.names == ("0", "10", "20", "30", "40", "50")
+    np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
+    # Bundler's camera looks along -z and its y is up: in COLMAP's axes both turn round.
+    np.testing.assert_allclose(cam_from_world[:, 1:], -rotations[:, 1:], atol=1e-12)
+    i, j = found.pairs.T
+    relative = cam_from_world[j] @ cam_from_world[i].swapaxes(1, 2)  # cam_j_from_cam_i
+    np.testing.assert_allclose(found.rotations, relative, atol=1e-12)
+
+
+def test_what_is_written_is_what_was_read(tmp_path):
+    folder, _, centers = write_scene(tmp_path / "a")
+    found = read_onedsfm(folder)
+    cam_from_world, known = read_rotations(folder / "rots.txt", found.names)
+    texts = onedsfm_files(found, cam_from_world, np.arange(1, 6), centers[1:])
+    again_folder = folder_with(tmp_path / "b", **{name.removesuffix(".txt"): t for name, t in texts.items()})
+    again = read_onedsfm(again_folder)
+    assert texts["cc.txt"].split() == ["10", "20", "30", "40", "50"]
+    assert again.names == found.names[1:]  # cc.txt leaves the first camera out
+    inside = (found.pairs > 0).all(axis=1)
+    np.testing.assert_array_equal(again.pairs, found.pairs[inside] - 1)
+    np.testing.assert_allclose(again.rotations, found.rotations[inside], atol=1e-14)
+    np.testing.assert_allclose(again.to_second, found.to_second[inside], atol=1e-14)
+    np.testing.assert_allclose(
+        read_rotations(again_folder / "rots.txt", again.names)[0], cam_from_world[1:], atol=1e-14
+    )
+    solution = [line.split() for line in texts["soln.txt"].splitlines()]
+    np.testing.assert_array_equal([[float(x) for x in row[1:]] for row in solution], centers[1:])
+    assert known.all()
+
+
+def test_cameras_without_rotation_have_no_directions_and_the_format_is_told_from_bare_graphs(tmp_path):
+    folder, _, _ = write_scene(tmp_path, num_rotations=4)
+    found = read_onedsfm(folder)
+    graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
+    assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
+    folder_with(folder, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
+    assert is_onedsfm(folder)
+    assert is_onedsfm(folder / "EGs.txt")
+    for name in ("graph.txt", "wide.txt", "nowhere.txt"):  # the second has directions in 12 dimensions
+        assert not is_onedsfm(folder / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("EGs", "", "no lines of the form i j R11"),
+        ("EGs", f"1 2 {IDENTITY} 1 0\n", "line 1: has 13 columns, expected 14"),
+        ("EGs", f"{GOOD}\n1 2 {IDENTITY} 1 0 x\n", "line 5: 'x' is not a number"),
+        ("EGs", f"{GOOD}1 2 {IDENTITY} 1 0 inf\n", "line 4: has a number that is not finite"),
+        ("EGs", f"{GOOD}1 2 1 0 0 0 1 0 0 0 -1 1 0 0\n", "line 4: has no rotation matrix"),
+        ("EGs", f"{GOOD}1 2 2 0 0 0 1 0 0 0 1 1 0 0\n", "line 4: has no rotation matrix"),
+        ("EGs", f"{GOOD}1 2 {IDENTITY} 2 0 0\n", "line 4: has no unit direction"),
+        ("EGs", f"{GOOD}1 1 {IDENTITY} 1 0 0\n", "line 4: joins a camera with itself"),
+        ("EGs", f"{GOOD}7 3 {IDENTITY} 1 0 0\n", "line 4: repeats an earlier pair"),
+        ("rots", f"3 {IDENTITY}\n7 1 2 3\n", "line 2: has 4 columns, expected 10"),
+        ("rots", f"3 {IDENTITY}\n7 1 0 0 0 1 0 0 0 2\n", "line 2: has no rotation matrix"),
+        ("rots", f"3 {IDENTITY}\n3 {IDENTITY}\n", "line 2: gives an earlier camera a second rotation"),
+        ("rots", f"4 {IDENTITY}\n", "a rotation of none of the 3 cameras"),
+        ("cc", "3\n7 1\n", "line 2: is not one"),
+        ("cc", "1\n", "keeps no pair"),
+    ],
+)
+def test_malformed_pairs_rotations_and_components_are_refused_by_line(tmp_path, name, text, words):
+    folder_with(tmp_path, **({"EGs": GOOD} | {name: text}))
+    with pytest.raises(InputError, match=words):
+        read_rotations(tmp_path / "rots.txt", read_onedsfm(tmp_path).names)
+
+
+def test_the_published_scene_has_the_conventions_of_its_manual():
+    source = real_scene("1dsfm-Madrid_Metropolis")
+    found = read_onedsfm(source)
+    assert (len(found.names), len(found.pairs)) == (394, 23_784)
+    stored = np.load(source / "viewgraph.npz")
+    names = [str(k) for k in stored["image_index"].tolist()]
+    assert set(names) == set(found.names)
+    ours = {(found.names[i], found.names[j]): k for k, (i, j) in enumerate(found.pairs.tolist())}
+    rows = [ours[names[i], names[j]] for i, j in stored["edges"].tolist()]
+    np.testing.assert_allclose(found.rotations[rows], stored["R_ji"], atol=1e-5)  # six digits, float32
+    to_second = -np.einsum("eba,eb->ea", stored["R_ji"], stored["t_ji"]).astype(np.float64)
+    assert angle_between_deg(found.to_second[rows], to_second).max() < 1e-3
+
+
+def test_g2o_has_the_camera_in_the_world_and_numbers_nodes_that_have_names():
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
+    (line,) = g2o_text(["12"], np.array([[1.0, 2.0, 3.0]]), turn[None]).splitlines()
+    tag, name, *numbers = line.split()
+    assert (tag, name) == ("VERTEX_SE3:QUAT", "12")
+    world_from_cam = [0.0, 0.0, -np.sin(0.15), np.cos(0.15)]
+    np.testing.assert_allclose([float(x) for x in numbers], [1.0, 2.0, 3.0, *world_from_cam], atol=1e-15)
+    text = g2o_text(["b.jpg", "a\n.jpg"], np.array([[0.1, 2.0], [3.0, 4.0]]))
+    assert text == "# 0 b.jpg\nVERTEX_XY 0 0.1 2.0\n# 1 a?.jpg\nVERTEX_XY 1 3.0 4.0\n"
+    assert g2o_text(["5"], np.array([[1.0, 2.0, 3.0]])) == "VERTEX_TRACKXYZ 5 1.0 2.0 3.0\n"
+    with pytest.raises(InputError, match="5 dimensions"):
+        g2o_text(["0"], np.zeros((1, 5)))
+
+
+def edges_text(cam_from_world, centers, information=""):
+    """All pairs as a pose-graph tool writes them: the pose of j in the axes of i, in meters."""
+    lines = []
+    for i in range(len(centers)):
+        for j in range(i + 1, len(centers)):
+            seen = cam_from_world[i] @ (centers[j] - centers[i])
+            turn = Rotation.from_matrix(cam_from_world[i] @ cam_from_world[j].T).as_quat()
+            numbers = " ".join(map(repr, map(float, [*seen, *turn])))
+            lines.append(f"EDGE_SE3:QUAT {10 * i} {10 * j} {numbers}{information}\n")
+    return "".join(lines)
+
+
+def test_the_edges_of_a_g2o_file_are_relative_poses_and_its_vertices_rotations(tmp_path):
+    cam_from_world, centers = scene()
+    names = [str(10 * k) for k in range(6)]
+    vertices = g2o_text(names, centers, cam_from_world)
+    information = " 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    file = tmp_path / "graph.g2o"
+    file.write_text(f"# made here\n{vertices}FIX 0\n{edges_text(cam_from_world, centers, information)}")
+    poses = read_g2o(file)
+    assert is_g2o(file)
+    assert poses.names == tuple(names)
+    i, j = poses.pairs.T
+    np.testing.assert_allclose(
+        poses.rotations, cam_from_world[j] @ cam_from_world[i].swapaxes(1, 2), atol=1e-14
+    )
+    rotations, known = read_g2o_rotations(file, poses.names)
+    assert known.all()
+    np.testing.assert_allclose(rotations, cam_from_world, atol=1e-14)
+    graph = poses.view_graph(rotations, known)
+    np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
+
+
+def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
+    cam_from_world, centers = scene()
+    file = tmp_path / "graph.g2o"
+    vertices = g2o_text([str(10 * k) for k in range(6)], np.zeros((6, 3)), cam_from_world)
+    file.write_text(edges_text(cam_from_world, centers) + vertices)
+    found = place_graph_file(file, rotations=file)
+    assert "6 of 6 rotations of" in found.statement
+    placed, true = (x - x.mean(axis=0) for x in (found.placement.locations, centers))
+    # Exact directions: positions come back but for scale, to the solve's tolerance.
+    np.testing.assert_allclose(placed / np.linalg.norm(placed), true / np.linalg.norm(true), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0", "line 2: has 9 columns, expected 10"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 5 5", "line 2: has 12 columns, expected 10"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 x", "line 2: 'x' is not a number"),
+        ("EDGE_SE3:QUAT 1 2 nan 0 0 0 0 0 1", "line 2: has a number that is not finite"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 2", "line 2: has no unit quaternion"),
+        ("EDGE_SE3:QUAT 1 2 0 0 0 0 0 0 1", "line 2: has no translation"),
+        ("EDGE_SE3:QUAT 2 2 1 0 0 0 0 0 1", "line 2: joins a vertex with itself"),
+        ("EDGE_SE3:QUAT 1 0 1 0 0 0 0 0 1", "line 2: gives a pair for the second time"),
+        ("EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1", "line 2: is neither a vertex nor EDGE_SE3:QUAT"),
+    ],
+)
+def test_malformed_edges_of_g2o_are_refused_by_line(tmp_path, line, words):
+    (tmp_path / "graph.g2o").write_text(f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(InputError, match=words):
+        read_g2o(tmp_path / "graph.g2o")
+
+
+def test_vertices_that_are_none_twice_or_of_others_are_refused(tmp_path):
+    file = tmp_path / "graph.g2o"
+    vertex = "VERTEX_SE3:QUAT 0 1 2 3 0 0 0 1\n"
+    for text, words in [
+        (vertex * 2, "line 2: gives an earlier camera a second rotation"),
+        (vertex, "has a rotation of none of the 1 cameras"),
+        ("VERTEX_SE2 0 1 2 0\n", "has no VERTEX_SE3:QUAT"),
+    ]:
+        file.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_g2o_rotations(file, ("7",))
+    with pytest.raises(InputError, match="has no EDGE_SE3:QUAT"):
+        read_g2o(file)

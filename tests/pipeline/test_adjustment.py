@@ -1,0 +1,160 @@
+"""Placed cameras adjusted to the pixels, with the given rotations held, weighted or free."""
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from sfm_shapefit.files.colmap.model import read_model, with_frame_rotations
+from tests.scenes import COURTYARD, RING, copied, edit_database, real_scene
+
+DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
+
+
+def turned(model, sigma_deg, seed=4):
+    """The posed model with rotations that are off by sigma per axis, but for the first camera's."""
+    rng = np.random.default_rng(seed)
+    copy = pycolmap.Reconstruction(model)
+    for k, image_id in enumerate(sorted(copy.reg_image_ids())):
+        image = copy.image(image_id)
+        error = Rotation.from_rotvec(np.radians(sigma_deg) * rng.standard_normal(3)).as_matrix()
+        if k:
+            rotation = pycolmap.Rotation3d(error @ image.cam_from_world().rotation.matrix())
+            pose = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ image.projection_center()))
+            copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    return copy
+
+
+def rotations_of(found):
+    model = found.reconstruction
+    return {i: model.image(i).cam_from_world().rotation.quat for i in model.reg_image_ids()}
+
+
+@pytest.fixture(scope="module")
+def placed():
+    return sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust=False)
+
+
+@pytest.fixture(scope="module")
+def off():
+    """The courtyard with rotations off by 0.2 degrees."""
+    return turned(pycolmap.Reconstruction(COURTYARD / "sparse" / "0"), 0.2)
+
+
+@pytest.fixture(scope="module")
+def adjusted(off):
+    return sfm_shapefit.locate(off, DATABASE)
+
+
+def error(found):
+    return sfm_shapefit.evaluate(found.reconstruction, TRUTH)
+
+
+def test_exact_rotations_are_held_to_the_bit_and_centers_gain(placed):
+    found = sfm_shapefit.locate(COURTYARD / "sparse" / "0")
+    assert found.adjustment.weight.hold
+    assert "held" in found.adjustment.statement
+    assert error(found).position.mean < 0.8 * error(placed).position.mean
+    given = pycolmap.Reconstruction(COURTYARD / "sparse" / "0")
+    for image_id, quat in rotations_of(found).items():
+        np.testing.assert_array_equal(quat, given.image(image_id).cam_from_world().rotation.quat)
+    told = found.summary()["adjustment"]
+    assert (told["rotations"], told["rotation_sigma_deg"]) == ("held", None)
+    assert found.summary()["rotation_refinement"]["num_updated"] == 0
+    assert placed.adjustment is None
+    assert placed.summary()["adjustment"] is None
+
+
+def test_rotations_that_are_off_are_weighted_by_about_how_much_and_end_nearer_to_the_truth(off, adjusted):
+    plain = sfm_shapefit.locate(off, DATABASE, adjust=False)
+    told = adjusted.summary()["adjustment"]
+    assert told["rotations"] == "weighted"
+    # The root mean square of 24 x 3 normal numbers is within 4 / sqrt(144) = 33 % of sigma.
+    assert told["rotation_sigma_deg"] == pytest.approx(0.2, rel=0.33)
+    assert error(adjusted).position.median < 0.3 * error(plain).position.median
+    assert error(adjusted).rotation_deg.median < 0.3 * error(plain).rotation_deg.median
+    assert adjusted.kept.sum() >= plain.kept.sum()
+    assert adjusted.summary()["rotation_refinement"]["num_updated"] > 20
+
+
+def test_measured_rotations_are_held_without_a_question_and_a_given_sigma_is_used(off):
+    held = sfm_shapefit.locate(off, DATABASE, rotations="measured", min_trust=0.0)
+    assert held.adjustment.errors is None
+    given = pycolmap.Reconstruction(off)
+    for image_id, quat in rotations_of(held).items():
+        np.testing.assert_array_equal(quat, given.image(image_id).cam_from_world().rotation.quat)
+    tight, loose = (
+        sfm_shapefit.locate(off, DATABASE, rotation_sigma_deg=sigma, min_trust=0.0) for sigma in (1e-3, 0.2)
+    )
+    free = sfm_shapefit.locate(off, DATABASE, rotations="free", min_trust=0.0)
+    turns = [np.median(one.turned_deg) for one in (tight, loose, free)]
+    assert turns[0] < 0.01
+    assert turns[1] > 0.1
+    assert turns[1] == pytest.approx(turns[2], rel=0.2)
+    assert "weighted by 0.2 deg, as asked" in loose.adjustment.statement
+    assert "rotations free, as asked" in free.adjustment.statement
+
+
+def test_bundle_adjustment_obeys_the_same_choice(placed):
+    """With exact rotations free, bundle adjustment takes the courtyard's centers away from the truth."""
+    model = COURTYARD / "sparse" / "0"
+    auto = sfm_shapefit.locate(model, bundle_adjust=True)
+    free = sfm_shapefit.locate(model, bundle_adjust=True, rotations="free")
+    assert error(auto).position.mean < error(placed).position.mean < error(free).position.mean
+    assert error(auto).rotation_deg.max < 1e-5 < error(free).rotation_deg.max
+
+
+def test_the_models_own_tracks_serve_as_well():
+    off = turned(pycolmap.Reconstruction(RING / "sparse" / "0"), 0.2, seed=1)
+    plain = sfm_shapefit.locate(off, directions="tracks", adjust=False)
+    found = sfm_shapefit.locate(off, directions="tracks")
+    before, after = (
+        sfm_shapefit.evaluate(one.reconstruction, RING / "sparse" / "0") for one in (plain, found)
+    )
+    assert after.rotation_deg.median < 0.25 * before.rotation_deg.median
+
+
+def test_an_optimum_that_was_asked_for_is_delivered_as_it_is():
+    for option in ({"objective": "shapefit"}, {"refine": False}, {"objective": "least-squares"}):
+        assert sfm_shapefit.locate(RING / "sparse" / "0", **option).adjustment is None
+
+
+def test_frames_turn_about_their_centers_and_the_input_stays_as_it_is():
+    model = read_model(RING / "sparse" / "0")
+    other = turned(model.reconstruction, 1.0)
+    found = with_frame_rotations(model, other)
+    theirs = [other.image(i).cam_from_world().rotation.matrix() for i in model.image_ids.tolist()]
+    np.testing.assert_allclose(found.rotations, theirs, atol=1e-14)
+    np.testing.assert_allclose(found.centers, model.centers, atol=1e-13)
+    np.testing.assert_array_equal(found.rotations[0], model.rotations[0])
+    again = read_model(RING / "sparse" / "0")
+    np.testing.assert_array_equal(model.rotations, again.rotations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "mean"), [("castle-P19", 0.030), ("castle-P30", 0.023)])
+def test_a_real_scene_gains_from_weighted_rotations_and_no_camera_is_lost(name, mean):
+    """As placed, the mean errors are 0.044 and 0.028 m."""
+    scene = real_scene(name)
+    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
+    assert not errors.missing
+    assert errors.position.mean < mean
+
+
+def test_a_focal_length_that_is_the_databases_guess_is_found(tmp_path):
+    guess = np.array([1150.0, 1150.0, 600.0, 450.0])
+    change = f"UPDATE cameras SET params = x'{guess.astype('<f8').tobytes().hex()}', prior_focal_length = 0"
+    path = edit_database(copied(RING, tmp_path) / "database.db", change)
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    calibrated = sfm_shapefit.locate(model, path)
+    assert calibrated.summary()["intrinsics"] == []
+    model.camera(1).params = guess
+    found = sfm_shapefit.locate(model, path)
+    (row,) = found.summary()["intrinsics"]
+    assert row["decided_by"] == "adjusted"
+    assert row["focal_px"] == pytest.approx(1000.0, rel=1e-3)
+    errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    assert not any("focal" in warning for warning in found.warnings)

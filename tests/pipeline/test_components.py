@@ -1,0 +1,56 @@
+"""Components with averaged rotations, and what is said of the frames that get none."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.components import ComponentAveraging
+
+
+def averaged(pairs, weight_shares, **options):
+    """The groups of frames that get rotations, and the reasons of the others."""
+    k = len(pairs)
+    relative = RelativeRotations(
+        pairs=np.array(pairs),
+        rotations=np.tile(np.eye(3), (k, 1, 1)),
+        information=np.tile(1e6 * np.eye(3), (k, 1, 1)),
+        num_matches=np.full(k, 100),
+        weight_shares=np.array(weight_shares),
+    )
+    reasons: dict[int, str] = {}
+    components = ComponentAveraging(MapOptions(**options), Clock(), gravity=None, shares={})
+    found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
+    return [frames.tolist() for frames, _ in found], reasons
+
+
+SOUND, UNSOUND = 0.9, 0.2
+
+
+def test_each_frame_of_a_component_too_small_once_averaged_is_told_so():
+    groups, reasons = averaged([(0, 1), (1, 2)], [SOUND, UNSOUND])
+    assert groups == []
+    few = "tied to 1 other image only by pairs that can be believed; a model needs 3"
+    assert (reasons[0], reasons[1]) == (few, few)
+    assert reasons[2].startswith("no pair that can be believed ties it to the others")
+
+
+def test_frames_behind_unsound_pairs_are_a_component_of_their_own():
+    pairs = [(0, 1), (1, 2), (0, 2), (2, 3), (3, 4), (4, 5), (3, 5)]
+    groups, reasons = averaged(pairs, [SOUND, SOUND, SOUND, UNSOUND, SOUND, SOUND, SOUND])
+    assert groups == [[0, 1, 2], [3, 4, 5]]
+    assert set(reasons) <= {3, 4, 5}  # the caller takes these back once they have a model
+
+
+def test_a_limit_of_matches_that_no_pair_reaches_is_named():
+    _, reasons = averaged([(0, 1), (1, 2), (0, 2)], [SOUND] * 3, min_matches=101)
+    assert reasons[0] == "none of 3 pairs has 101 inlier matches; lower min_matches"
+
+
+def test_a_stage_that_fails_has_taken_its_time():
+    clock = Clock()
+    with pytest.raises(UnsolvableError), clock("locate"):
+        raise UnsolvableError
+    assert list(clock.seconds) == ["locate"]

@@ -1,0 +1,224 @@
+"""Ground control points set scale, origin and axes; what is wrong with them is said."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.colmap.control_points import read_control_points
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.pipeline.control_points import read_control
+from sfm_shapefit.placement.control_points import ControlPoints, fit_control_points
+from tests.scenes import RING
+
+TURN = pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])).matrix()
+WORLD = Similarity(scale=2.5, rotation=TURN, translation=np.array([10.0, -20.0, 30.0]))
+CORNERS = 0.3 * np.array([[1, 1, 0], [-1, 1, 0], [1, -1, 0], [-1, -1, 0], [0, 0, 1], [0, 1, -1], [1, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return pycolmap.Reconstruction(RING / "sparse" / "0")
+
+
+def marks_of(ring, points, world=WORLD.apply):
+    """Return the lines of points (k, 3) of the ring's world: P0, P1, ..., with all their marks."""
+    images = sorted(ring.images.values(), key=lambda image: image.name)
+    lines = []
+    for k, (point, xyz) in enumerate(zip(points, world(points).tolist(), strict=True)):
+        for image in images:
+            u, v = image.project_point(point)
+            lines.append(
+                " ".join(f"{value!r}" for value in (*xyz, float(u), float(v))) + f" {image.name} P{k}"
+            )
+    return lines
+
+
+def written(folder, lines, projection="local"):
+    path = folder / "gcp_list.txt"
+    path.write_text("\n".join([projection, *lines]) + "\n")
+    return str(path)
+
+
+def centers_of(model):
+    return {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
+
+
+@pytest.mark.parametrize("options", [{}, {"bundle_adjust": True}], ids=["placed", "adjusted"])
+def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp_path, options):
+    lines = marks_of(ring, CORNERS)
+    for k, line in enumerate(lines):  # P6 checks only; P4 is a meter too high
+        cells = line.split()
+        if cells[6] == "P4":
+            lines[k] = " ".join([*cells[:2], repr(float(cells[2]) + 1.0), *cells[3:]])
+        if cells[6] == "P6":
+            lines[k] = f"{line} check"
+    wrong = lines[0].split()
+    lines[0] = " ".join([*wrong[:3], repr(float(wrong[3]) + 300.0), *wrong[4:]])
+    path = written(tmp_path, lines)
+    found = sfm_shapefit.locate(ring, RING / "database.db", control_points=path, **options)
+    assert found.gauge.scale == "control points"
+    assert found.gauge.statement.startswith(f"control points: 7 points of {path}; 5 of 6 agree")
+    for name, center in centers_of(found.reconstruction).items():
+        true = WORLD.apply(ring.find_image_with_name(name).projection_center()[None])[0]
+        np.testing.assert_allclose(center, true, atol=1e-4)  # keypoints of float32 are off by 3e-5 px
+    centers = [centers_of(found.reconstruction)[row.name] for row in found.cameras]
+    np.testing.assert_allclose([row.center for row in found.cameras], centers, atol=1e-12)
+    near = found.gauge.apply(found.placement.locations)
+    np.testing.assert_allclose(near, [row.center for row in found.cameras], atol=1e-2)
+    rows = {row["name"]: row for row in found.summary()["control_points"]}
+    assert [rows[f"P{k}"]["use"] for k in range(7)] == ["control"] * 4 + ["unused", "control", "check"]
+    assert rows["P6"]["error"] < 1e-4
+    np.testing.assert_allclose(rows["P4"]["residual"], [0.0, 0.0, -1.0], atol=1e-3)
+    assert rows["P0"]["num_agreeing_marks"] == rows["P0"]["num_marks"] - 1 == 7
+    said = " ".join(found.warnings)
+    assert "1 of the control points contradict the others and set nothing, P4 most, which is 1 off" in said
+    assert "1 mark of control points miss where the others put the point, that of P0 in" in said
+
+
+def test_map_stands_where_the_points_are(ring, tmp_path):
+    path = written(tmp_path, marks_of(ring, CORNERS))
+    found = sfm_shapefit.map_database(RING / "database.db", control_points=path).models[0].located
+    for name, center in centers_of(found.reconstruction).items():
+        true = WORLD.apply(ring.find_image_with_name(name).projection_center()[None])[0]
+        np.testing.assert_allclose(center, true, atol=1e-3)
+
+
+ORIGIN = np.array([48.1, 11.5, 520.0])
+
+
+def on_earth(points):
+    """Latitude, longitude and altitude of points (k, 3), in meters from a place in Munich."""
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.enu_to_ellipsoid(points, *ORIGIN))
+
+
+def in_utm(points):
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.ellipsoid_to_utm(on_earth(points))[0])
+
+
+@pytest.mark.parametrize(
+    ("projection", "world"),
+    [
+        ("EPSG:4326", lambda p: on_earth(p)[:, [1, 0, 2]]),
+        ("+proj=longlat +datum=WGS84 +no_defs", lambda p: on_earth(p)[:, [1, 0, 2]]),
+        ("WGS84 UTM 32N", in_utm),
+        ("EPSG:32632", in_utm),
+        ("+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs", in_utm),
+    ],
+)
+def test_coordinates_on_earth_become_east_north_and_up_of_their_median(ring, tmp_path, projection, world):
+    known = read_control_points(
+        tmp_path / written(tmp_path, marks_of(ring, CORNERS, world), projection), read_model(ring)
+    )
+    assert known.datum == pytest.approx(np.median(on_earth(CORNERS), axis=0), abs=1e-5)
+    apart = known.positions - known.positions[0]
+    np.testing.assert_allclose(apart, CORNERS - CORNERS[0], atol=1e-6)  # a nanometer of UTM's series
+
+
+def line(k, image="0001.jpg", name=None):
+    x, y, z = CORNERS[k].tolist()
+    return f"{x} {y} {z} 100 100 {image} {f'P{k}' if name is None else name}"
+
+
+TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
+
+
+@pytest.mark.parametrize(
+    ("projection", "lines", "said"),
+    [
+        ("EPSG:31468", TWICE, "line 1: the projection 'EPSG:31468' is not one that is converted"),
+        ("+proj=utm +zone=32 +ellps=bessel", TWICE, "is not one that is converted"),
+        ("WGS84 UTM 61N", TWICE, "is not one that is converted"),
+        (
+            "EPSG:4326",
+            [line.replace("0.3 0.3", "11.0 95.0") for line in TWICE],
+            "latitude or longitude is out",
+        ),
+        ("local", [*TWICE, "1 2 nan 3 4 0001.jpg P9"], "line 10: coordinates must be finite, and all three"),
+        ("local", [*TWICE, "1 2 3 4 0001.jpg"], "line 10: expected x y z, two pixel coordinates"),
+        ("local", [*TWICE, TWICE[0]], "line 10: P0 is marked twice in 0001.jpg; keep one of its marks"),
+        ("local", [*TWICE, line(1, "0003.jpg", "P0")], "line 10: P0 has other coordinates than in line 2"),
+        (
+            "local",
+            [*TWICE, f"{line(0, '0003.jpg')} check"],
+            "line 10: P0 is a check point in one line and none",
+        ),
+        ("local", [line(k, "other.jpg") for k in range(4)], "has no mark in an image of the model, such as"),
+        (
+            "local",
+            TWICE[:4],
+            "2 of the control points have marks in two images of the model, and scale and axes",
+        ),
+        ("local", TWICE[::2], "0 of the control points have marks in two images"),
+        ("local", [line.replace("P3", "CHK-3").replace("P2", "CHK-2") for line in TWICE], "2 of the control"),
+        (
+            "local",
+            [f"{k} {k} {k} 1 1 {image} P{k}" for k in range(4) for image in ("0001.jpg", "0002.jpg")],
+            "the control points that have marks in two images of the model lie on a line",
+        ),
+    ],
+)
+def test_a_file_that_cannot_serve_is_refused(ring, tmp_path, projection, lines, said):
+    path = written(tmp_path, lines, projection)
+    with pytest.raises(InputError, match=path.replace(".", r"\.")) as refused:
+        read_control(read_model(ring), LocateOptions(control_points=path))
+    assert said in str(refused.value)
+
+
+def test_an_empty_file_is_refused(ring, tmp_path):
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    with pytest.raises(InputError, match=r"is empty; its first line is the projection"):
+        read_control_points(tmp_path / "empty.txt", read_model(ring))
+
+
+def test_only_one_thing_sets_the_scale(ring, tmp_path):
+    path = written(tmp_path, TWICE)
+    for other in ({"scale": "unit"}, {"known_distance": ("a", "b", 1.0)}, {"fix": "solved"}):
+        with pytest.raises(ValueError, match="would both set the scale; leave out one"):
+            LocateOptions(control_points=path, **other)
+    with pytest.raises(InputError, match="control points and position priors would both set the scale"):
+        sfm_shapefit.locate(ring, RING / "database.db", control_points=path, priors=path)
+
+
+def test_points_that_cannot_be_triangulated_leave_the_model_as_it_is(ring, tmp_path):
+    found = sfm_shapefit.locate(ring, RING / "database.db", control_points=written(tmp_path, TWICE))
+    assert found.gauge.scale == "input"
+    assert any(
+        "the model does not stand in the axes of the control points" in said for said in found.warnings
+    )
+    assert {row["use"] for row in found.summary()["control_points"]} == {"unused"}
+
+
+@pytest.mark.parametrize("count", [5, 8])
+def test_wrong_points_have_no_part_in_the_fit(count):
+    """A quarter of the points is wrong, rounded down but one at least."""
+    wrong, lost, found_all = max(1, count // 4), [], 0
+    for seed in range(3):
+        rng = np.random.default_rng([count, seed])
+        found = rng.uniform(-10.0, 10.0, (count, 3))
+        positions = WORLD.apply(found) + 0.02 * rng.standard_normal((count, 3))
+        positions[:wrong] += 2.0 * rng.standard_normal((wrong, 3))
+        none = np.zeros(0, dtype=np.int64)
+        known = ControlPoints(
+            names=tuple(map(str, range(count))),
+            positions=positions,
+            is_check=np.zeros(count, dtype=np.bool_),
+            points=none,
+            images=none,
+            pixels=np.zeros((0, 2)),
+            statement="",
+        )
+        fit = fit_control_points(known, found)
+        found_all += not fit.fitting[:wrong].any()
+        lost.append(int(np.sum(~fit.fitting[wrong:])))
+        # Of 3 n coordinates with 7 parameters, sigma is known to 1 / sqrt(2 (3 n - 7)).
+        if not fit.fitting[:wrong].any() and not lost[-1]:
+            freedom = 3 * (count - wrong) - 7
+            assert fit.sigma == pytest.approx(0.02, rel=4.0 / np.sqrt(2 * freedom))
+    assert found_all == 3
+    assert sum(lost) <= 1

@@ -1,0 +1,208 @@
+"""Directions measured by other processes equal those of one; a worker that dies is replaced or reported."""
+
+import dataclasses
+import os
+import signal
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import from_posed_cameras, posed_cameras, read_model
+from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.pair_directions import concatenate
+from sfm_shapefit.pipeline import execution
+from sfm_shapefit.pipeline.execution import (
+    PairTask,
+    PairWork,
+    WorkerError,
+    measure_task,
+    measure_with_workers,
+    open_executor,
+)
+from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.program import run_python
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A small ring as a COLMAP workspace."""
+    out = tmp_path_factory.mktemp("execution") / "ring"
+    write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def model(workspace):
+    return read_model(workspace / "sparse" / "0")
+
+
+WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()), matches_per_task=700)
+
+
+def serial(workspace, model):
+    cameras = posed_cameras(model)
+    with open_database(workspace / "database.db", model) as database:
+        whole = database.rows((0, database.num_pairs))
+    task = PairTask(database=workspace / "database.db", rows=whole, cameras=cameras, work=WORK)
+    (found,) = measure_task(task)
+    return found
+
+
+def shared(workspace, model, executor):
+    seen = []
+    with open_database(workspace / "database.db", model) as database:
+        parts = measure_with_workers(database, model, WORK, executor, lambda *done: seen.append(done))
+    return concatenate(parts), seen
+
+
+def assert_same_bits(a, b):
+    for field in dataclasses.fields(a):
+        ours, theirs = getattr(a, field.name), getattr(b, field.name)
+        if field.name == "status":
+            assert list(ours) == list(theirs)
+        else:
+            np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
+
+
+def test_parts_cover_all_pairs_once_and_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
+    found = []
+    for one in (model, from_posed_cameras(posed_cameras(model))):
+        with open_database(workspace / "database.db", one) as database:
+            found.append(list(database.iter_matches(1)))
+            whole = np.concatenate([batch.pairs for batch in found[-1]])
+            for size in (1, 700, 10**9):
+                parts = database.parts(size)
+                pieces = [b.pairs for part in parts for b in database.iter_matches(1, part=part)]
+                np.testing.assert_array_equal(np.concatenate(pieces), whole)
+            assert len(database.parts(700)) > 3
+            assert len(database.parts(10**9)) == 1
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a.rays_i, b.rays_i)
+        np.testing.assert_array_equal(a.rays_j, b.rays_j)
+
+
+def test_a_worker_does_not_read_the_table_of_all_pairs(workspace, model, monkeypatch):
+    expected = serial(workspace, model)
+    with open_database(workspace / "database.db", model) as database:
+        halves = [(0, database.num_pairs // 2), (database.num_pairs // 2, database.num_pairs)]
+        rows = [database.rows(half) for half in halves]
+    monkeypatch.delattr("sfm_shapefit.files.colmap.database.read_pairs")
+    tasks = [
+        PairTask(database=workspace / "database.db", rows=own, cameras=posed_cameras(model), work=WORK)
+        for own in rows
+    ]
+    assert_same_bits(concatenate([part for task in tasks for part in measure_task(task)]), expected)
+
+
+def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):
+    with ThreadPoolExecutor(2) as pool:
+        found, seen = shared(workspace, model, pool)
+    assert_same_bits(found, serial(workspace, model))
+    assert seen[-1] == (len(found.pairs), len(found.pairs))
+
+
+@pytest.mark.slow
+def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(workspace, model):
+    with open_executor("processes", 2) as pool:
+        found, _ = shared(workspace, model, pool)
+    assert_same_bits(found, serial(workspace, model))
+
+
+def _die(_task):
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", _die)
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
+        pytest.raises(WorkerError, match=r"a worker failed .* run again"),
+    ):
+        shared(workspace, model, pool)
+
+
+def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
+    def refuse(_task):
+        raise InputError("the database is damaged")
+
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", refuse)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
+        shared(workspace, model, pool)
+
+
+def die_once(flag, task):
+    """Kill the first worker that comes here, in the middle of the work."""
+    try:
+        os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        time.sleep(0.05)
+        return measure_task(task)
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
+    pytest.importorskip("distributed")
+    flag = tmp_path / "killed"
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", partial(die_once, str(flag)))
+    with open_executor("dask", 2) as pool:
+        found, _ = shared(workspace, model, pool)
+    assert flag.exists()
+    assert_same_bits(found, serial(workspace, model))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+def test_an_interrupt_of_all_processes_is_the_business_of_the_first_one(kind):
+    if kind == "dask":
+        pytest.importorskip("distributed")
+    script = """
+import os, signal, sys, time
+os.setsid()
+from sfm_shapefit.pipeline.execution import open_executor
+try:
+    with open_executor(sys.argv[1], 2) as pool:
+        list(pool.map(abs, range(20)))  # all workers are there, and wait
+        os.killpg(os.getpgrp(), signal.SIGINT)  # as a terminal does
+        time.sleep(60)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    done = run_python("-c", script, kind)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
+    done, before = [], signal.getsignal(signal.SIGINT)
+
+    def open_cluster():
+        with execution._interrupts_wait():
+            signal.raise_signal(signal.SIGINT)
+            done.append(1)
+
+    with pytest.raises(KeyboardInterrupt):
+        open_cluster()
+    assert done == [1]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.slow
+def test_a_second_cluster_on_a_machine_opens_without_a_word(recwarn):
+    pytest.importorskip("distributed")
+    with open_executor("dask", 1) as first, open_executor("dask", 1) as second:
+        assert [pool.submit(abs, -2).result() for pool in (first, second)] == [2, 2]
+    assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
+
+
+def test_a_scheduler_without_dask_is_refused():
+    with pytest.raises(InputError, match="belongs to the executor dask"), open_executor("serial", 1, "a:1"):
+        pass

@@ -1,0 +1,685 @@
+"""`map`: from a database alone to models, one for each component, with rotations the matches agree with."""
+
+import dataclasses
+import json
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from abuse import determinism
+from abuse.verdicts import read_cameras
+from sfm_shapefit.adjustment import structure as triangulation
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.facts.intrinsics import describe_intrinsics
+from sfm_shapefit.facts.scene_words import describe_line, describe_loops
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.merge import merge_models
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.pair_list import read_pair_list
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline import execution, relative_rotations
+from sfm_shapefit.pipeline.execution import PairTask, open_executor
+from sfm_shapefit.pipeline.relative_rotations import measure_rotations
+from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.first_screen import banner
+from sfm_shapefit.report.read_back import read_output
+from sfm_shapefit.rotations.trusted import average_consistently
+from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.facts.test_schema import problems
+from tests.pipeline.test_execution import die_once
+from tests.program import run, run_python
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+
+PAIR = 2147483647
+FAST = {"points": "never"}
+
+
+def changed(scene, folder, *statements):
+    """A copy of a scene's database after some SQL."""
+    return edit_database(copied(scene, folder) / "database.db", *statements)
+
+
+def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
+    before = fingerprint(COURTYARD)
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", sfm_shapefit.MapOptions(points="never"))
+    assert fingerprint(COURTYARD) == before
+    (model,) = found.models
+    assert (found.num_placed, found.left_out, found.warnings) == (25, {}, ())
+    errors = sfm_shapefit.evaluate(model.located.reconstruction, COURTYARD / "truth")
+    assert errors.position.max < 0.005 * errors.extent  # measured 0.0007; a quarter of the pairs is false
+    assert errors.rotation_deg.max < 0.2
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert read_model(tmp_path / "out" / "0").num_images == 25
+    assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
+    facts = json.loads((tmp_path / "out" / "map.json").read_text())
+    assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
+    # The pairs whose baselines were made false are told by the matches that are missing in their overlap.
+    pairs = {name: np.array(column) for name, column in model.located.table("pairs").items()}
+    false = pairs["residual_deg"] > 10.0
+    assert false.sum() > 30
+    assert np.nanmax(pairs["pair_score"][false]) < np.nanmedian(pairs["pair_score"][~false])
+    assert not (tmp_path / "out" / "0" / "doubtful_pairs.csv").exists()
+
+
+def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", points="never")
+    located = found.models[0].located
+    shares, row = located.matched_shares.copy(), next(r for r in located.pairs if r.verdict == "inlier")
+    names = [(pair.name1, pair.name2) for pair in located.pairs]
+    shares[names.index((row.name1, row.name2))] = 1e-4
+    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, matched_shares=shares))
+    sfm_shapefit.write_map_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
+    listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
+    assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}
+    assert "1 pair in use looks like repeated" in (tmp_path / "out" / "0" / "report.html").read_text()
+
+
+def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    positions = dict(zip(truth.names, 2.0 * truth.centers @ turn.T + 100.0, strict=True))
+    table = tmp_path / "priors.txt"
+    table.write_text(
+        "\n".join(f"{n} {x} {y} {z}" for n, (x, y, z) in positions.items() if n in truth.names[4:])
+    )
+    found = sfm_shapefit.map_database(
+        changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}"),
+        priors=table,
+        refine_with_priors=True,
+        **FAST,
+    )
+    scales = {}
+    for model in found.models:
+        scales[model.names[0] in truth.names[:4]] = model.located.gauge.scale
+        if model.located.gauge.scale == "prior":
+            images = model.located.reconstruction.images.values()
+            off = [image.projection_center() - positions[image.name] for image in images if image.has_pose]
+            # Half a pixel, as far as the placement alone is off; the scene is 20 units across.
+            assert len(off) == 4
+            assert np.abs(off).max() < 0.05
+    assert scales == {True: "unit", False: "prior"}
+
+
+def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
+    # The receiver of the first four said the same place all the time.
+    positions = np.where(np.arange(8)[:, None] < 4, truth.centers[0], truth.centers)
+    table = tmp_path / "priors.txt"
+    rows = zip(truth.names, positions, strict=True)
+    table.write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
+    path = changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}")
+    found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
+    scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
+    assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
+    said = "the scale is not that of position priors: the position priors coincide"
+    assert any(warning.startswith(said) for warning in scales[True].warnings)
+
+
+def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
+    database = RING / "database.db"
+    arguments = ["map", database, tmp_path / "out", "--bundle-adjust", "--points", "never", "--json"]
+    facts = json.loads(run(*arguments, code=0).stdout)
+    assert facts["models"][0]["located"]["bundle_adjustment"]["final_error_px"] < 1.0
+    errors = sfm_shapefit.evaluate(tmp_path / "out" / "0", RING / "sparse" / "0")
+    assert len(errors.names) == 8
+    assert errors.position.max < 0.005 * errors.extent
+    run(*arguments, code=3)
+    run(*arguments, "--overwrite", code=0)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("precious")
+    run("map", database, tmp_path / "mine", "--overwrite", code=3)
+    run("map", tmp_path / "missing.db", tmp_path / "o", code=3)
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("shape", ["ring", "facade"])
+def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, shape):
+    """All tracks of so few images are adjusted, as in bundle adjustment: the likeliest answer, but for the
+    loss. Averaged rotations are that of pairs, each of which sees its own matches only: every track of k
+    images is cut into pairs, and no two of them need agree on a point."""
+    size = {"num_images": 10, "num_points": 400, "max_pairs_per_image": 6, "max_keypoints_per_image": 200}
+    write_workspace(make_scene(SceneOptions(shape=shape, seed=2, **size)), tmp_path / "made")
+
+    def errors(**options):
+        found = sfm_shapefit.map_database(tmp_path / "made" / "database.db", min_trust=0.0, **options)
+        compared = sfm_shapefit.evaluate(
+            found.models[0].located.reconstruction, tmp_path / "made" / "sparse" / "0"
+        )
+        assert len(compared.names) == 10
+        return compared.position.rms, compared.rotation_deg.rms
+
+    coarse, adjusted, likeliest = errors(adjust=False), errors(), errors(bundle_adjust=True)
+    for k in range(2):
+        assert adjusted[k] < 1.1 * likeliest[k]
+        assert adjusted[k] < coarse[k] / 1.5
+
+
+def test_images_that_see_few_points_are_left_out_with_the_reason(tmp_path):
+    everyone = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=0).models[0].located
+    model = everyone.reconstruction
+    counts = {image.name: image.num_points3D for image in model.images.values()}
+    assert everyone.kept.all()
+    assert everyone.few_points == {}
+    poorest = min(counts, key=counts.get)
+    limit = counts[poorest] + 1
+    out = tmp_path / "out"
+    told = run("map", RING / "database.db", out, "--min-points-per-image", limit, "--json", code=0).stdout
+    # The others have enough without the observations that the poorest takes along.
+    assert json.loads(told)["models"][0]["located"]["few_points"] == {poorest: limit - 1}
+    written = read_model(out / "0").reconstruction
+    kept = {written.image(k).name: written.image(k).num_points3D for k in written.reg_image_ids()}
+    assert kept == {name: count for name, count in counts.items() if name != poorest}
+    reasons = {row["name"]: row["reason"] for row in read_cameras(out / "0")}
+    assert [name for name, reason in reasons.items() if reason] == [poorest]
+    assert f"{limit - 1} points" in reasons[poorest]
+
+
+def test_threads_repetition_and_hashes_change_no_byte(tmp_path):
+    flags = ("--bundle-adjust",)
+    assert list(determinism.differing_files(RING, tmp_path, command="map", always=flags)) == []
+
+
+STAGES = ("relative rotations", "rotation averaging", "first placement", "locate")
+INTERRUPTED = """
+import os, signal, sys
+from contextlib import contextmanager
+from sfm_shapefit.cli import main
+from sfm_shapefit.pipeline.clock import Clock
+
+stage, sys.argv = sys.argv[1], ["sfm-shapefit", *sys.argv[2:]]
+timed = Clock.__call__
+
+def begin(clock, name):
+    if name == stage:
+        os.kill(os.getpid(), signal.SIGINT)
+    return timed(clock, name)
+
+Clock.__call__ = begin
+main()
+"""
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_interrupt_in_any_stage_leaves_nothing(tmp_path, stage):
+    done = run_python("-c", INTERRUPTED, stage, "map", RING / "database.db", tmp_path / "out", "-q")
+    assert (done.returncode, done.stderr) == (130, "sfm-shapefit: interrupted; nothing was written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
+    seen = []
+
+    def cancel(name, _done, _total):
+        seen.append(name)
+        if name == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm_shapefit.map_database(RING / "database.db", progress=cancel)
+    assert seen[-1] == stage
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--averaging", "ceres"], "'ceres' is not one of 'own', 'pycolmap'"),
+        (["--rotations", "measured"], "map finds the rotations itself"),
+        (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
+        (["--rotations", "exact"], "'exact' is not one of"),
+        (["--adjuster", "ceres"], "adjuster has no effect without bundle_adjust"),
+        (["--min-points-per-image", "-1"], "min_points_per_image must be"),
+    ],
+)
+def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, words):
+    said = run("map", RING / "database.db", tmp_path / "out", *flags, code=2).stderr
+    assert words in said
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("executor", [None, "processes"])
+def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor):
+    truth = read_model(RING / "sparse" / "0")
+    listed, ids = [(0, 1), (4, 3)], truth.image_ids.tolist()
+    gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
+    without = tmp_path / "without.csv"
+    without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
+    database = changed(
+        RING, tmp_path / "edited", f"DELETE FROM two_view_geometries WHERE {' OR '.join(gone)}"
+    )
+    if executor is None:
+        given = (
+            sfm_shapefit.map_database(RING / "database.db", without=str(without), **FAST).models[0].located
+        )
+        gone = sfm_shapefit.map_database(database, **FAST).models[0].located
+    else:
+        with ThreadPoolExecutor(2) as pool:
+            model = RING / "sparse" / "0"
+            given = sfm_shapefit.locate(model, without=str(without), executor=pool, **FAST)
+            gone = sfm_shapefit.locate(model, database, **FAST)
+    np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
+    assert len(given.directions.pairs) > 0
+    centers = [found.table("cameras")["x"] for found in (given, gone)]
+    np.testing.assert_array_equal(*centers)
+
+
+class Counting(ThreadPoolExecutor):
+    """Counts the tasks of each kind."""
+
+    def __init__(self, workers):
+        super().__init__(workers)
+        self.tasks = {}
+
+    def submit(self, work, /, task):
+        kind = task.work.estimate.func.__name__ if isinstance(task, PairTask) else work.__name__
+        self.tasks[kind] = self.tasks.get(kind, 0) + 1
+        return super().submit(work, task)
+
+
+def assert_same_bits(shared, serial, folder):
+    """Model and tables, as they are written."""
+    for found, out in ((shared, folder / "shared"), (serial, folder / "serial")):
+        sfm_shapefit.write_map_result(found, out, report=False)
+        for named in out.rglob("*.json"):  # which have timings
+            named.unlink()
+    written = sorted(path.name for path in (folder / "serial" / "0").iterdir())
+    assert {"cameras.csv", "images.bin", "pairs.csv", "points3D.bin"} <= set(written)
+    for name in written:
+        assert (folder / "shared" / "0" / name).read_bytes() == (folder / "serial" / "0" / name).read_bytes()
+
+
+def test_an_executor_shares_out_pairs_and_tracks_and_changes_no_bit(monkeypatch, tmp_path):
+    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
+    monkeypatch.setattr(triangulation, "_TRACKS_A_BLOCK", 200)
+    with Counting(2) as pool:
+        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
+    monkeypatch.undo()
+    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
+    assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions", "triangulate_block"}
+    assert pool.tasks["estimate_relative_rotations"] > 3 < pool.tasks["triangulate_block"]
+    assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
+    assert_same_bits(shared, serial, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_path):
+    pytest.importorskip("distributed")
+    flag = tmp_path / "killed"
+    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
+    monkeypatch.setattr(execution, "measure_task", partial(die_once, str(flag)))
+    with open_executor("dask", 2) as pool:
+        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
+    monkeypatch.undo()
+    assert flag.exists()
+    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
+    assert_same_bits(shared, serial, tmp_path)
+
+
+def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowhere(tmp_path, monkeypatch):
+    size = {"num_images": 16, "num_points": 900, "max_pairs_per_image": 15, "max_keypoints_per_image": 300}
+    write_workspace(make_scene(SceneOptions(shape="ring", seed=2, **size)), tmp_path / "made")
+    database = tmp_path / "made" / "database.db"
+
+    def with_a_false_loop(*given):
+        found = measure_rotations(*given)
+        turn = Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
+        rotations, counts = found.rotations.copy(), found.num_matches.copy()
+        far = found.pairs[:, 1] - found.pairs[:, 0] == 15
+        assert far.sum() == 1
+        rotations[far], counts[far] = turn, 300
+        # Without pairs between, the first and the last frame are beyond the reach of all.
+        kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
+        return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
+
+    monkeypatch.setattr("sfm_shapefit.pipeline.map.measure_rotations", with_a_false_loop)
+    found = sfm_shapefit.map_database(database, sequence="names", **FAST)
+    (loop,) = found.models[0].located.loops
+    names = found.models[0].names
+    assert (loop.first, loop.second, loop.num_refused) == ((names[0],) * 2, (names[15],) * 2, 1)
+    assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
+    assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
+    assert describe_loops(found.models[0].located.summary()["loops"]).endswith(f"{names[0]} to {names[15]}")
+    blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
+    assert (blind.num_video_frames, blind.models[0].located.loops) == (0, ())
+    assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
+
+
+def test_a_straight_drive_is_placed_by_points_and_says_how_sure_lengths_are(tmp_path, monkeypatch):
+    drawn = layouts.LAYOUTS["drive"]
+
+    def straight(*given):
+        layout = drawn(*given)
+        return dataclasses.replace(layout, centers=layout.centers * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.5])
+
+    def street(x):
+        along, left = np.tile([[1.0, 0.0, 0.0]], (len(x), 1)), np.tile([[0.0, 1.0, 0.0]], (len(x), 1))
+        return along * x[:, None], along, left
+
+    monkeypatch.setattr(layouts, "street", street)
+    monkeypatch.setitem(layouts.LAYOUTS, "drive", straight)
+    write_workspace(make_scene(SceneOptions(shape="drive", num_images=8, seed=2)), tmp_path / "made")
+    located = sfm_shapefit.map_database(tmp_path / "made" / "database.db").models[0].located
+    errors = sfm_shapefit.evaluate(located.reconstruction, tmp_path / "made" / "sparse" / "0")
+    assert errors.position.max < 0.01 * errors.extent
+    assert 1e-5 < located.line_sigma < 0.01
+    said = describe_line(located.summary()["line_sigma"])
+    assert f"known to {100.0 * located.line_sigma:.2g}% of its length" in said
+
+
+def test_pairs_are_left_out_of_databases_only(tmp_path):
+    listed = tmp_path / "without.txt"
+    listed.write_text("0000.jpg 0001.jpg\n")
+    with pytest.raises(InputError, match="of a database only"):
+        sfm_shapefit.locate(RING / "sparse" / "0", directions="tracks", without=str(listed))
+
+
+def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):
+    groups = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
+    lonely = f"pair_id / {PAIR} = 8 OR pair_id % {PAIR} = 8"
+    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {groups} OR {lonely}")
+    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
+    assert [model.names for model in found.models] == [
+        tuple(f"{k:04d}.jpg" for k in group) for group in ((1, 2, 3, 4), (5, 6, 7))
+    ]
+    assert list(found.left_out) == ["0008.jpg"]
+    assert "no matches" in found.left_out["0008.jpg"]
+    assert any("is in no model" in warning for warning in found.warnings)
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
+    assert "give one of them, such as" in run("report", tmp_path / "out", code=3).output
+
+
+def test_images_in_no_model_are_told_their_own_reason(tmp_path):
+    group = f"(pair_id / {PAIR} > 4) + (pair_id / {PAIR} > 6) + (pair_id / {PAIR} > 7)"
+    cut = f"{group} != {group.replace('/', '%')}"
+    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {cut}")
+    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
+    assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
+    assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
+    assert {found.left_out[name] for name in ("0005.jpg", "0006.jpg")} == {
+        "matched with 1 other image only; a model needs 3"
+    }
+    assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
+
+
+def test_inlier_matches_are_enough(tmp_path):
+    path = changed(
+        RING,
+        tmp_path,
+        "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL",
+    )
+    images = read_images(path)
+    unposed, truth = read_model(images.reconstruction), read_model(RING / "sparse" / "0")
+    found = sfm_shapefit.relative_rotations(path)
+    i, j = found.pairs.T
+    true = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
+    assert len(found.pairs) > 10
+    assert found.are_sound().all()
+    assert found.names == unposed.names
+    # Half a pixel of noise at f = 1000 px, over hundreds of matches.
+    assert np.median(rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ true)) < 0.2
+    with pytest.raises(UnsolvableError, match="has 15 inlier matches and a relative rotation"):
+        sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(relative_rotations="stored"))
+
+
+def wrong_focal_length(factor):
+    """A statement that makes a factor's worth of the focal length of the ring's camera COLMAP's guess."""
+    params = np.array([1000.0 * factor, 1000.0 * factor, 600.0, 450.0], dtype="<f8").tobytes().hex()
+    return f"UPDATE cameras SET params = x'{params}', prior_focal_length = 0"
+
+
+def test_a_guessed_focal_length_is_found_and_told(tmp_path):
+    path = changed(RING, tmp_path, wrong_focal_length(0.85))
+    before = path.read_bytes()
+    found = sfm_shapefit.map_database(path, **FAST)
+    assert path.read_bytes() == before
+    located = found.models[0].located
+    (row,) = located.summary()["intrinsics"]
+    told = row["origin"], row["decided_by"], row["given_focal_px"], row["num_images"]
+    assert told == ("a guess", "adjusted", 850.0, 8)
+    assert row["focal_px"] == pytest.approx(1000.0, rel=1e-3)
+    assert 0.0 < row["focal_sigma_px"] < 20.0
+    assert row["parameters"] == located.reconstruction.camera(1).params.tolist()
+    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    (line,) = describe_intrinsics([row])
+    assert line.startswith("camera 1: focal length 850.0 px (a guess) became 1,000.")
+    assert "(+17.6%) by adjustment" in line
+
+
+def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
+    path = changed(RING, tmp_path, wrong_focal_length(1.01))
+    found = sfm_shapefit.map_database(path, refine_intrinsics="none", **FAST)
+    located = found.models[0].located
+    assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
+    assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)
+    assert located.summary()["intrinsics"][0]["decided_by"] == "held"
+
+
+UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RENAME TO {0};"
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE cameras SET params = x'00'", "camera with id 1 is damaged"),
+        ("UPDATE cameras SET model = 99", "has the model 99, which pycolmap does not know"),
+        ("UPDATE cameras SET height = -1", "camera with id 1 is damaged"),
+        ("UPDATE cameras SET camera_id = 4294967295", "camera with id 4294967295 is damaged"),
+        (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
+        (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
+        (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
+        ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
+        (
+            "ALTER TABLE cameras RENAME TO c; CREATE VIEW cameras AS WITH RECURSIVE n(x) AS "
+            "(VALUES (1) UNION ALL SELECT x + 1 FROM n) SELECT x AS camera_id, 1 AS model, 1 AS width, "
+            "1 AS height, x'' AS params, 1 AS prior_focal_length FROM n",
+            "its cameras is a view",
+        ),
+        (
+            "UPDATE images SET camera_id = 7 WHERE image_id = 2",
+            "image with id 2 has no valid name and camera",
+        ),
+        ("DELETE FROM images", "has 0 images, but two or more"),
+    ],
+)
+def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
+    with pytest.raises(InputError, match=message):
+        sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
+
+
+def problem(num_false=0, seed=5, n=14):
+    """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
+    rng = np.random.default_rng(seed)
+    truth = Rotation.random(n, random_state=rng).as_matrix()
+    pairs = np.column_stack(np.triu_indices(n, 1))
+    noise = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=(len(pairs), 3))).as_matrix()
+    rotations = noise @ truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    counts = np.full(len(pairs), 100)
+    false = rng.permutation(np.flatnonzero((pairs < n // 2).sum(axis=1) == 1))[:num_false]
+    turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]).as_matrix()
+    i, j = pairs[false].T
+    rotations[false], counts[false] = truth[j] @ turn @ truth[i].transpose(0, 2, 1), 16
+    information = np.tile(np.eye(3), (len(pairs), 1, 1))
+    shares = np.ones(len(pairs))
+    return truth, RelativeRotations(
+        pairs=pairs,
+        rotations=rotations,
+        information=information,
+        num_matches=counts,
+        weight_shares=shares,
+    )
+
+
+def worst_error_deg(answer, truth):
+    difference = answer.rotations.transpose(0, 2, 1) @ truth
+    return rotation_angles_deg(difference @ mean_rotation_l1(difference).T).max()
+
+
+def test_the_most_consistent_of_several_averagings_is_kept():
+    truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
+    misled = average_consistently(14, relative, min_matches=15, averaging="pycolmap")
+    assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
+    weights = np.sqrt(relative.num_matches)
+    right = relative.num_matches == 100
+    for averaging, certified in (("pycolmap", None), ("own", True)):
+        answer = average_consistently(14, relative, averaging=averaging)
+        assert (answer.averaging, answer.certified) == (averaging, certified)
+        assert answer.registered.all()
+        assert answer.num_tried > 1
+        assert answer.num_pairs == right.sum()
+        assert worst_error_deg(answer, truth) < 0.5
+        assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
+
+
+def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
+    truth, relative = problem()
+    assert not average_consistently(14, relative).unsettled.any()
+    bad = (relative.pairs == 3).any(axis=1)
+    unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
+    answers = []
+    for wrong, shares in ((bad, np.ones(len(bad))), (unsound, np.where(unsound, 0.3, 1.0))):
+        rotations = relative.rotations.copy()
+        rng = np.random.default_rng(1)
+        rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
+        part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
+        answers.append(average_consistently(14, part))
+    assert answers[0].agreements[3] < 0.25
+    assert np.delete(answers[0].agreements, 3).min() > 0.8
+    assert list(np.flatnonzero(answers[0].unsettled)) == [3]
+    assert answers[1].num_pairs == 61
+    assert answers[1].share > 0.99
+    assert worst_error_deg(answers[1], truth) < 0.5
+
+
+def keep_few_matches(wrong):
+    """Of the pairs between the first images and the others, leave few matches of six and none of the rest."""
+
+    def edit(connection):
+        rng = np.random.default_rng(0)
+        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+        between = [row for row in rows if (row[0] // PAIR <= 4) != (row[0] % PAIR <= 4)]
+        for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: -row[1])):
+            matches = np.frombuffer(data, np.uint32).reshape(-1, 2)
+            matches = matches[rng.permutation(count)[: 12 * (rank < 6)]].copy()
+            if wrong:
+                matches[:, 1] = rng.permutation(matches[:, 1])
+            values = len(matches), matches.tobytes(), pair
+            connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+    return edit
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tmp_path, wrong):
+    database = changed(RING, tmp_path, keep_few_matches(wrong))
+    taped = ("0001.jpg", "0008.jpg", 3.0)  # from one model to the other
+    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST), known_distance=(taped,))
+    (told,) = found.joins
+    assert [len(model.names) for model in found.models] == [4, 4]
+    assert [warning for warning in found.warnings if "0001.jpg and 0008.jpg is of no use" in warning] == (
+        [f"the known distance of 0001.jpg and 0008.jpg is of no use: {APART}"] if wrong else []
+    )
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    facts = json.loads((tmp_path / "out" / "1" / "locate.json").read_text())
+    assert facts["join"]["statement"] == told.statement
+    assert facts["join"] == json.loads((tmp_path / "out" / "map.json").read_text())["joins"][0]
+    assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["join"] is None
+    assert ("joined_0" in names) == (told.join is not None) == (not wrong)
+    if wrong:
+        assert "model 1 is not joined to model 0: " in told.statement
+        return
+    whole = read_model(tmp_path / "out" / "joined_0")
+    errors = sfm_shapefit.evaluate(whole.reconstruction, RING / "sparse" / "0")
+    assert len(errors.names) == 8
+    assert errors.position.max < 1e-5 * errors.extent  # the keypoints are exact
+    assert errors.rotation_deg.max < 1e-3
+    models = [model.located.reconstruction for model in found.models]
+    assert whole.reconstruction.num_points3D() == sum(model.num_points3D() for model in models)
+    same = [(min(models[0].point3D_ids()), min(models[1].point3D_ids()))]
+    merged, renamed, new = merge_models(*models, told.join.first_from_second, same)
+    assert merged.num_points3D() == whole.reconstruction.num_points3D() - 1
+    assert renamed[same[0][0]] == new[same[0][1]]
+    check_joined_folder(tmp_path / "out" / "joined_0", found)
+
+
+APART = "they are in models 0 and 1, which are not joined"
+
+
+def check_joined_folder(folder, found):
+    """A joined model says of itself what others do, and its commands work."""
+    drawing, facts = read_output(folder)
+    assert problems(facts, "joined") == []
+    assert facts["known_distances"][0]["found"] == pytest.approx(3.0)
+    assert "0001.jpg and 0008.jpg are 3 apart" in facts["scale"]
+    assert facts["joins"][0]["statement"] == found.joins[0].statement
+    rows = [row for model in found.models for row in model.located.cameras]
+    assert dict(zip(drawing.cameras.names, drawing.cameras.trust.tolist(), strict=True)) == {
+        row.name: row.trust for row in rows
+    }
+    # The errors of the join come on top of what its models know, all in the units of the known distance.
+    together = {row.name: row for row in found.joined[0].cameras}
+    scales, own = [], []
+    for model in found.models:
+        (first, *_, last) = ours = model.located.cameras
+        apart = [
+            np.subtract(two.center, one.center)
+            for one, two in ((first, last), (together[first.name], together[last.name]))
+        ]
+        scales.append(np.linalg.norm(apart[1]) / np.linalg.norm(apart[0]))
+        own.append({row.name: np.sum(np.square(row.sigma)) * scales[-1] ** 2 for row in ours})
+    of_join = (scales[0] * found.joins[0].join.center_sigma) ** 2
+    for variances, more in zip(own, (0.0, of_join), strict=True):
+        for name, variance in variances.items():
+            assert np.sum(np.square(together[name].sigma)) == pytest.approx(
+                variance + more, rel=1e-4, abs=0.0
+            )
+    assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
+    assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
+    before = (folder / "report.html").read_text("utf-8")
+    run("report", folder)
+    assert (folder / "report.html").read_text("utf-8") == before
+    assert "bundle_adjuster" in banner(drawing, facts)["command"]
+
+
+def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    across = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
+    database = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {across}")
+    table = tmp_path / "priors.txt"
+    rows = zip(truth.names, truth.centers.tolist(), strict=True)
+    table.write_text("\n".join(" ".join(map(str, (name, *center))) for name, center in rows))
+    out = tmp_path / "out"
+    arguments = ("map", database, out, "--points", "never", "--no-report")
+    run(*arguments, "--priors", table)
+    (told,) = json.loads((out / "map.json").read_text())["joins"]
+    assert "model 1 is joined to model 0 by position priors of 4 and 4 cameras" in told["statement"]
+    errors = sfm_shapefit.evaluate(out / "joined_0", RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    assert "not joined" in run(*arguments, "--overwrite").output
+    told = json.loads((out / "map.json").read_text())
+    assert not any("priors" in warning for warning in told["warnings"])  # it has none
+    edit_database(
+        database,
+        "INSERT INTO pose_priors (pose_prior_id, corr_data_id, corr_sensor_id, corr_sensor_type, position, "
+        "coordinate_system) VALUES (1, 1, 1, 0, x'00', 1)",
+    )
+    run(*arguments, "--overwrite")
+    assert "join no models: " in json.loads((out / "map.json").read_text())["warnings"][-1]
+    facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
+    assert facts["joins"] == []
+    assert not (out / "joined_0").exists()

@@ -1,0 +1,190 @@
+"""Memory told beforehand: limits that are kept, refused with the number needed, and what is given up."""
+
+import re
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import InputError, LocateOptions
+from sfm_shapefit.graph.groups import separate
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.measure import sample_errors
+from sfm_shapefit.pipeline.memory import (
+    ECONOMIES,
+    Workload,
+    choose_economy,
+    describe_work,
+    forecast,
+    keep_within_memory,
+)
+from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive, random_graph_problem
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.scenes import RING
+
+WORK = Workload(
+    num_images=1000,
+    num_keypoints=1_000_000,
+    num_pairs=100_000,
+    num_matches=2_000_000,
+    num_edges=120_000,
+    num_nodes=20_000,
+    num_sampled=120_000,
+    has_points=True,
+    factor_entries=5_000_000,
+    adjusts=True,
+)
+BARE = replace(WORK, num_edges=100_000, num_nodes=1000, has_points=False, factor_entries=2_000_000)
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Workload) if field.name != "needs_factor"])
+def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
+    peaks = [forecast(WORK, economy).peak_mb for economy in ECONOMIES]
+    assert peaks == sorted(peaks, reverse=True)
+    assert peaks[0] > 2.0 * peaks[-1]
+    more = replace(
+        WORK,
+        **{
+            name: {"has_points": True, "adjusts": True, "adjusts_bundle": True}.get(
+                name, 2 * getattr(WORK, name)
+            )
+        },
+    )
+    for economy, peak in zip(ECONOMIES, peaks, strict=True):
+        assert forecast(more, economy).peak_mb >= peak
+
+
+def test_the_cheapest_economy_that_fits_is_taken_or_the_number_that_is_enough_is_told():
+    for k, economy in enumerate(ECONOMIES):
+        limit = forecast(WORK if economy.points else BARE, economy).peak_mb
+        chosen = choose_economy(WORK, BARE, limit)
+        assert ECONOMIES.index(chosen) <= k
+        assert forecast(WORK if chosen.points else BARE, chosen).peak_mb <= limit
+    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]  # given up already
+    with pytest.raises(InputError, match="raise it to") as refused:
+        choose_economy(WORK, BARE, 100.0)
+    needed = float(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
+    assert choose_economy(WORK, BARE, needed) is ECONOMIES[-1]
+
+
+def loop_graph(num_nodes=400):
+    """Cameras on a loop, each with its next twenty: a factor of half a megabyte."""
+    edges = np.array([(i, (i + k) % num_nodes) for i in range(num_nodes) for k in range(1, 21)])
+    return ViewGraph(num_nodes, np.sort(edges, axis=1), np.tile([1.0, 0.0, 0.0], (len(edges), 1)))
+
+
+LOOP_WORK = Workload(
+    num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
+)
+
+
+def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_nothing_is_refined():
+    graph = loop_graph()
+    plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
+    split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
+    with_priors = LocateOptions(solver="admm", refine_with_priors=True)
+    for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
+        work = describe_work(LOOP_WORK, measured, options)
+        assert work.needs_factor
+        peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
+        assert peaks[0] == peaks[1]  # so that it is never chosen
+    full = describe_work(LOOP_WORK, plain, split)
+    assert full.factor_entries > 0
+    assert not full.needs_factor
+    least = forecast(full, ECONOMIES[-1]).peak_mb
+    assert forecast(full, ECONOMIES[-2]).peak_mb > least
+    limited = replace(split, max_memory_mb=int(np.ceil(least)))
+    economy, kept, changed = keep_within_memory(LOOP_WORK, plain, limited, ECONOMIES[0])
+    assert economy is ECONOMIES[-1]
+    assert kept is plain
+    assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
+    assert "neither refined" in economy.statement
+
+
+def test_points_that_are_given_up_are_in_the_graph_no_more():
+    # 5,000 of the edges are of points: more than a megabyte, in which limits are given
+    problem = random_graph_problem(200, 0.5, sigma=0.01, seed=1)
+    measured = MeasuredGraph(ViewGraph(200, problem.edges, problem.directions), num_points=60)
+    work = Workload(
+        num_images=140, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=140
+    )
+    limit = forecast(describe_work(work, measured.without_points(), LocateOptions()), ECONOMIES[3]).peak_mb
+    options = LocateOptions(max_memory_mb=int(np.ceil(limit)))
+    economy, kept, _ = keep_within_memory(work, measured, options, ECONOMIES[0])
+    assert not economy.points
+    assert kept.num_points == 0
+    assert keep_within_memory(work, measured, LocateOptions(), ECONOMIES[0])[1] is measured
+
+
+def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_for():
+    crowded = replace(WORK, num_matches=20_000_000, num_keypoints=20_000_000)
+    peaks = {economy.adjustment: forecast(crowded, economy).peak_mb for economy in ECONOMIES}
+    assert set(forecast(crowded).memory_mb) - set(forecast(replace(crowded, adjusts=False)).memory_mb) == {
+        "adjusting"
+    }
+    # Each of 14 million observations has an entry of 144 bytes at least, among much else.
+    assert peaks[True] > peaks[False] + 14 * 144
+    asked = replace(crowded, adjusts_bundle=True)
+    assert forecast(asked, ECONOMIES[-1]).peak_mb > 14 * 144
+    measured = MeasuredGraph(loop_graph())
+    last = [economy for economy in ECONOMIES if economy.adjustment][-1]
+    needed = forecast(describe_work(crowded, measured, LocateOptions()), last).peak_mb
+    options = LocateOptions(max_memory_mb=int(needed) - 1)
+    economy, _, changed = keep_within_memory(crowded, measured, options, ECONOMIES[0])
+    assert "not adjusted" in economy.statement
+    assert not changed.adjust
+    plenty = replace(options, max_memory_mb=10**6)
+    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[2].adjust
+
+
+@pytest.fixture(scope="module")
+def workspaces(tmp_path_factory):
+    """Models with a database: plain, and of rigs."""
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    rigs = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
+    return {"plain": RING / "sparse" / "0", "rigs": folder / "sparse" / "0"}
+
+
+@pytest.mark.parametrize("kind", ["plain", "rigs"])
+def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_changes_nothing(
+    workspaces, kind
+):
+    with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
+        sfm_shapefit.locate(workspaces[kind], max_memory_mb=100)
+    needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
+    # The counts of the database alone do not know the graph, whose part is a few megabytes here.
+    limits = (needed + 30, 9000, 0)
+    found, limited, usual = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in limits)
+    assert len(found.placement.cameras) == len(usual.placement.cameras)
+    assert found.placement.refined.is_refined
+    assert np.isfinite(found.placement.assessment.sigmas).all()
+    np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
+    assert limited.warnings == usual.warnings
+
+
+@pytest.mark.parametrize("kind", ["plain", "rigs"])
+def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch):
+    sampled = []
+
+    def listen(*given):
+        sampled.append(sample_errors(*given))
+        return sampled[-1]
+
+    monkeypatch.setattr("sfm_shapefit.pipeline.measure.sample_errors", listen)
+    full = sfm_shapefit.inspect(workspaces[kind]).expected
+    for limit in range(int(full.peak_mb) - 1, 200, -5):
+        try:
+            found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit)
+        except InputError:
+            break
+        statement = next(text for text in found.warnings if text.startswith("to stay below max_memory_mb"))
+        assert ("count as independent" in statement) == (sampled[-1] is None)
+        assert found.placement.measured.evidence.errors is None  # the largest arrays are not kept
+        assert ("not adjusted" in statement) == (found.adjustment is None)
+        assert ("neither refined" in statement) == (not found.placement.refined.is_refined)
+    else:
+        pytest.fail("no limit was refused")

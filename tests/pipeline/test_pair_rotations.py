@@ -1,0 +1,158 @@
+"""`relative_rotations`: the same by threads and by any executor, and bad input refused in a sentence."""
+
+import dataclasses
+import struct
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.pairs import essential as door
+from sfm_shapefit.pipeline import relative_rotations as module
+from sfm_shapefit.pipeline.execution import open_executor
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+
+DATABASE = COURTYARD / "database.db"
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sfm_shapefit.relative_rotations(DATABASE, threads=1)
+
+
+def assert_same_bits(a, b):
+    assert a.names == b.names
+    for field in dataclasses.fields(a):
+        np.testing.assert_array_equal(getattr(a, field.name), getattr(b, field.name), err_msg=field.name)
+
+
+def test_pairs_are_positions_in_the_sorted_names(found):
+    before = fingerprint(COURTYARD)
+    images = read_images(DATABASE).reconstruction
+    assert found.names == tuple(sorted(image.name for image in images.images.values()))
+    i, j = found.pairs.T
+    assert (i < j).all()
+    assert (np.diff(i * len(found.names) + j) > 0).all()
+    truth = read_model(COURTYARD / "sparse" / "0")
+    worst = found.subset(np.argsort(found.num_matches)[-1:])
+    assert worst.names == found.names
+    i, j = (truth.names.index(found.names[k]) for k in worst.pairs[0])
+    true = truth.rotations[j] @ truth.rotations[i].T
+    np.testing.assert_allclose(worst.rotations[0], true, atol=2e-3)
+    assert fingerprint(COURTYARD) == before
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_threads_change_no_bit(found, threads):
+    assert_same_bits(sfm_shapefit.relative_rotations(str(DATABASE), threads=threads), found)
+
+
+def test_an_executor_changes_no_bit(found, monkeypatch):
+    monkeypatch.setattr(module, "_MATCHES_PER_TASK", 3000)
+    seen = []
+    with ThreadPoolExecutor(2) as pool:
+        shared = sfm_shapefit.relative_rotations(
+            DATABASE, executor=pool, progress=lambda *now: seen.append(now)
+        )
+        many = sfm_shapefit.relative_rotations(DATABASE, executor=pool, min_matches=60)
+    assert_same_bits(shared, found)
+    assert_same_bits(many, found.subset(found.num_matches >= 60))
+    assert {stage for stage, _, _ in seen} == {"relative rotations"}
+    assert len(seen) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+def test_other_processes_change_no_bit(found, kind, monkeypatch):
+    if kind == "dask":
+        pytest.importorskip("distributed")
+    monkeypatch.setattr(module, "_MATCHES_PER_TASK", 10_000)
+    with open_executor(kind, 2) as pool:
+        assert_same_bits(sfm_shapefit.relative_rotations(DATABASE, executor=pool), found)
+
+
+def test_few_matches_and_stored_poses_are_as_asked(found, tmp_path):
+    many = sfm_shapefit.relative_rotations(DATABASE, min_matches=60)
+    assert_same_bits(many, found.subset(found.num_matches >= 60))
+    scene = make_scene(SceneOptions(num_images=8, num_points=300))
+    write_workspace(scene, tmp_path / "ring", WorkspaceOptions(relative_poses=True))
+    stored = sfm_shapefit.relative_rotations(tmp_path / "ring" / "database.db", source="stored")
+    np.testing.assert_array_equal(stored.pairs, scene.pairs[np.lexsort(scene.pairs.T[::-1])])
+    np.testing.assert_array_equal(stored.weight_shares, 1.0)
+    assert len(sfm_shapefit.relative_rotations(DATABASE, source="stored").pairs) == 0
+
+
+def test_progress_ends_with_all_pairs_though_some_are_left_out(found):
+    seen = []
+    sfm_shapefit.relative_rotations(
+        DATABASE, min_matches=60, progress=lambda _stage, done, total: seen.append((done, total))
+    )
+    (total,) = {total for _, total in seen[1:-1]}
+    assert seen[-2] == (total, total)
+    assert total >= len(found.pairs) > (found.num_matches >= 60).sum()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_interrupt_ends_the_work_after_the_slices_at_hand(monkeypatch, threads):
+    monkeypatch.setattr(door, "_PAIRS_PER_SLICE", 8)
+    begun, estimate = [], door._estimate_slice
+    monkeypatch.setattr(
+        door, "_estimate_slice", lambda *given: (begun.append(given[-1]), estimate(*given))[1]
+    )
+
+    def interrupt(_stage, done, _total):
+        if done > 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm_shapefit.relative_rotations(DATABASE, threads=threads, progress=interrupt)
+    assert len(begun) < 10  # of 22
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        ["DELETE FROM two_view_geometries"],
+        ["UPDATE keypoints SET rows = 0, data = x''", "UPDATE two_view_geometries SET rows = 0, data = x''"],
+        # SIMPLE_RADIAL, and all pixels lie where such a lens has no rays.
+        [f"UPDATE cameras SET model = 2, params = x'{struct.pack('<4d', 1e3, 1e5, 0.0, -5.0).hex()}'"],
+    ],
+)
+def test_a_database_without_matches_has_no_pairs(tmp_path, statements):
+    path = edit_database(copied(RING, tmp_path) / "database.db", *statements)
+    none = sfm_shapefit.relative_rotations(path)
+    assert none.rotations.shape == (0, 3, 3)
+    assert len(none.names) == 8
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE two_view_geometries SET data = x'00' WHERE rows > 0", "has matches of wrong length"),
+        ("UPDATE keypoints SET rows = 1, data = zeroblob(4 * cols)", "keypoints that do not exist"),
+        ("UPDATE cameras SET params = x'00'", "is damaged"),
+        ("DELETE FROM images", "has 0 images"),
+    ],
+)
+def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
+    path = edit_database(copied(RING, tmp_path) / "database.db", "PRAGMA foreign_keys = OFF", statement)
+    for threads in (1, 2):
+        with pytest.raises(InputError, match=message):
+            sfm_shapefit.relative_rotations(path, threads=threads)
+
+
+def test_other_bad_arguments_are_refused(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        sfm_shapefit.relative_rotations(tmp_path / "none.db")
+    with pytest.raises(ValueError, match="min_matches must be at least 1"):
+        sfm_shapefit.relative_rotations(DATABASE, min_matches=0)
+    with pytest.raises(ValueError, match="relative_rotations must be one of"):
+        sfm_shapefit.relative_rotations(DATABASE, source="guessed")
+    with pytest.raises(ValueError, match="threads must"):
+        sfm_shapefit.relative_rotations(DATABASE, threads=-1)

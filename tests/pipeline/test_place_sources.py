@@ -1,0 +1,224 @@
+"""`solve` on 1DSfM folders, and what its objectives, filters and formats write."""
+
+import csv
+import json
+import re
+from collections import Counter
+from itertools import chain
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import fit_similarity, normalized
+from sfm_shapefit.baselines import linf
+from sfm_shapefit.facts.rows import pair_rows
+from sfm_shapefit.files.g2o import g2o_text
+from sfm_shapefit.files.graph_text import graph_text, read_graph
+from sfm_shapefit.files.onedsfm import is_onedsfm, read_onedsfm, read_rotations
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.place import place_graph_file
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.synthetic import random_graph_problem
+from tests.files.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene
+from tests.program import run
+from tests.scenes import BUNDLED, real_scene
+
+
+def solve(*arguments, code=0):
+    return run("solve", *arguments, code=code)
+
+
+def centers_of(out):
+    with (out / "cameras.csv").open() as stream:
+        return {
+            row["name"]: [float(row[axis]) for axis in "xyz"]
+            for row in csv.DictReader(stream)
+            if row["placed"] == "true"
+        }
+
+
+def worst_error(found, truth):
+    """Largest distance after similarity alignment, as a share of the truth's extent."""
+    similarity = fit_similarity(found, truth)
+    return np.linalg.norm(similarity.apply(found) - truth, axis=1).max() / np.ptp(truth, axis=0).max()
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_a_1dsfm_folder_is_placed_from_given_or_averaged_rotations(tmp_path, averaged):
+    source, _, centers = write_scene(tmp_path / "in", n=9)
+    given = [] if averaged else ["--rotations", source / "rots.txt"]
+    solve(source, tmp_path / "out", *given)
+    found = centers_of(tmp_path / "out")
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    assert list(found) == [str(10 * k) for k in range(9)]
+    assert worst_error(np.array(list(found.values())), centers) < 1e-6  # averaging stops at its own tolerance
+    assert ("averaged by pycolmap" in facts["inputs"]["directions"]) == averaged
+    assert facts["residuals_deg"]["quantile_90"] < 1e-4
+
+
+def test_pairs_whose_rotation_contradicts_the_cameras_are_left_out_and_counted(tmp_path):
+    rotations, centers = scene(n=9)
+    lines = egs_text(rotations, centers).splitlines()
+    wrong = scene(n=9, seed=99)
+    lines[0] = egs_text(*wrong).splitlines()[0]
+    source = folder_with(tmp_path / "in", EGs="\n".join(lines), rots=rots_text(rotations))
+    arguments = [source, "--rotations", source / "rots.txt"]
+    solve(arguments[0], tmp_path / "out", *arguments[1:])
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    assert "1 of 36 pairs contradict them by more than 10 deg" in facts["inputs"]["directions"]
+    assert facts["num_pairs"] == 35
+    solve(arguments[0], tmp_path / "all", *arguments[1:], "--max-rotation-error", "180")
+    assert json.loads((tmp_path / "all" / "locate.json").read_text())["num_pairs"] == 36
+
+
+def test_what_solve_writes_in_other_formats_can_be_read(tmp_path):
+    source, _, _ = write_scene(tmp_path / "in", n=9)
+    out = tmp_path / "out"
+    solve(source, out, "--rotations", source / "rots.txt", "--g2o", "--1dsfm")
+    assert is_onedsfm(out / "1dsfm")
+    again = read_onedsfm(out / "1dsfm")
+    assert len(again.pairs) == 36
+    assert (out / "1dsfm" / "rots.txt").read_text().split() != []
+    known = read_rotations(out / "1dsfm" / "rots.txt", again.names)[0]
+    found = centers_of(out)
+    expected = g2o_text(list(found), np.array(list(found.values())), known)
+    assert [line.split()[:2] for line in (out / "positions.g2o").read_text().splitlines()] == [
+        line.split()[:2] for line in expected.splitlines()
+    ]
+    solution = [line.split() for line in (out / "1dsfm" / "soln.txt").read_text().splitlines()]
+    assert {row[0]: [float(x) for x in row[1:]] for row in solution} == found
+
+
+def test_a_bare_graph_written_as_1dsfm_has_the_same_directions(tmp_path):
+    out = tmp_path / "out"
+    solve(BUNDLED / "graph40.txt", out, "--1dsfm")
+    agreeing = read_onedsfm(out / "1dsfm")
+    known = read_rotations(out / "1dsfm" / "rots.txt", agreeing.names)
+    again, first = agreeing.view_graph(*known), read_graph(BUNDLED / "graph40.txt")
+    of = {
+        (first.names[i], first.names[j]): v for (i, j), v in zip(first.edges, first.directions, strict=True)
+    }
+    for (i, j), v in zip(again.edges.tolist(), again.directions, strict=True):
+        np.testing.assert_allclose(v, of[again.names[i], again.names[j]], atol=1e-14)
+    assert again.num_edges < first.num_edges  # those that contradict are gone
+
+
+def test_neither_order_nor_orientation_of_lines_matters_and_reversed_directions_give_the_same_scene(tmp_path):
+    graph, rng = read_graph(BUNDLED / "graph40.txt"), np.random.default_rng(5)
+    v = normalized(graph.directions + 0.03 * rng.standard_normal(graph.directions.shape))
+    order, flip = rng.permutation(graph.num_edges), rng.random((graph.num_edges, 1)) < 0.5
+    edges = np.where(flip, graph.edges[:, ::-1], graph.edges)[order]
+    flipped = np.where(flip, -v, v)[order]
+    locations = []
+    for pairs, directions, is_reversed in (
+        (graph.edges, v, False),
+        (edges, flipped, False),
+        (edges, -flipped, True),
+    ):
+        text = graph_text(ViewGraph(graph.num_nodes, pairs, directions, names=graph.names))
+        (tmp_path / "g.txt").write_text(text)
+        found = place_graph_file(tmp_path / "g.txt", reverse=is_reversed)
+        locations.append(found.placement.locations)
+    plain, shuffled, turned = locations
+    assert np.abs(shuffled - plain).max() <= 1e-12 * np.ptp(plain, axis=0).max()
+    np.testing.assert_array_equal(turned, shuffled)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["graph.txt", "--rotations", "rots.txt"], "needs? no rotations"),
+        (["EGs.txt", "--reverse"], "leave out --reverse"),
+        (["EGs.txt", "--rotations", "wrong.txt"], "agrees with those of the cameras"),
+        (["flat.txt", "--1dsfm"], "of three dimensions, the graph of 2"),
+    ],
+)
+def test_options_that_do_not_fit_the_source_are_refused(tmp_path, arguments, words):
+    rotations, centers = scene()
+    flat = random_graph_problem(10, 0.9, d=2, seed=1)
+    folder_with(
+        tmp_path,
+        EGs=egs_text(rotations, centers),
+        rots=rots_text(rotations),
+        wrong=rots_text(scene(seed=7)[0]),
+        graph="0 1 1 0 0\n1 2 0 1 0\n0 2 0.6 0.8 0\n",
+        flat=graph_text(ViewGraph(10, flat.edges, flat.directions)),
+    )
+    paths = [tmp_path / a if a.endswith(".txt") else a for a in arguments]
+    result = solve(paths[0], tmp_path / "out", *paths[1:], code=3)
+    assert re.search(words, " ".join(result.stderr.split()))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("objective", ["auto", "shapefit", "lud", "least-squares", "linf"])
+def test_every_objective_writes_the_same_files_and_only_shapefit_is_certified(tmp_path, objective):
+    problem = random_graph_problem(14, 0.9, sigma=0.001, seed=5)
+    (tmp_path / "g.txt").write_text(graph_text(problem.view_graph))
+    solve(tmp_path / "g.txt", tmp_path / "out", "--objective", objective, "--quiet")
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    found = centers_of(tmp_path / "out")
+    order = np.array([found[str(k)] for k in range(14)])
+    assert worst_error(order, problem.locations) < 0.01  # noise of 0.001
+    certified = objective in ("auto", "shapefit", "lud")
+    assert facts["solve"]["status"] == ("converged" if certified else "not_solved")
+    assert any("nothing is certified" in warning for warning in facts["warnings"]) == (not certified)
+    if not certified:
+        assert facts["solve"]["dual_bound"] == 0.0
+        assert "nothing certifies" in facts["solve"]["method_reason"]
+        assert facts["finish"]["start"] == objective
+    with (tmp_path / "out" / "pairs.csv").open() as stream:
+        assert all((row["dual_norm"] != "") == certified for row in csv.DictReader(stream))
+
+
+def corrupted(seed=2):
+    problem = random_graph_problem(25, 0.8, sigma=0.002, q=0.2, seed=seed)
+    return problem, problem.view_graph
+
+
+@pytest.mark.parametrize("name", ["1dsfm", "triangles"])
+def test_a_filter_composes_with_least_squares(name):
+    problem, graph = corrupted()
+    errors = [
+        worst_error(
+            place(graph, PlacementOptions(objective="least-squares", filter=f)).locations, problem.locations
+        )
+        for f in ("none", name)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
+    problem, graph = corrupted()
+    placed = place(graph, PlacementOptions(filter="triangles"))
+    rows = pair_rows(placed, np.zeros(graph.num_edges, dtype=np.int64))
+    dropped = [k for k, row in enumerate(rows) if row.reason == "left out by the filter"]
+    assert dropped == placed.dropped.tolist()
+    assert problem.corrupted[placed.dropped].mean() > 0.9
+    for k in (0, len(rows) - 1):
+        assert rows[k].direction == tuple(graph.directions[k].tolist())
+    assert worst_error(placed.locations, problem.locations) < 0.01
+
+
+def test_without_a_filter_nothing_is_dropped_and_large_graphs_are_refused_by_l_inf(monkeypatch):
+    _, graph = corrupted()
+    assert place(graph, PlacementOptions(objective="shapefit")).dropped.tolist() == []
+    monkeypatch.setattr(linf, "_MOST_PAIRS", 10)
+    with pytest.raises(UnsolvableError, match="at most 10 pairs"):
+        linf.locate_linf(graph)
+
+
+@pytest.mark.slow
+def test_the_published_1dsfm_scene_is_placed_end_to_end(tmp_path):
+    """Its 200 images of most pairs; all of it is a benchmark."""
+    scene = real_scene("1dsfm-Madrid_Metropolis")
+    lines = (scene / "EGs.txt").read_text().splitlines()
+    pairs = [line.split()[:2] for line in lines]
+    kept = dict(Counter(chain.from_iterable(pairs)).most_common(200))
+    part = [line for line, pair in zip(lines, pairs, strict=True) if kept.keys() >= set(pair)]
+    solve(folder_with(tmp_path / "in", EGs="\n".join(part)), tmp_path / "out")
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    assert facts["num_placed"] > 180
+    assert facts["solve"]["status"] == "converged"
+    assert facts["residuals_deg"]["quantile_50"] < 5.0

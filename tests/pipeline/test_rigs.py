@@ -1,0 +1,542 @@
+"""Rigs and fixed cameras in `locate`: metric scale, poses that stay, and what is refused."""
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from sfm_shapefit import InputError, LocateOptions, UnsolvableError
+from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.pipeline import rigs as rigs_stage
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.synthetic import (
+    SceneOptions,
+    WorkspaceOptions,
+    make_rendered_scene,
+    make_rig_drive,
+    make_scene,
+)
+from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.program import run
+from tests.scenes import RING, copied, edit_database
+
+
+@pytest.fixture(scope="module")
+def rigs():
+    """Twelve frames of two rigs, a fifth of the pairs wrong."""
+    size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
+    return make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
+
+
+@pytest.fixture(scope="module")
+def workspace(rigs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(workspace):
+    return sfm_shapefit.locate(workspace / "sparse" / "0")
+
+
+def centers_of(reconstruction):
+    """Ids and centers of the posed images, ascending."""
+    ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
+
+
+def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(rigs, workspace):
+    model = read_model(workspace / "truth")
+    truth = model.reconstruction
+    assert (truth.num_rigs(), truth.num_frames(), truth.num_cameras()) == (2, 12, 6)
+    np.testing.assert_allclose(centers_of(truth)[1], rigs.scene.centers, atol=1e-12)
+    assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
+    with pycolmap.Database.open(workspace / "database.db") as database:
+        assert (database.num_rigs(), database.num_frames()) == (2, 12)
+    first = rigs.sensor_of_image == 0
+    expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
+    np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
+    assert not model.frame_offsets[first].any()
+    np.testing.assert_array_equal(model.groups.group_of, rigs.frame_of_image)
+    assert model.has_rigs
+
+
+def test_a_sensor_without_a_pose_in_its_rig_is_refused_by_name(workspace):
+    model = pycolmap.Reconstruction(workspace / "truth")
+    sensor = model.camera(2).sensor_id
+    model.rig(1).reset_sensor_from_rig(sensor)
+    with pytest.raises(InputError, match=r"camera 2 has no pose in rig 1 \(sensor_from_rig\)"):
+        read_model(model)
+
+
+def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
+    model = read_model(workspace / "truth")
+    before = [model.reconstruction.frame(f).rig_from_world.matrix() for f in range(1, 13)]
+    centers = 2.0 * (model.centers - model.frame_offsets) + [1.0, 2.0, 3.0] + model.frame_offsets
+    placed = model.frame_ids != 5
+    placed[1:3] = False  # of a frame whose first image is placed: they come with it
+    seed = build_seed(model, placed, centers)
+    ids, found = centers_of(seed)
+    expected = model.frame_ids != 5
+    assert ids == model.image_ids[expected].tolist()
+    np.testing.assert_allclose(found, centers[expected], atol=1e-12)
+    assert_rigs_equal(seed, model.reconstruction)
+    for frame, matrix in enumerate(before, start=1):  # the input is not touched
+        np.testing.assert_array_equal(model.reconstruction.frame(frame).rig_from_world.matrix(), matrix)
+
+
+def assert_rigs_equal(a, b, atol=0.0):
+    assert set(a.rigs) == set(b.rigs)
+    for rig_id, rig in a.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            other = b.rig(rig_id).sensor_from_rig(sensor)
+            # Bundle adjustment normalizes quaternions anew; nothing else changes a bit.
+            np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
+
+
+def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
+    ids, own = centers_of(found.reconstruction)
+    assert ids == list(range(1, 37))
+    fit = fit_similarity(own, rigs.scene.centers, rotate=False)
+    assert abs(fit.scale - 1.0) < 1e-3
+    errors = np.linalg.norm(fit.apply(own) - rigs.scene.centers, axis=1)
+    assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
+    assert found.certified.gap <= 1e-8
+    assert found.gauge.statement.startswith("rig: ")
+    assert_rigs_equal(found.reconstruction, found.model.reconstruction)
+
+
+def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_moved_together(found, tmp_path):
+    for image in found.reconstruction.images.values():
+        frame = found.reconstruction.frame(image.frame_id)
+        rig = found.reconstruction.rig(frame.rig_id)
+        sensor = image.camera.sensor_id
+        pose = frame.rig_from_world
+        if not rig.is_ref_sensor(sensor):
+            pose = rig.sensor_from_rig(sensor) * pose
+        np.testing.assert_allclose(image.cam_from_world().matrix(), pose.matrix(), atol=1e-12)
+    write_result(found, tmp_path / "out")
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    inner = facts["rigid_groups"].pop("num_inner_pairs")
+    assert facts["rigid_groups"] == {"num_groups": 12, "num_placed": 12, "num_fixed": 0}
+    assert sum("inside a frame" in row.reason for row in found.pairs) == inner
+    assert facts["num_placed"] == 36
+    again = pycolmap.Reconstruction(tmp_path / "out")
+    assert_rigs_equal(again, found.model.reconstruction)
+    assert found.summary()["num_placed"] == again.num_reg_images()
+
+
+def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
+    images = rigs.scene
+    kept = ~(images.pairs == 4).any(axis=1)
+    counts = np.diff(images.match_offsets)
+    rows = np.repeat(kept, counts)
+    per_pair = ("pairs", "pair_is_corrupted", "relative_rotations", "relative_translations")
+    parts = {name: getattr(images, name)[kept] for name in per_pair}
+    parts |= {name: getattr(images, name)[rows] for name in ("matches", "match_is_wrong")}
+    lonely = replace(images, **parts, match_offsets=np.append(0, np.cumsum(counts[kept])))
+    out = workspace.parent / "lonely"
+    write_workspace(lonely, out, WorkspaceOptions(model="rotations"))
+    located = sfm_shapefit.locate(out / "sparse" / "0", points="never")
+    row = located.cameras[4]
+    assert row.placed
+    assert row.reason == "placed with its frame; no pair of its own takes part"
+    offsets = [np.subtract(x.cameras[4].center, x.cameras[3].center) for x in (located, found)]
+    np.testing.assert_allclose(*offsets, atol=1e-9)
+    assert located.reconstruction.num_reg_images() == 36
+
+
+def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", bundle_adjust=True, points="never")
+    assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
+    fit = fit_similarity(centers_of(located.reconstruction)[1], rigs.scene.centers, rotate=False)
+    assert abs(fit.scale - 1.0) < 1e-3
+
+
+def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
+    model = workspace / "sparse" / "0"
+    for source, option, sentence in (
+        (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
+        (model, {"objective": "linf"}, "go with the objectives auto, shapefit and lud"),
+        (model, {"filter": "1dsfm"}, "go with the objectives auto, shapefit and lud"),
+        (RING / "sparse" / "0", {"scale": "rig"}, "no rig of several cameras"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            sfm_shapefit.locate(source, **option)
+
+    seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
+    assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
+    assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
+
+
+def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
+    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False))
+    model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
+    with pytest.raises(UnsolvableError, match="nothing determines the scale"):
+        sfm_shapefit.locate(model, points="never")
+
+
+@pytest.fixture
+def moved_ring(tmp_path):
+    """The ring with true centers of five cameras, in a unit of 0.37 m, and the others at the origin."""
+    truth = read_model(RING / "sparse" / "0")
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]
+    for k, image_id in enumerate(truth.image_ids.tolist()):
+        frame = model.frame(model.image(image_id).frame_id)
+        rotation = frame.rig_from_world.rotation
+        center = centers[k] if k < 5 else np.zeros(3)
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    names = tmp_path / "names.txt"
+    names.write_text("# solved last week\n" + "\n".join(truth.names[:5]) + "\n\n")
+    return model, centers, names, truth.names
+
+
+def poses(reconstruction):
+    return {
+        image.name: image.cam_from_world().matrix()
+        for image in reconstruction.images.values()
+        if image.has_pose
+    }
+
+
+@pytest.mark.parametrize("bundle_adjust", [False, True])
+def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring, bundle_adjust):
+    model, centers, names, all_names = moved_ring
+    given = poses(model)
+    options = LocateOptions(fix=str(names), bundle_adjust=bundle_adjust)
+    found = sfm_shapefit.locate(model, RING / "database.db", options=options)
+    after = poses(found.reconstruction)
+    for name in all_names[:5]:
+        np.testing.assert_array_equal(after[name], given[name])
+    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - centers, axis=1) * 0.37
+    assert errors.max() < 0.02  # meters; half a pixel at 4 m is 2 mm
+    assert found.summary()["rigid_groups"]["num_fixed"] == 5
+    assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
+    assert found.certified.gap <= 1e-8
+
+
+def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkeypatch):
+    loose = SimpleNamespace(
+        assessment=SimpleNamespace(loose_groups=[SimpleNamespace(cameras=[1])]), cameras=[1]
+    )
+
+    def place(graph, *_, **__):
+        if graph != "without points":
+            raise UnsolvableError("rays to far points let the start collapse")
+        return loose
+
+    monkeypatch.setattr(rigs_stage, "place", place)
+    measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
+    assert rigs_stage.place_cameras(measured, LocateOptions(), Clock()) is loose
+
+
+def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
+    model, _, names, all_names = moved_ring
+    names.write_text(all_names[2])
+    given = poses(model)[all_names[2]]
+    options = LocateOptions(fix=str(names), scale="unit")
+    found = sfm_shapefit.locate(model, RING / "database.db", options=options)
+    np.testing.assert_array_equal(poses(found.reconstruction)[all_names[2]], given)
+    own = centers_of(found.reconstruction)[1]
+    assert np.median(np.linalg.norm(own - own.mean(axis=0), axis=1)) == pytest.approx(1.0)
+    assert f"shifted so that {all_names[2]} stays where it is" in found.gauge.statement
+
+
+def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
+    model, _, names, all_names = moved_ring
+    solved = sfm_shapefit.locate(model, RING / "database.db", fix=str(names)).reconstruction
+    new = all_names[-1]
+    for image in list(solved.images.values()):  # one image has never been placed: a rotation, no points
+        if image.name == new:
+            for index in [k for k, point in enumerate(image.points2D) if point.has_point3D()]:
+                solved.delete_observation(image.image_id, index)
+            frame = solved.frame(image.frame_id)
+            frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
+    given = poses(solved)
+    found = sfm_shapefit.locate(solved, RING / "database.db", fix="solved")
+    after = poses(found.reconstruction)
+    assert found.summary()["rigid_groups"]["num_fixed"] == len(all_names) - 1
+    for name in all_names[:-1]:
+        np.testing.assert_array_equal(after[name], given[name])
+    assert np.abs(after[new] - given[new]).max() > 1.0
+
+
+def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(rigs, workspace, tmp_path):
+    model = pycolmap.Reconstruction(workspace / "truth")
+    names = tmp_path / "names.txt"
+    names.write_text("0008.jpg\n")
+    found = sfm_shapefit.locate(model, workspace / "database.db", fix=str(names), points="never")
+    for image_id in (7, 8, 9):
+        np.testing.assert_array_equal(
+            found.reconstruction.image(image_id).cam_from_world().matrix(),
+            model.image(image_id).cam_from_world().matrix(),
+        )
+    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - rigs.scene.centers, axis=1)
+    assert np.median(errors) < 0.02  # grows with the distance from the frame that is held
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
+        ("# nobody\n", "names no image"),
+        (None, "does not exist"),
+        ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
+    ],
+)
+def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_path, text, message):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    for frame in model.frames.values():
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
+    names = tmp_path / "names.txt"
+    if text is not None:
+        names.write_text(text)
+    with pytest.raises(InputError, match=message):
+        sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
+
+
+def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
+    scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
+    names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
+    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
+    done = run(*arguments, names, code=0)
+    assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
+        done.output.replace("│", " ").split()
+    )
+    given, after = (poses(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
+    for k in (1, 2, 3):
+        np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
+    run(*arguments, tmp_path / "none.txt", "--overwrite", code=3)
+
+
+@pytest.fixture(scope="module")
+def mapped(workspace):
+    return sfm_shapefit.map_database(workspace / "database.db")
+
+
+def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspace):
+    (model,) = mapped.models
+    assert (mapped.num_placed, mapped.left_out, mapped.warnings) == (36, {}, ())
+    assert model.located.gauge.scale == "rig"
+    errors = sfm_shapefit.evaluate(model.located.reconstruction, workspace / "truth")
+    assert abs(errors.ref_from_model.scale - 1.0) < 1e-3
+    # Half a pixel of noise; `locate` with the true rotations ends at 0.001 of an extent of 10.
+    assert errors.position.max < 0.01
+    ours, theirs = (
+        read_model(given).reconstruction for given in (model.located.reconstruction, workspace / "truth")
+    )
+    for rig_id, rig in theirs.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            np.testing.assert_allclose(
+                ours.rig(rig_id).sensor_from_rig(sensor).matrix(), pose.matrix(), atol=1e-12
+            )
+
+
+def assert_mapped_as_well_as_located(scene, workspace, largest_scale_error=1e-3, **options):
+    """`map` has no rotations: `locate` starts at the true ones and frees them."""
+    (model,) = sfm_shapefit.map_database(workspace / "database.db", **options).models
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", rotations="free", **options)
+    mean_errors = []
+    for found in (model.located, located):
+        ids, own = centers_of(found.reconstruction)
+        assert len(ids) == scene.num_images
+        fit = fit_similarity(own, scene.centers)
+        assert abs(fit.scale - 1.0) < largest_scale_error
+        metric = replace(fit, scale=1.0, translation=np.zeros(3)).apply(own - own.mean(axis=0))
+        mean_errors.append(
+            np.linalg.norm(metric - (scene.centers - scene.centers.mean(axis=0)), axis=1).mean()
+        )
+    assert mean_errors[0] < 1.2 * mean_errors[1]
+
+
+def test_a_rig_of_four_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1500, seed=3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard")
+
+
+@pytest.fixture(scope="module")
+def disturbed(tmp_path_factory):
+    """A yard seen by a rig of four whose sensors are said to be 1 deg and 2 % of their distance off."""
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    workspace, rng = tmp_path_factory.mktemp("rigs") / "yard", np.random.default_rng(3)
+    scene = make_scene(replace(options, wrong_match_fraction=0.05))
+    write_workspace(scene, workspace, WorkspaceOptions(model="rotations"))
+    statements, model = [], pycolmap.Reconstruction(workspace / "sparse" / "0")
+    for k, share in ((1, 0.02), (2, -0.02), (3, 0.02)):
+        axis = rng.standard_normal(3)
+        turn = Rotation.from_rotvec(np.radians(1.0) * axis / np.linalg.norm(axis)).as_matrix()
+        rotation = turn @ scene.rigs.sensor_rotations[0, k]
+        shift = -rotation @ scene.rigs.sensor_centers[0, k] * (1.0 + share)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift)
+        model.rig(1).set_sensor_from_rig(model.camera(k + 1).sensor_id, pose)
+        blob = pose.rotation.quat[[3, 0, 1, 2]].tobytes() + pose.translation.tobytes()
+        statements.append(
+            f"UPDATE rig_sensors SET sensor_from_rig = x'{blob.hex()}' WHERE sensor_id = {k + 1}"
+        )
+    edit_database(workspace / "database.db", *statements)
+    return scene, model, workspace / "database.db"
+
+
+@pytest.mark.parametrize("way", ["map", "locate", "ceres"])
+def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(disturbed, way):
+    scene, model, database = disturbed
+    if way == "locate":
+        found = sfm_shapefit.locate(model, database, refine_rigs=True)
+    else:
+        ceres = {"bundle_adjust": True, "adjuster": "ceres"} if way == "ceres" else {}
+        found = sfm_shapefit.map_database(database, refine_rigs=True, **ceres).models[0].located
+    said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
+    (rig,) = found.reconstruction.rigs.values()
+    poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
+    shifts = np.array([poses[camera].translation for camera in (2, 3, 4)])
+    mean = np.linalg.norm(shifts, axis=1).mean()
+    assert mean == pytest.approx(np.linalg.norm(said, axis=1).mean(), rel=1e-9)
+    true = scene.rigs.sensor_centers[0]
+    size = np.linalg.norm(true[1:], axis=1).mean() / mean
+    assert [row["camera"] for row in found.rigs] == [2, 3, 4]
+    for row in found.rigs:
+        camera, pose = row["camera"], poses[row["camera"]]
+        turn = scene.rigs.sensor_rotations[0, camera - 1].T @ pose.rotation.matrix()
+        center = -size * pose.rotation.matrix().T @ pose.translation
+        # Largest of three axes, of the noise and of what is left of the wrong matches: 2.5 times at most.
+        assert rotation_angles_deg(turn) < 5.0 * row["turn_sigma_deg"] < 0.1
+        assert np.linalg.norm(center - true[camera - 1]) < 5.0 * row["place_sigma"] < 0.02
+        assert row["turned_deg"] == pytest.approx(1.0, abs=0.05)
+    ids, own = centers_of(found.reconstruction)
+    assert len(ids) == 32
+    fit = fit_similarity(own, scene.centers)
+    assert np.linalg.norm(fit.apply(own) - scene.centers, axis=1).max() < 0.01  # as they are said: 0.2
+    assert abs(fit.scale / size - 1.0) < 2e-3
+
+
+def test_a_component_without_rigs_has_a_scale_of_its_own_beside_one_with_rigs(workspace, tmp_path):
+    database = tmp_path / "database.db"
+    shutil.copy(workspace / "database.db", database)
+    of_second = "SELECT frame_id FROM frames WHERE rig_id = 2"
+    second = f"(SELECT data_id FROM frame_data WHERE frame_id IN ({of_second}))"
+    ends = (f"pair_id / {MAX_NUM_IMAGES} IN {second}", f"pair_id % {MAX_NUM_IMAGES} IN {second}")
+    edit_database(
+        database,
+        f"DELETE FROM two_view_geometries WHERE ({ends[0]}) != ({ends[1]})",
+        f"DELETE FROM frame_data WHERE frame_id IN ({of_second})",
+        *(f"DELETE FROM {table} WHERE rig_id = 2" for table in ("frames", "rig_sensors", "rigs")),
+    )
+    found = sfm_shapefit.map_database(database, scale="rig", points="never")
+    scales = [model.located.gauge.scale for model in found.models]
+    assert sorted(scales) == ["rig", "unit"]
+    with pytest.raises(InputError, match="no rig of several cameras to take the scale from"):
+        sfm_shapefit.map_database(RING / "database.db", scale="rig")
+
+
+def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
+    # The two that look to the sides see nothing of a facade.
+    scene = make_scene(SceneOptions(rig="four", shape="facade", num_images=24, num_points=1500, seed=2))
+    write_workspace(scene, tmp_path / "facade")
+    sentence = r"the matches do not tell where camera [34] is in its rig"
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", refine_rigs=True)
+    with pytest.raises(InputError, match=sentence):
+        sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", refine_rigs=True)
+    for call in (
+        lambda: sfm_shapefit.map_database(RING / "database.db", refine_rigs=True),
+        lambda: sfm_shapefit.locate(RING / "sparse" / "0", refine_rigs=True),
+    ):
+        with pytest.raises(InputError, match="no rig of several cameras to refine; leave out refine_rigs"):
+            call()
+    with pytest.raises(ValueError, match="refine_rigs needs an adjustment"):
+        LocateOptions(refine_rigs=True, adjust=False)
+
+
+def keep_few_matches(connection):
+    """Leave few matches of eight pairs between the first four frames and the others, and none of the rest."""
+    rng, first = np.random.default_rng(0), 16
+    rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+    ends = {row[0]: divmod(row[0], 2147483647) for row in rows}
+    between = [pair for pair, (i, j) in ends.items() if (i <= first) != (j <= first)]
+    query = "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?"
+    found = [(pair, *connection.execute(query, (pair,)).fetchone()) for pair in between]
+    for rank, (pair, count, data) in enumerate(sorted(found, key=lambda row: -row[1])):
+        kept = rng.permutation(count)[: 12 * (rank < 8)]
+        matches = np.frombuffer(data, np.uint32).reshape(-1, 2)[kept]
+        values = len(matches), matches.tobytes(), pair
+        connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+
+def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_together(tmp_path):
+    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
+    scene = make_scene(options)
+    write_workspace(scene, tmp_path / "yard")
+    database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches)
+    found = sfm_shapefit.map_database(database)
+    assert [len(model.names) for model in found.models] == [16, 16]
+    (told,) = found.joins
+    assert told.join is not None, told.statement
+    assert told.join.first_from_second.scale == 1.0
+    sigmas = [model.located.gauge.scale_sigma for model in found.models]
+    assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
+    (joined,) = found.joined
+    whole = read_model(joined.reconstruction)
+    assert (whole.num_images, whole.groups.num_groups, whole.has_rigs) == (32, 8, True)
+    assert (joined.reconstruction.num_rigs(), joined.reconstruction.num_cameras()) == (1, 4)
+    own, truth = whole.centers, scene.centers[whole.image_ids - 1]
+    fit = fit_similarity(own, truth)
+    errors = np.linalg.norm(fit.apply(own) - truth, axis=1)
+    assert errors.max() < 4.0 * told.join.center_sigma + 0.005
+    assert abs(fit.scale - 1.0) < 2e-3
+
+
+@pytest.mark.slow
+def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
+    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 24}
+    scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
+    write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
+    # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, bundle_adjust=True)
+
+
+def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_path):
+    path = edit_database(
+        copied(workspace, tmp_path) / "database.db",
+        "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2",
+    )
+    images = read_images(path)
+    assert images.rigs.incomplete == (1,)
+    assert list(images.rigs.rigs) == [2]
+    of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
+    assert set(images.rigs.place_of_image) == of_second
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE rig_sensors SET sensor_from_rig = x'00'", "the pose of a sensor in rig 1 is damaged"),
+        ("UPDATE rig_sensors SET sensor_id = 99 WHERE sensor_id = 3", "rig 1 refers to camera 99"),
+        ("UPDATE rigs SET ref_sensor_id = 77 WHERE rig_id = 1", "rig 1 refers to camera 77"),
+        ("UPDATE rigs SET ref_sensor_id = 2 WHERE rig_id = 1", "camera 2 stands twice in rig 1"),
+        ("UPDATE frame_data SET sensor_id = 3 WHERE data_id = 2", "frame 1 has image 2 at another camera"),
+        ("UPDATE frame_data SET frame_id = 1", "an image of frame 1 stands twice"),
+    ],
+)
+def test_a_damaged_rig_of_a_database_is_named(workspace, tmp_path, statement, message):
+    path = edit_database(copied(workspace, tmp_path) / "database.db", statement)
+    with pytest.raises(InputError, match=message):
+        read_images(path)
