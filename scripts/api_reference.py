@@ -13,27 +13,33 @@ from pathlib import Path
 import pdoc
 
 NAMES = (
-    *("baselines", "colmap.model", "synthetic.rendered_workspace", "colmap.quiet", "synthetic.workspace"),
     *(
-        "placement.diagnosis",
-        "directions",
-        "errors",
-        "evaluation",
-        "formats",
-        "placement.gauge",
-        "locate_options",
+        "baselines",
+        "files.colmap.model",
+        "synthetic.rendered_workspace",
+        "files.colmap.quiet",
+        "synthetic.workspace",
     ),
     *(
-        "commands",
+        "placement.diagnosis",
+        "pairs",
+        "base.errors",
+        "scene.evaluation",
+        "files",
+        "placement.gauge",
+        "facts.options",
+    ),
+    *(
+        "pipeline",
         "placement.place",
-        "results.result",
-        "results.map_result",
-        "results.tables",
-        "rigidity",
+        "facts.result",
+        "facts.map_result",
+        "facts.tables",
+        "graph.rigidity",
         "judgement",
         "solver",
     ),
-    *("synthetic", "synthetic.fixtures", "theory", "viewgraph"),
+    *("synthetic", "synthetic.fixtures", "theory", "graph.viewgraph"),
 )
 MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
 

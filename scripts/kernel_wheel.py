@@ -64,8 +64,8 @@ def _copy_kernels(checkout: Path, package: Path) -> None:
     """Copy what is compiled beside the sources of this checkout and not stale."""
     for file in checkout.rglob("__pycache__/*.nbc"):
         folder = file.parent.parent
-        is_note = folder.name == "commands"
-        source = folder / ("stages/examples.py" if is_note else f"{file.name.partition('.')[0]}.py")
+        is_note = folder.name == "pipeline"
+        source = folder / ("examples.py" if is_note else f"{file.name.partition('.')[0]}.py")
         if f"-{RUNTIME}-{stamp_of(source)}-" in file.name:
             place = package / file.relative_to(checkout)
             place.parent.mkdir(parents=True, exist_ok=True)

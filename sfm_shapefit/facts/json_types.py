@@ -22,7 +22,7 @@ Version = Annotated[Literal[1], "Keys are added, never renamed, within a version
 
 
 class JudgedModel(TypedDict):
-    """Whether the model can be used; the rules are in `results.model_verdict`."""
+    """Whether the model can be used; the rules are in `judgement.grade`."""
 
     grade: Annotated[Literal["good", "look", "do not use"], "What to do with it."]
     statement: Annotated[str, "The same in a sentence."]

@@ -1,1 +1,1 @@
-"""The commands as functions: read, measure, place, seed, write. Each is a page, its steps in `stages`."""
+"""The commands as functions: read, measure, place, seed, write. Each is a page; its steps stand beside it."""

@@ -58,7 +58,7 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
         model: a model folder. Where its locate.json has a datum, latitudes and longitudes of the table become
             meters east, north and up of that, and are compared as they stand too.
         table: `name x y z` or, with a line that names the columns, name, latitude, longitude, altitude; see
-            `colmap.priors.table_priors`.
+            `files.colmap.priors.table_priors`.
 
     Raises:
         InputError: if either cannot be read, or they have fewer than three cameras in common.

@@ -1,6 +1,6 @@
 """`warm-up`: compile all kernels at once, by running small examples.
 
-What compiles a kernel is a call with arguments of the right types, so `stages.examples` calls everything.
+What compiles a kernel is a call with arguments of the right types, so `pipeline.examples` calls everything.
 Processes, one per core, take one example after the other and tell of each kernel that they compile or find.
 What they compile is kept on disk, see `kernel_cache`, and so is the name of each example that is done. A
 command that misses a kernel lets the examples that commands need run first, if they never did, and goes on
@@ -94,7 +94,7 @@ def warm_up(examples: Sequence[str], tell: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
     Args:
-        examples: names of functions of `commands.stages.examples`.
+        examples: names of functions of `pipeline.examples`.
         tell: called when a kernel is ready.
     """
     if not examples:

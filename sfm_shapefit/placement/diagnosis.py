@@ -1,13 +1,13 @@
 """What a view graph says before anything is solved: pieces, hinges, weak cameras, corruption, and the plan.
 
-Rigidity is exact and blind to the directions (`rigidity`). What the directions say beyond it:
+Rigidity is exact and blind to the directions (`graph.rigidity`). What the directions say beyond it:
 
 weak cameras   A camera's pairs hold it by the stacked projectors P_v = I - v v^T of their measured
                directions; the squared singular values of that stack are the eigenvalues of sum P_v. `spread`
                is the least over the greatest of these: 0 where all directions are parallel, so that the
                camera may slide along them, 1 where they point evenly everywhere.
 corruption     In a triangle without errors each direction lies on the arc between the other two. The
-               iterated mean angle to these arcs (`directions.triangles`) tells wrong pairs from right ones.
+               iterated mean angle to these arcs (`pairs.triangles`) tells wrong pairs from right ones.
                The estimate is the share of pairs above 0.3 rad, of those in a triangle. On six synthetic
                families with uniformly wrong directions, noise of 0.01 and 0.05, it lies within 0.03 of the
                true share up to 0.2 of them, within 0.06 at 0.4 and within 0.09 at 0.5; too high where pairs

@@ -180,7 +180,7 @@ def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path, monk
 
 
 def test_a_note_holds_for_its_sources_only(folder, monkeypatch):
-    own = kernel_cache.PACKAGE / "commands"
+    own = kernel_cache.PACKAGE / "pipeline"
     assert not is_noted("an example", own)
     note("an example", own)
     assert is_noted("an example", own)
