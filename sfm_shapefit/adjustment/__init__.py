@@ -37,7 +37,6 @@ from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covari
 from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
 from sfm_shapefit.adjustment.problem import (
     AdjustmentProblem,
-    Lens,
     LensPrior,
     Rig,
     RotationPrior,
@@ -51,6 +50,7 @@ from sfm_shapefit.adjustment.solve import (
     frames_not_gained,
     reprojection_errors_px,
 )
+from sfm_shapefit.scene.lens import Lens
 
 __all__ = [
     "Adjusted",

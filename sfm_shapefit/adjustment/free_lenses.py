@@ -17,50 +17,9 @@ import numpy as np
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.problem import NUM_VALUES, AdjustmentProblem, Lens, LensPrior
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, LensPrior
 from sfm_shapefit.base.arrays import FloatArray
-
-LARGEST_SIGMA = 0.02
-"""Of a focal length, as a share of it: beyond, the observations do not tell it."""
-
-# Errors that keypoints share make those of a focal length larger than the noise alone does: on kitti-turn,
-# driven straight ahead for the greatest part, seven times.
-_SHARED_NOISE = 7.0
-# So many standard deviations, of the noise and of what was given, are no chance.
-_CONTRADICTION = 10.0
-# By what factor a guess may be off, and the largest coefficient of a distortion.
-_MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
-_FOCAL_LENGTHS, _DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
-
-
-class LensDoubt(NamedTuple):
-    """What was given of a lens, and how far it may be off."""
-
-    given: Lens
-    focal_sigma: float
-    """Standard deviation of its focal lengths, as a share of them."""
-    distortion_sigma: float
-    """Standard deviation of each coefficient of its distortion."""
-
-    def information(self) -> FloatArray:
-        """Return the inverse variances of the OPENCV parameters, (8,); 0 for those that are held anyway."""
-        information = np.zeros(NUM_VALUES)
-        information[_FOCAL_LENGTHS] = (self.focal_sigma * self.given.values()[_FOCAL_LENGTHS]) ** -2.0
-        information[_DISTORTION] = self.distortion_sigma**-2.0
-        return information
-
-    def accepts(self, found: Lens, sigma: float) -> bool:
-        """Return whether an adjusted lens is to be believed, its focal length known to `sigma` by the noise.
-
-        It is to be known better than what was given, or to contradict that clearly. One that has run away,
-        beyond what any lens given so is off by, is not believed either.
-        """
-        ratio = found.values()[0] / self.given.values()[0]
-        sound = bool(np.abs(found.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
-        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
-        better = _SHARED_NOISE * sigma <= self.focal_sigma
-        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
-        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
+from sfm_shapefit.scene.lens import _FOCAL_LENGTHS, Lens, LensDoubt
 
 
 class FreeLenses(NamedTuple):

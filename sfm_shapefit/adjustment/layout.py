@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.problem import NUM_VALUES, AdjustmentProblem
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.scene.lens import NUM_VALUES
 
 SLOTS = 6
 """Unknowns of a node at most."""

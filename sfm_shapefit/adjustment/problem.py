@@ -29,79 +29,9 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.lens import NUM_VALUES, Lens
 
-_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
-NUM_VALUES = 8
-"""Parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2."""
-
-# For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
-_PLACES = {
-    "SIMPLE_PINHOLE": (-1, _CX, _CY),
-    "PINHOLE": (_FX, _FY, _CX, _CY),
-    "SIMPLE_RADIAL": (-1, _CX, _CY, _K1),
-    "RADIAL": (-1, _CX, _CY, _K1, _K2),
-    "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
-}
 _ORTHONORMAL = 1e-6  # largest entry of R R^T - I
-
-
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """The intrinsics that one or several cameras look through."""
-
-    model: str
-    """SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
-    parameters: tuple[float, ...]
-    """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
-    fixed: bool = False
-    """Whether it stays what it is even where focal lengths or distortion are free."""
-    focal_fixed: bool = False
-    """Whether its focal lengths stay even where they are free."""
-
-    def __post_init__(self) -> None:
-        """Refuse unknown models and impossible parameters."""
-        if self.model not in _PLACES:
-            known = ", ".join(_PLACES)
-            raise InputError(
-                f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
-            )
-        wanted = len(_PLACES[self.model])
-        if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
-            raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
-        if min(self.values()[:2]) <= 0.0:
-            raise InputError("a lens has a focal length that is not positive; correct its parameters")
-
-    def values(self) -> FloatArray:
-        """Return the parameters of the same lens as OPENCV model, (8,)."""
-        values = np.zeros(NUM_VALUES)
-        for place, parameter in zip(_PLACES[self.model], self.parameters, strict=True):
-            values[[_FX, _FY] if place < 0 else place] = parameter
-        return values
-
-    def with_values(self, values: FloatArray) -> "Lens":
-        """Return the lens of this model whose OPENCV parameters are `values`, (8,)."""
-        kept = [float(values[max(place, 0)]) for place in _PLACES[self.model]]
-        return replace(self, parameters=tuple(kept))
-
-    def own_values(self) -> BoolArray:
-        """Return which of OPENCV's parameters the model states by itself, (8,): fy is none where it is fx."""
-        own = np.zeros(NUM_VALUES, np.bool_)
-        own[[max(place, 0) for place in _PLACES[self.model]]] = True
-        return own
-
-    def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
-        """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
-        slots = np.full(NUM_VALUES, -1)
-        if self.fixed:
-            return slots
-        focal_lengths = focal_lengths and not self.focal_fixed
-        unknown = 0
-        for place in _PLACES[self.model]:
-            if place in (_CX, _CY) or not (focal_lengths if place <= _FY else distortion):
-                continue
-            slots[[_FX, _FY] if place < 0 else place] = unknown
-            unknown += 1
-        return slots
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,8 +7,8 @@ The parts of which kernels of an adjustment are made. Each camera is a row of nu
 from typing import Any
 
 from sfm_shapefit.adjustment.layout import SLOTS
-from sfm_shapefit.adjustment.problem import NUM_VALUES
 from sfm_shapefit.base.jit import inner_kernel
+from sfm_shapefit.scene.lens import NUM_VALUES
 
 _LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
 

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
-from sfm_shapefit.adjustment.problem import NUM_VALUES
 from sfm_shapefit.adjustment.projection import (
     LENS,
     SHIFT,
@@ -40,6 +39,7 @@ from sfm_shapefit.adjustment.projection import (
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.scene.lens import NUM_VALUES
 
 CHUNKS = 4
 """Into which the points are cut; each has sums of all nodes of its own."""

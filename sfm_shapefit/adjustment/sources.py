@@ -9,18 +9,13 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentProblem
-from sfm_shapefit.adjustment.views import (
-    CUBE,
-    PosedFrames,
-    focal_length_px,
-    is_adjusted,
-    read_frames,
-)
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.adjustment.views import CUBE, PosedFrames, read_frames
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.lenses import focal_length_px, is_adjusted
 from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.scene.matches import KeypointMatches
-from sfm_shapefit.tracks.links import Int32Array, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 
 TrackSource = MatchedKeypoints | pycolmap.Reconstruction
 """The matches between the posed images of a model, or another model with the same points2D."""

@@ -16,11 +16,10 @@ import pycolmap
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.files.colmap.lenses import is_adjusted, lens_of
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
-
-_ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -277,25 +276,6 @@ def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
     pose = frame.rig_from_world
     assert pose is not None
     return pose
-
-
-def is_adjusted(camera: pycolmap.Camera) -> bool:
-    """Return whether the adjustment knows the model of a camera; others are undistorted for it."""
-    return camera.model_name in _ADJUSTED_MODELS
-
-
-def lens_of(camera: pycolmap.Camera) -> Lens:
-    """Return the lens of a camera, or that of the views of one that is undistorted."""
-    if is_adjusted(camera):
-        return Lens(camera.model_name, tuple(camera.params.tolist()))
-    return Lens("SIMPLE_PINHOLE", (focal_length_px(camera), 0.0, 0.0), fixed=True)
-
-
-def focal_length_px(camera: pycolmap.Camera) -> float:
-    """Return pixels per radian at the axis; those of an equirectangular camera are the same everywhere."""
-    if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR:
-        return float(camera.params[0] / (2.0 * np.pi))
-    return float(camera.mean_focal_length())
 
 
 def _views(camera: pycolmap.Camera) -> FloatArray:

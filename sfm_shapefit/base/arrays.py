@@ -22,3 +22,6 @@ def frozen(array: AnyArray) -> AnyArray:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+Int32Array = npt.NDArray[np.int32]

@@ -6,7 +6,8 @@ import numpy as np
 
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.json_types import ControlPoint
-from sfm_shapefit.placement.control_points import ControlFit, ControlPoints, TriangulatedControl
+from sfm_shapefit.placement.control_points import ControlFit, TriangulatedControl
+from sfm_shapefit.scene.given import ControlPoints
 
 
 def control_rows(

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from sfm_shapefit.base.settings import explained, option
 from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.rotations.options import Averaging, Sequencing
 from sfm_shapefit.tracks.options import Adjuster, StructureOptions
@@ -21,8 +22,6 @@ KnownDistance = tuple[str, str, float]
 Refined = Literal["auto", "focal", "all", "none"]
 Join = Literal["never", "safe"]
 
-LEAST_MATCHES = 15
-"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
 
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""

@@ -47,3 +47,11 @@ class RelativeRotations:
         """Return which pairs to believe, (k,): W ln n >= least, and W >= 0.4."""
         soundness = self.weight_shares * np.log(np.maximum(self.num_matches, 1))
         return np.asarray((soundness >= least) & (self.weight_shares >= _LEAST_WEIGHT_SHARE))
+
+
+AGREEMENT_DEG = 5.0
+"""Pairs agree with averaged rotations up to here."""
+
+
+LEAST_MATCHES = 15
+"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""

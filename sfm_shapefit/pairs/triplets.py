@@ -16,8 +16,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
 # Of a rotation by no more than that angle.
 _LEAST_TRACE = 1.0 + 2.0 * float(np.cos(np.radians(AGREEMENT_DEG)))

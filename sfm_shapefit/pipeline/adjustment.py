@@ -26,10 +26,10 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
-from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import MatchBatch
 
 _SAID_OF_MATCHES = (

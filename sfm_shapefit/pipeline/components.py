@@ -19,8 +19,8 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gravity import refine_with_gravity
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.trusted import average_consistently
+from sfm_shapefit.scene.given import Gravity
 
 # Our own averaging leaves out what only unsound pairs tie to the rest, or pairs below `min_matches`;
 # pycolmap's what contradicts its answer, too.

@@ -10,7 +10,8 @@ from sfm_shapefit.files.colmap.control_points import read_control_points, triang
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.pipeline.seed import Seeded
-from sfm_shapefit.placement.control_points import ControlPoints, control_gauge, fit_control_points
+from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
+from sfm_shapefit.scene.given import ControlPoints
 
 
 def read_control(model: PosedModel, options: LocateOptions) -> ControlPoints | None:

@@ -11,7 +11,6 @@ from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
-from sfm_shapefit.placement.gauge import Datum
 from sfm_shapefit.scene.evaluation import (
     CameraPoses,
     Evaluation,
@@ -19,6 +18,7 @@ from sfm_shapefit.scene.evaluation import (
     evaluate_poses,
     evaluate_positions,
 )
+from sfm_shapefit.scene.given import Datum
 
 if TYPE_CHECKING:
     import pycolmap

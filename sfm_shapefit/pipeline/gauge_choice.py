@@ -16,7 +16,6 @@ from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
-    PositionPriors,
     coincide,
     distance_gauge,
     input_gauge,
@@ -25,6 +24,7 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
+from sfm_shapefit.scene.given import PositionPriors
 
 
 def read_priors(

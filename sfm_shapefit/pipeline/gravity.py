@@ -16,12 +16,12 @@ from sfm_shapefit.rotations.average import check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.gravity import (
     FEWEST_GRAVITIES,
-    Gravity,
     down_of,
     judge_gravity,
     turn_upright,
     with_gravity,
 )
+from sfm_shapefit.scene.given import Gravity
 
 _NAMED = 3
 

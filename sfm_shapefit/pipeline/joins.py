@@ -23,7 +23,6 @@ from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.joined import Group, tell_group
-from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import (
     ModelJoin,
     PlacedByPriors,
@@ -32,6 +31,7 @@ from sfm_shapefit.placement.join import (
     join_by_priors,
     place_by_priors,
 )
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import MatchBatch
 
 if TYPE_CHECKING:

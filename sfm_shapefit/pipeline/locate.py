@@ -66,13 +66,12 @@ from sfm_shapefit.pipeline.seed import (
     place_further_pieces,
     select_trusted,
 )
-from sfm_shapefit.placement.control_points import ControlPoints
-from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
+from sfm_shapefit.placement.gauge import Gauge, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.placement.tied_groups import measure_unit
-from sfm_shapefit.rotations.gravity import Gravity
+from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
 
 if TYPE_CHECKING:
     import pycolmap

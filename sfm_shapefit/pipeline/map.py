@@ -24,7 +24,7 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
-from sfm_shapefit.facts.options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult, Loop
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
@@ -32,7 +32,7 @@ from sfm_shapefit.files.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.files.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.components import ComponentAveraging, pairs_among
@@ -46,13 +46,12 @@ from sfm_shapefit.pipeline.joins import JoinedModels, Told, join_models
 from sfm_shapefit.pipeline.locate import Locating, locate_source
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.placement.control_points import ControlPoints
-from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors, UselessPriorsError
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
-from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
+from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
 
 # The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
 # again.

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from sfm_shapefit.facts.options import LEAST_MATCHES, MapOptions, Relative
+from sfm_shapefit.facts.options import MapOptions, Relative
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
@@ -16,7 +16,7 @@ from sfm_shapefit.pairs.essential import (
     estimate_relative_rotations,
     stored_relative_rotations,
 )
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 

@@ -12,64 +12,27 @@ made points, this left out 0.03 to 0.17 good ones a fit of 4 to 7, and found one
 axis in 67 % of the fits of 4 points, and in 97 % or more of those of 5 to 7. Three points check nothing.
 """
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, median_spread
-from sfm_shapefit.placement.gauge import Datum, Gauge, PositionPriors, fit_to_priors
+from sfm_shapefit.placement.gauge import Gauge, fit_to_priors
+from sfm_shapefit.scene.given import (
+    FEWEST_CONTROL_POINTS,
+    ControlPoints,
+    PositionPriors,
+    _principal_lengths,
+    why_too_few,
+)
 from sfm_shapefit.scene.known_positions import KnownPositions
 
-FEWEST_CONTROL_POINTS = 3
 _PARAMETERS = 7
 _FITTING_SIGMAS = 4.0
 _MOST_ROUNDS = 20
-# Points within this share of their length from a line say nothing of the turn about it.
-_THIN = 1e-3
 # Nor do those within so many standard deviations.
 _FLAT = 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControlPoints:
-    """Points of known position, and where images show them."""
-
-    names: tuple[str, ...]
-    positions: FloatArray
-    """(k, 3) in axes and units of their own."""
-    is_check: BoolArray
-    """(k,) those that only check the model."""
-    points: IntArray
-    """(m,) the point of each mark, ascending."""
-    images: IntArray
-    """(m,) the image that it is in; of one point ascending, each once."""
-    pixels: FloatArray
-    """(m, 2)"""
-    statement: str
-    """Where they come from, and what their axes are."""
-    datum: Datum | None = None
-    """Where their origin is on Earth, if that is known."""
-
-    def of(self, images: IntArray) -> "ControlPoints":
-        """Return them with the marks in some images (n,), ascending, numbered by their place among these."""
-        inside = np.isin(self.images, images)
-        return replace(
-            self,
-            points=self.points[inside],
-            images=np.searchsorted(images, self.images[inside]),
-            pixels=self.pixels[inside],
-        )
-
-    def seen_twice(self) -> BoolArray:
-        """Return which points have marks in two images, (k,)."""
-        return np.bincount(self.points, minlength=len(self.names)) > 1
-
-    def why_too_few(self) -> str:
-        """Return why these points cannot tell scale and axes, a clause; empty if they can."""
-        usable = self.seen_twice() & ~self.is_check
-        return why_too_few(self.positions[usable], "have marks in two images of the model")
 
 
 class TriangulatedControl(NamedTuple):
@@ -97,16 +60,6 @@ class ControlFit(NamedTuple):
     """(k, 3) the model's position minus the known one, in units of the latter; NaN where it has none."""
     scale_sigma: float
     """Relative standard deviation of the scale."""
-
-
-def why_too_few(positions: FloatArray, what: str) -> str:
-    """Return why points (k, 3) that are all there is cannot tell scale and axes, or nothing if they can."""
-    if len(positions) < FEWEST_CONTROL_POINTS:
-        return f"{len(positions)} of the control points {what}, and scale and axes need three"
-    lengths = _principal_lengths(positions)
-    if lengths[1] <= _THIN * lengths[0]:
-        return f"the control points that {what} lie on a line, and axes need one beside it"
-    return ""
 
 
 def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | str:
@@ -199,8 +152,3 @@ def _leverages(points: FloatArray, fits: BoolArray) -> FloatArray:
     jacobians[:, :, 6] = x
     normal = np.einsum("kab,kac->bc", jacobians[fits], jacobians[fits])
     return np.asarray(np.einsum("kab,kab->k", jacobians @ np.linalg.pinv(normal), jacobians)) / 3.0
-
-
-def _principal_lengths(points: FloatArray) -> FloatArray:
-    """Return the singular values of points (k, 3) around their mean, largest first."""
-    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))

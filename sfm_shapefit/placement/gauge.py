@@ -7,7 +7,7 @@ whole model onto their axes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from sfm_shapefit.base.geometry import (
     rotation_angles_deg,
 )
 from sfm_shapefit.refinement.options import Scale
-from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.given import Datum, PositionPriors
 
 # An input center that is farther off, of the spread of all, is lost and must not set the scale.
 _CAP_OF_SIZE = 0.5
@@ -43,14 +43,6 @@ _REWEIGHTINGS = 20
 
 class UselessPriorsError(InputError):
     """Position priors cannot set scale and origin of the cameras that were found."""
-
-
-class Datum(NamedTuple):
-    """A point on Earth: the origin of axes east, north and up, in meters."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,26 +69,6 @@ class Gauge:
         """Map the solver's locations (n, 3) to the output's units and axes."""
         moved = self.similarity.apply(locations)
         return moved if self.axes is None else np.asarray(moved @ self.axes.T)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PositionPriors:
-    """Measured positions of some cameras, such as GPS, in axes and units of their own."""
-
-    known: KnownPositions
-    """By camera."""
-    statement: str
-    """Where they come from, and what their axes are."""
-    datum: Datum | None = None
-    """Where their origin is on Earth, if that is known."""
-
-    def of(self, cameras: IntArray) -> "PositionPriors":
-        """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
-        return replace(self, known=self.known.among(cameras))
-
-    def __len__(self) -> int:
-        """Return how many cameras have one."""
-        return len(self.known.indices)
 
 
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:

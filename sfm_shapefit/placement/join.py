@@ -35,7 +35,8 @@ from sfm_shapefit.base.geometry import (
     rotation_angles_deg,
 )
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.placement.gauge import PositionPriors, fit_to_priors, prior_gauge
+from sfm_shapefit.placement.gauge import fit_to_priors, prior_gauge
+from sfm_shapefit.scene.given import PositionPriors
 
 FEWEST_WITNESSES = 3
 """Pairs of images, or known positions in each model, that a join needs."""

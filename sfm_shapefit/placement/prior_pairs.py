@@ -6,7 +6,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between, normalized
-from sfm_shapefit.placement.gauge import Gauge, PositionPriors
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.scene.given import PositionPriors
 
 # A direction contradicts its baseline beyond so many standard deviations of it, and beyond so many degrees.
 _FAR = 4.0

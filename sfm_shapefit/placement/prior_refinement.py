@@ -7,11 +7,12 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH
-from sfm_shapefit.placement.gauge import Gauge, PositionPriors
+from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.anchored import refine_anchored, weighted_anchors
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH, Metric
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 PULLED = "; the priors moved cameras by "

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.sparse import coo_array, csgraph
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,
     follow_tree,

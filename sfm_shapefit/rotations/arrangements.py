@@ -49,8 +49,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
 
 _USUAL_QUANTILE, _NUM_ALIKE = 0.8, 81
 _EVEN_SHARE, _SPREAD = 0.65, 0.25

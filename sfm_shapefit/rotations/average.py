@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.graph.viewgraph import connected_components
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
     Linearized,
@@ -37,7 +37,7 @@ from sfm_shapefit.rotations.annealing import (
     reattach,
     refine_fully,
 )
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import cap_information, residual_squares
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenvalues, plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas

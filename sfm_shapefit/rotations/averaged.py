@@ -7,10 +7,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.options import Averaging
-
-AGREEMENT_DEG = 5.0
-"""Pairs agree with averaged rotations up to here."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
 
 def relative_rotations_of_frames(

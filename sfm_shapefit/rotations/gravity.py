@@ -20,8 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import angle_between, normalized
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.annealing import (
     LAST_REDUCTION,
     LONGEST_STEP,
@@ -30,10 +31,11 @@ from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
     Linearized,
 )
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import MOST_LEVERAGE, estimate_sigmas, residual_variance
+from sfm_shapefit.scene.given import Gravity
 
 DOWN = np.array([0.0, 0.0, -1.0])
 """In axes of the world."""
@@ -51,34 +53,6 @@ _WRONG_SIGMAS = 5.0
 # Median of the length of two normal components of variance 1.
 _MEDIAN_LENGTH = 1.1774
 FEWEST_GRAVITIES = 2
-
-
-class Gravity(NamedTuple):
-    """Measured directions of gravity, in axes of cameras (x right, y down, z ahead)."""
-
-    indices: IntArray
-    """(k,) whose they are, ascending without repetition."""
-    directions: FloatArray
-    """(k, 3) unit vectors."""
-    sigmas: FloatArray
-    """(k,) standard deviations about each of two axes, in radians."""
-
-    def among(self, members: IntArray) -> "Gravity":
-        """Return those of some members (n,), ascending, numbered by their place among these."""
-        _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
-        return Gravity(places, self.directions[rows], self.sigmas[rows])
-
-    def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
-        """Return the gravities of frames, by the frame (n,) and sensor_from_rig (n, 3, 3) of each image.
-
-        Of a frame with several the most certain counts: sensors of one rig share their errors.
-        """
-        turned = np.einsum("kba,kb->ka", sensor_rotations[self.indices], self.directions)
-        frames = frame_of_image[self.indices]
-        order = np.lexsort((self.sigmas, frames))
-        found, first = np.unique(frames[order], return_index=True)
-        rows = order[first]
-        return Gravity(found, turned[rows], self.sigmas[rows])
 
 
 def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:

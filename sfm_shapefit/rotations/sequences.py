@@ -25,9 +25,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.viewgraph import connected_components
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
 
 # Of so many digits at most, as Python reads no integer of more than 4,300.
 _LAST_NUMBER = re.compile(r"^(.*?)(\d{1,255})(\D*)$", re.DOTALL)

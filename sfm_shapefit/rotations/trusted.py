@@ -27,10 +27,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.options import LEAST_MATCHES
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.options import Averaging
 from sfm_shapefit.rotations.rotation_averaging import Loss, average_rotations
 

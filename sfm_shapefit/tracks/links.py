@@ -6,12 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
-
-Int32Array = npt.NDArray[np.int32]
 
 # Between two slices Python can be interrupted: about 50 ms.
 _MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000

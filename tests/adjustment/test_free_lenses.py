@@ -7,7 +7,8 @@ import pytest
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust
 from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, LensDoubt, focal_sigmas
+from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
+from sfm_shapefit.scene.lens import LensDoubt
 from tests.adjustment.made import disturb, look_at, ring_problem
 
 OPTIONS = AdjustmentOptions(loss_scale_px=2.0, cost_tolerance=1e-9)

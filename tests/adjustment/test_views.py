@@ -12,11 +12,13 @@ from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly, bundle_adjust
-from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks, read_bundle
-from sfm_shapefit.adjustment.views import lens_of, read_frames, with_points, with_poses
+from sfm_shapefit.adjustment.views import read_frames, with_points, with_poses
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.scenes import BUNDLED

@@ -4,9 +4,10 @@ import pytest
 
 from sfm_shapefit.adjustment import Lens
 from sfm_shapefit.adjustment.adjusted import RefinedLenses
-from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.facts.intrinsics import Intrinsics, describe_intrinsics, intrinsics_warnings
 from sfm_shapefit.files.colmap.intrinsics import Origin
+from sfm_shapefit.scene.lens import LensDoubt
 
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):

@@ -15,18 +15,19 @@ import pytest
 from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
 from sfm_shapefit.adjustment.filter import filter_in_place, filter_points
-from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import collect_matches
 from sfm_shapefit.adjustment.structure import triangulate, triangulate_in_place
-from sfm_shapefit.adjustment.views import lens_of
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
+from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.point_colors import color_points, read_colors
 from sfm_shapefit.files.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.files.colmap.seed import build_seed, write_model
+from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.problems import all_pairs

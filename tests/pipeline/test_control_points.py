@@ -11,7 +11,8 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.placement.control_points import ControlPoints, fit_control_points
+from sfm_shapefit.placement.control_points import fit_control_points
+from sfm_shapefit.scene.given import ControlPoints
 from tests.scenes import RING
 
 TURN = pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])).matrix()

@@ -7,7 +7,8 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.placement.gauge import PositionPriors, input_gauge, prior_gauge
+from sfm_shapefit.placement.gauge import input_gauge, prior_gauge
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
 from sfm_shapefit.synthetic.workspace import write_workspace

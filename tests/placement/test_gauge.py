@@ -19,10 +19,11 @@ from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.placement.gauge import distance_gauge, input_gauge, prior_gauge
 from sfm_shapefit.placement.prior_pairs import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
 from tests.scenes import RING

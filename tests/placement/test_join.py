@@ -13,8 +13,8 @@ from sfm_shapefit.base.geometry import (
     normalized,
     rotation_angles_deg,
 )
-from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.join import Ties, join_by_matches, join_by_priors, place_by_priors
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()

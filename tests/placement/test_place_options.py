@@ -11,11 +11,12 @@ from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.gauge import PositionPriors, prior_gauge
+from sfm_shapefit.placement.gauge import prior_gauge
 from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences

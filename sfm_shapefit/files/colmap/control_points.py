@@ -25,8 +25,8 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel, camera_rays
 from sfm_shapefit.files.colmap.priors import enu_of
 from sfm_shapefit.files.lines import is_number, text_of
-from sfm_shapefit.placement.control_points import ControlPoints, TriangulatedControl
-from sfm_shapefit.placement.gauge import Datum
+from sfm_shapefit.placement.control_points import TriangulatedControl
+from sfm_shapefit.scene.given import ControlPoints, Datum
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks

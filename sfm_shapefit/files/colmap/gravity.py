@@ -14,7 +14,7 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import PRIORS_OF_IMAGES
 from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.files.lines import is_number, lines_of_cells
-from sfm_shapefit.rotations.gravity import Gravity
+from sfm_shapefit.scene.given import Gravity
 
 _SIGMA_DEG = 1.0
 # No instrument is as exact, and beside a gravity that is, the pairs' share of the system drowns in rounding.

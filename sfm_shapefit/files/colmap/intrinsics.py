@@ -23,13 +23,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment.free_lenses import LensDoubt
-from sfm_shapefit.adjustment.views import is_adjusted, lens_of
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
+from sfm_shapefit.files.colmap.lenses import is_adjusted, lens_of
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.scene.lens import LensDoubt
 
 
 class Origin(Enum):

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.arrays import Int32Array, IntArray
 from sfm_shapefit.files.colmap.model import UInt64Array, observed_points, points2d_xy
-from sfm_shapefit.tracks.links import Int32Array
 
 
 class SeenColors(NamedTuple):

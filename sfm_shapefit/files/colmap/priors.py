@@ -18,7 +18,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
 from sfm_shapefit.files.lines import is_number, lines_of_cells
-from sfm_shapefit.placement.gauge import Datum, PositionPriors
+from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 _WGS84, _CARTESIAN = 0, 1

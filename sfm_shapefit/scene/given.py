@@ -1,0 +1,127 @@
+"""What a user tells of the images beside the matches: positions, control points, gravity; types only."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.scene.known_positions import KnownPositions
+
+
+class Datum(NamedTuple):
+    """A point on Earth: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PositionPriors:
+    """Measured positions of some cameras, such as GPS, in axes and units of their own."""
+
+    known: KnownPositions
+    """By camera."""
+    statement: str
+    """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
+
+    def of(self, cameras: IntArray) -> "PositionPriors":
+        """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
+        return replace(self, known=self.known.among(cameras))
+
+    def __len__(self) -> int:
+        """Return how many cameras have one."""
+        return len(self.known.indices)
+
+
+FEWEST_CONTROL_POINTS = 3
+
+
+# Points within this share of their length from a line say nothing of the turn about it.
+_THIN = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlPoints:
+    """Points of known position, and where images show them."""
+
+    names: tuple[str, ...]
+    positions: FloatArray
+    """(k, 3) in axes and units of their own."""
+    is_check: BoolArray
+    """(k,) those that only check the model."""
+    points: IntArray
+    """(m,) the point of each mark, ascending."""
+    images: IntArray
+    """(m,) the image that it is in; of one point ascending, each once."""
+    pixels: FloatArray
+    """(m, 2)"""
+    statement: str
+    """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
+
+    def of(self, images: IntArray) -> "ControlPoints":
+        """Return them with the marks in some images (n,), ascending, numbered by their place among these."""
+        inside = np.isin(self.images, images)
+        return replace(
+            self,
+            points=self.points[inside],
+            images=np.searchsorted(images, self.images[inside]),
+            pixels=self.pixels[inside],
+        )
+
+    def seen_twice(self) -> BoolArray:
+        """Return which points have marks in two images, (k,)."""
+        return np.bincount(self.points, minlength=len(self.names)) > 1
+
+    def why_too_few(self) -> str:
+        """Return why these points cannot tell scale and axes, a clause; empty if they can."""
+        usable = self.seen_twice() & ~self.is_check
+        return why_too_few(self.positions[usable], "have marks in two images of the model")
+
+
+def why_too_few(positions: FloatArray, what: str) -> str:
+    """Return why points (k, 3) that are all there is cannot tell scale and axes, or nothing if they can."""
+    if len(positions) < FEWEST_CONTROL_POINTS:
+        return f"{len(positions)} of the control points {what}, and scale and axes need three"
+    lengths = _principal_lengths(positions)
+    if lengths[1] <= _THIN * lengths[0]:
+        return f"the control points that {what} lie on a line, and axes need one beside it"
+    return ""
+
+
+def _principal_lengths(points: FloatArray) -> FloatArray:
+    """Return the singular values of points (k, 3) around their mean, largest first."""
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))
+
+
+class Gravity(NamedTuple):
+    """Measured directions of gravity, in axes of cameras (x right, y down, z ahead)."""
+
+    indices: IntArray
+    """(k,) whose they are, ascending without repetition."""
+    directions: FloatArray
+    """(k, 3) unit vectors."""
+    sigmas: FloatArray
+    """(k,) standard deviations about each of two axes, in radians."""
+
+    def among(self, members: IntArray) -> "Gravity":
+        """Return those of some members (n,), ascending, numbered by their place among these."""
+        _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
+        return Gravity(places, self.directions[rows], self.sigmas[rows])
+
+    def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
+        """Return the gravities of frames, by the frame (n,) and sensor_from_rig (n, 3, 3) of each image.
+
+        Of a frame with several the most certain counts: sensors of one rig share their errors.
+        """
+        turned = np.einsum("kba,kb->ka", sensor_rotations[self.indices], self.directions)
+        frames = frame_of_image[self.indices]
+        order = np.lexsort((self.sigmas, frames))
+        found, first = np.unique(frames[order], return_index=True)
+        rows = order[first]
+        return Gravity(found, turned[rows], self.sigmas[rows])

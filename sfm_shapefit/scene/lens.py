@@ -1,0 +1,139 @@
+"""Lenses: the intrinsics of COLMAP's models that are cases of OPENCV, and how far given ones may be off.
+
+u = x/z, v = y/z, s = u^2 + v^2,
+pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
+         fy (v (1 + k1 s + k2 s^2) + 2 p2 u v + p1 (s + 2 v^2)) + cy).
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+
+_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
+
+
+NUM_VALUES = 8
+"""Parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2."""
+
+
+# For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
+_PLACES = {
+    "SIMPLE_PINHOLE": (-1, _CX, _CY),
+    "PINHOLE": (_FX, _FY, _CX, _CY),
+    "SIMPLE_RADIAL": (-1, _CX, _CY, _K1),
+    "RADIAL": (-1, _CX, _CY, _K1, _K2),
+    "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """The intrinsics that one or several cameras look through."""
+
+    model: str
+    """SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
+    parameters: tuple[float, ...]
+    """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
+    fixed: bool = False
+    """Whether it stays what it is even where focal lengths or distortion are free."""
+    focal_fixed: bool = False
+    """Whether its focal lengths stay even where they are free."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown models and impossible parameters."""
+        if self.model not in _PLACES:
+            known = ", ".join(_PLACES)
+            raise InputError(
+                f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
+            )
+        wanted = len(_PLACES[self.model])
+        if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
+            raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
+        if min(self.values()[:2]) <= 0.0:
+            raise InputError("a lens has a focal length that is not positive; correct its parameters")
+
+    def values(self) -> FloatArray:
+        """Return the parameters of the same lens as OPENCV model, (8,)."""
+        values = np.zeros(NUM_VALUES)
+        for place, parameter in zip(_PLACES[self.model], self.parameters, strict=True):
+            values[[_FX, _FY] if place < 0 else place] = parameter
+        return values
+
+    def with_values(self, values: FloatArray) -> "Lens":
+        """Return the lens of this model whose OPENCV parameters are `values`, (8,)."""
+        kept = [float(values[max(place, 0)]) for place in _PLACES[self.model]]
+        return replace(self, parameters=tuple(kept))
+
+    def own_values(self) -> BoolArray:
+        """Return which of OPENCV's parameters the model states by itself, (8,): fy is none where it is fx."""
+        own = np.zeros(NUM_VALUES, np.bool_)
+        own[[max(place, 0) for place in _PLACES[self.model]]] = True
+        return own
+
+    def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
+        """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
+        slots = np.full(NUM_VALUES, -1)
+        if self.fixed:
+            return slots
+        focal_lengths = focal_lengths and not self.focal_fixed
+        unknown = 0
+        for place in _PLACES[self.model]:
+            if place in (_CX, _CY) or not (focal_lengths if place <= _FY else distortion):
+                continue
+            slots[[_FX, _FY] if place < 0 else place] = unknown
+            unknown += 1
+        return slots
+
+
+LARGEST_SIGMA = 0.02
+"""Of a focal length, as a share of it: beyond, the observations do not tell it."""
+
+
+# Errors that keypoints share make those of a focal length larger than the noise alone does: on kitti-turn,
+# driven straight ahead for the greatest part, seven times.
+_SHARED_NOISE = 7.0
+
+
+# So many standard deviations, of the noise and of what was given, are no chance.
+_CONTRADICTION = 10.0
+
+
+# By what factor a guess may be off, and the largest coefficient of a distortion.
+_MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
+
+
+_FOCAL_LENGTHS, _DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
+
+
+class LensDoubt(NamedTuple):
+    """What was given of a lens, and how far it may be off."""
+
+    given: Lens
+    focal_sigma: float
+    """Standard deviation of its focal lengths, as a share of them."""
+    distortion_sigma: float
+    """Standard deviation of each coefficient of its distortion."""
+
+    def information(self) -> FloatArray:
+        """Return the inverse variances of the OPENCV parameters, (8,); 0 for those that are held anyway."""
+        information = np.zeros(NUM_VALUES)
+        information[_FOCAL_LENGTHS] = (self.focal_sigma * self.given.values()[_FOCAL_LENGTHS]) ** -2.0
+        information[_DISTORTION] = self.distortion_sigma**-2.0
+        return information
+
+    def accepts(self, found: Lens, sigma: float) -> bool:
+        """Return whether an adjusted lens is to be believed, its focal length known to `sigma` by the noise.
+
+        It is to be known better than what was given, or to contradict that clearly. One that has run away,
+        beyond what any lens given so is off by, is not believed either.
+        """
+        ratio = found.values()[0] / self.given.values()[0]
+        sound = bool(np.abs(found.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
+        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
+        better = _SHARED_NOISE * sigma <= self.focal_sigma
+        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
+        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
