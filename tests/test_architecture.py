@@ -17,8 +17,8 @@ FLOORS = [
     {"scene", "laplacian"},
     {"graph"},
     {"solver", "files"},
-    {"pairs", "refinement", "synthetic"},
-    {"tracks", "rotations"},
+    {"pairs", "refinement"},
+    {"tracks", "rotations", "synthetic"},
     {"adjustment"},
     {"placement"},
     {"judgement"},
@@ -28,19 +28,8 @@ FLOORS = [
     {"cli", "__main__"},
 ]
 # Arrows that still go up or across, type checking counted. The list may only become shorter.
-STILL_UPWARD = {
-    ("files", "adjustment"),
-    ("files", "placement"),
-    ("files", "rotations"),
-    ("files", "tracks"),
-    ("judgement", "facts"),
-    ("pairs", "rotations"),
-    ("placement", "judgement"),
-    ("rotations", "facts"),
-    ("synthetic", "pairs"),
-    ("tracks", "adjustment"),
-}
-MOST_ARROWS = 110  # between rooms, beside those to base/; the list may only become shorter
+STILL_UPWARD = {("placement", "judgement")}
+MOST_ARROWS = 95  # between rooms, beside those to base/; the list may only become shorter
 
 ROOMS = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 

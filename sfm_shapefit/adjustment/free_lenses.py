@@ -19,7 +19,7 @@ from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, LensPrior
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.scene.lens import _FOCAL_LENGTHS, Lens, LensDoubt
+from sfm_shapefit.scene.lens import DISTORTION, FOCAL_LENGTHS, Lens, LensDoubt
 
 
 class FreeLenses(NamedTuple):
@@ -75,7 +75,7 @@ ALL_HELD = FreeLenses({}, distortion=False)
 
 def _bends(lens: Lens) -> bool:
     """Return whether the model of a lens has a distortion."""
-    return bool(lens.own_values()[_DISTORTION].any())
+    return bool(lens.own_values()[DISTORTION].any())
 
 
 def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
@@ -88,6 +88,6 @@ def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> Floa
     Raises:
         UnsolvableError: if the observations leave more open than a similarity.
     """
-    sigmas = estimate_covariances(problem, options).lens_sigmas[:, _FOCAL_LENGTHS]
-    values = np.array([lens.values()[_FOCAL_LENGTHS] for lens in problem.lenses])
+    sigmas = estimate_covariances(problem, options).lens_sigmas[:, FOCAL_LENGTHS]
+    values = np.array([lens.values()[FOCAL_LENGTHS] for lens in problem.lenses])
     return np.asarray((sigmas / values).max(axis=1))

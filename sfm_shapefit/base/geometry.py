@@ -269,3 +269,8 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
     flip = np.ones(matrices.shape[:-1])
     flip[..., -1] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
     return np.asarray((u * flip[..., None, :]) @ vt)
+
+
+def principal_lengths(points: FloatArray) -> FloatArray:
+    """Return the singular values of points (k, 3) around their mean, largest first."""
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))

@@ -6,11 +6,15 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.control_points import control_rows, control_warnings
 from sfm_shapefit.facts.json_types import ControlPoint
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.control_points import read_control_points, triangulate_control_points
+from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.pipeline.seed import Seeded
-from sfm_shapefit.placement.control_points import control_gauge, fit_control_points
+from sfm_shapefit.placement.control_points import (
+    control_gauge,
+    fit_control_points,
+    triangulate_control_points,
+)
 from sfm_shapefit.scene.given import ControlPoints
 
 
@@ -37,7 +41,9 @@ def bring_to_control_points(
     """
     if known is None:
         return seeded, [], ()
-    found = triangulate_control_points(seeded.reconstruction, model.names, known, options)
+    found = triangulate_control_points(
+        known, look_at_marks(seeded.reconstruction, model.names, known), options
+    )
     fit = fit_control_points(known, found.positions)
     warnings = tuple(control_warnings(known, found, fit, model.names))
     rows = control_rows(known, found, fit)

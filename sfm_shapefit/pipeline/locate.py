@@ -102,8 +102,8 @@ def locate(
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
-        priors: a table of position priors, see `files.colmap.priors.table_priors`, or the folder of the images,
-            whose EXIF data have them; the database's own pose priors
+        priors: a table of position priors, see `files.colmap.priors`, or the folder of the images, whose
+            EXIF data have them; the database's own pose priors
             serve if the scale is "prior" and there is no table.
         executor: shares out pairs and tracks among its workers, which must see the file of the database, with
             the same answer to the bit; it is not shut down. None: all is done here.

@@ -1,6 +1,6 @@
 """What is rigid by its graph and yet loose by its geometry.
 
-The test of rigidity (`graph.rigidity`) takes positions to be general. At the solution they need not be: cameras on
+The test of rigidity takes positions to be general. At the solution they need not be: cameras on
 a line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly
 parallel, the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees
 all of these. Here its loose cameras are put into groups that move together, with what makes them loose:

@@ -17,17 +17,29 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose, fit_similarity, median_spread
+from sfm_shapefit.base.geometry import (
+    METRIC_SIGMA,
+    Similarity,
+    compose,
+    fit_similarity,
+    median_spread,
+    principal_lengths,
+)
 from sfm_shapefit.placement.gauge import Gauge, fit_to_priors
 from sfm_shapefit.scene.given import (
     FEWEST_CONTROL_POINTS,
     ControlPoints,
+    MarkedViews,
     PositionPriors,
-    _principal_lengths,
     why_too_few,
 )
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
+from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
 
+# Marks are set by hand, in a model that may be bent: they miss by more than keypoints do.
+_MARK_ERRORS = 4.0
 _PARAMETERS = 7
 _FITTING_SIGMAS = 4.0
 _MOST_ROUNDS = 20
@@ -62,6 +74,50 @@ class ControlFit(NamedTuple):
     """Relative standard deviation of the scale."""
 
 
+def triangulate_control_points(
+    known: ControlPoints, seen: MarkedViews, options: StructureOptions
+) -> TriangulatedControl:
+    """Return where the placed images of a model have control points; marks may be wrong.
+
+    Args:
+        known: the points and their marks.
+        seen: the placed images, and their views of the marks.
+        options: of 3D points; a mark may miss by four times what a keypoint may.
+    """
+    counts = np.bincount(known.points[seen.rows], minlength=len(known.names))
+    tracks = ObservedTracks(
+        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        cameras=seen.views,
+        keypoints=seen.rows,
+        pixels=known.pixels[seen.rows],
+        on_plane=seen.on_plane,
+        ids=np.arange(len(known.names)),
+        may_split=False,
+    )
+    limits = PointLimits(
+        max_error_px=_MARK_ERRORS * options.max_reprojection_error_px,
+        min_angle_deg=options.min_triangulation_angle_deg,
+        min_length=2,
+    )
+    stand = CameraPoses(
+        rotations=seen.rotations,
+        centers=seen.centers,
+        focal_lengths_px=seen.focal_lengths_px,
+        images=np.arange(len(seen.rotations)),
+    )
+    found = triangulate_tracks(tracks, stand, limits)
+    positions = np.full((len(known.names), 3), np.nan)
+    positions[found.tracks] = found.points
+    agreeing, errors = np.zeros(len(known.points), dtype=np.bool_), np.full(len(known.points), np.nan)
+    agreeing[seen.rows] = found.points_seen >= 0
+    to_point = positions[known.points[seen.rows]] - seen.centers[seen.views]
+    inside = np.einsum("kab,kb->ka", seen.rotations[seen.views], to_point)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
+        errors[seen.rows] = seen.focal_lengths_px[seen.views] * off
+    return TriangulatedControl(positions, errors, agreeing)
+
+
 def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | str:
     """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none."""
     there: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
@@ -86,7 +142,7 @@ def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | 
         fits = again
     if motion.scale <= 0.0:
         return "the control points contradict the model; check the order of their coordinates"
-    if _principal_lengths(target[fits])[1] <= _FLAT * sigma * np.sqrt(fits.sum()):
+    if principal_lengths(target[fits])[1] <= _FLAT * sigma * np.sqrt(fits.sum()):
         return (
             f"the control points contradict one another: those that agree, {int(fits.sum())} of {len(rows)}, "
             "lie on a line but for their errors; check coordinates and marks"

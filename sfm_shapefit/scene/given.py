@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import principal_lengths
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 
@@ -38,8 +39,6 @@ class PositionPriors:
 
 
 FEWEST_CONTROL_POINTS = 3
-
-
 # Points within this share of their length from a line say nothing of the turn about it.
 _THIN = 1e-3
 
@@ -88,15 +87,27 @@ def why_too_few(positions: FloatArray, what: str) -> str:
     """Return why points (k, 3) that are all there is cannot tell scale and axes, or nothing if they can."""
     if len(positions) < FEWEST_CONTROL_POINTS:
         return f"{len(positions)} of the control points {what}, and scale and axes need three"
-    lengths = _principal_lengths(positions)
+    lengths = principal_lengths(positions)
     if lengths[1] <= _THIN * lengths[0]:
         return f"the control points that {what} lie on a line, and axes need one beside it"
     return ""
 
 
-def _principal_lengths(points: FloatArray) -> FloatArray:
-    """Return the singular values of points (k, 3) around their mean, largest first."""
-    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))
+class MarkedViews(NamedTuple):
+    """The placed images of a model, and how they see the marks of control points."""
+
+    rotations: FloatArray
+    """(v, 3, 3) cam_from_world of the placed images."""
+    centers: FloatArray
+    """(v, 3)"""
+    focal_lengths_px: FloatArray
+    """(v,)"""
+    rows: IntArray
+    """(r,) the marks in placed images, by their place in `ControlPoints`, ascending."""
+    views: IntArray
+    """(r,) the placed image of each of these marks."""
+    on_plane: FloatArray
+    """(r, 2) normalized coordinates of each of these marks; NaN where it has no ray ahead."""
 
 
 class Gravity(NamedTuple):

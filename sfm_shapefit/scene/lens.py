@@ -106,7 +106,8 @@ _CONTRADICTION = 10.0
 _MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
 
 
-_FOCAL_LENGTHS, _DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
+FOCAL_LENGTHS, DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
+"""Where they are among the parameters of the OPENCV model."""
 
 
 class LensDoubt(NamedTuple):
@@ -121,8 +122,8 @@ class LensDoubt(NamedTuple):
     def information(self) -> FloatArray:
         """Return the inverse variances of the OPENCV parameters, (8,); 0 for those that are held anyway."""
         information = np.zeros(NUM_VALUES)
-        information[_FOCAL_LENGTHS] = (self.focal_sigma * self.given.values()[_FOCAL_LENGTHS]) ** -2.0
-        information[_DISTORTION] = self.distortion_sigma**-2.0
+        information[FOCAL_LENGTHS] = (self.focal_sigma * self.given.values()[FOCAL_LENGTHS]) ** -2.0
+        information[DISTORTION] = self.distortion_sigma**-2.0
         return information
 
     def accepts(self, found: Lens, sigma: float) -> bool:
@@ -132,7 +133,7 @@ class LensDoubt(NamedTuple):
         beyond what any lens given so is off by, is not believed either.
         """
         ratio = found.values()[0] / self.given.values()[0]
-        sound = bool(np.abs(found.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
+        sound = bool(np.abs(found.values()[DISTORTION]).max() <= _MOST_DISTORTION)
         sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
         better = _SHARED_NOISE * sigma <= self.focal_sigma
         contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)

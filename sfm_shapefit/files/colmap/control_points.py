@@ -1,4 +1,4 @@
-"""Ground control points from a file, and where a model has them.
+"""Ground control points from a file, and where the images of a model look at their marks.
 
 The file is OpenDroneMap's gcp_list.txt:
 
@@ -25,11 +25,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel, camera_rays
 from sfm_shapefit.files.colmap.priors import enu_of
 from sfm_shapefit.files.lines import is_number, text_of
-from sfm_shapefit.placement.control_points import TriangulatedControl
-from sfm_shapefit.scene.given import ControlPoints, Datum
-from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
-from sfm_shapefit.tracks.options import StructureOptions
-from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
+from sfm_shapefit.scene.given import ControlPoints, Datum, MarkedViews
 
 _LARGEST = 1e30
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
@@ -41,8 +37,6 @@ _UTM_STRING = re.compile(r".*\+proj=utm\b.*\+zone=(\d{1,2})\b.*")
 _EARTH_SHAPE, _UNITS = re.compile(r"\+(?:ellps|datum)=(\S+)"), re.compile(r"\+units=(\S+)")
 _ZONES = range(1, 61)
 _LINE = "x y z, two pixel coordinates, the name of an image, and perhaps that of the point"
-# Marks are set by hand, in a model that may be bent: they miss by more than keypoints do.
-_MARK_ERRORS = 4.0
 
 
 class _Mark(NamedTuple):
@@ -108,19 +102,15 @@ def read_control_points(path: Path, model: PosedModel) -> ControlPoints:
     )
 
 
-def triangulate_control_points(
-    reconstruction: pycolmap.Reconstruction,
-    names: tuple[str, ...],
-    known: ControlPoints,
-    options: StructureOptions,
-) -> TriangulatedControl:
-    """Return where the placed images of a model have control points; marks may be wrong.
+def look_at_marks(
+    reconstruction: pycolmap.Reconstruction, names: tuple[str, ...], known: ControlPoints
+) -> MarkedViews:
+    """Return the placed images of a model, and their views of the marks of control points.
 
     Args:
         reconstruction: not changed.
         names: (n,) of the images that the marks index.
         known: the points and their marks.
-        options: of 3D points; a mark may miss by four times what a keypoint may.
     """
     ids = {image.name: image_id for image_id, image in reconstruction.images.items()}
     placed = [k for k, name in enumerate(names) if name in ids and reconstruction.image(ids[name]).has_pose]
@@ -135,37 +125,14 @@ def triangulate_control_points(
         ray = camera_rays(cameras[place[known.images[row]]], known.pixels[row : row + 1])[0]
         if ray[2] > 0.0:
             on_plane[k] = ray[:2] / ray[2]
-    counts = np.bincount(known.points[rows], minlength=len(known.names))
-    seen = place[known.images[rows]]
-    centers = np.array([image.projection_center() for image in images]).reshape(-1, 3)
-    turns = np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3)
-    focals = np.array([camera.mean_focal_length() for camera in cameras])
-    tracks = ObservedTracks(
-        offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        cameras=seen,
-        keypoints=rows,
-        pixels=known.pixels[rows],
+    return MarkedViews(
+        rotations=np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3),
+        centers=np.array([image.projection_center() for image in images]).reshape(-1, 3),
+        focal_lengths_px=np.array([camera.mean_focal_length() for camera in cameras]),
+        rows=rows,
+        views=place[known.images[rows]],
         on_plane=on_plane,
-        ids=np.arange(len(known.names)),
-        may_split=False,
     )
-    limits = PointLimits(
-        max_error_px=_MARK_ERRORS * options.max_reprojection_error_px,
-        min_angle_deg=options.min_triangulation_angle_deg,
-        min_length=2,
-    )
-    stand = CameraPoses(
-        rotations=turns, centers=centers, focal_lengths_px=focals, images=np.arange(len(placed))
-    )
-    found = triangulate_tracks(tracks, stand, limits)
-    positions = np.full((len(known.names), 3), np.nan)
-    positions[found.tracks] = found.points
-    agreeing, errors = np.zeros(len(known.points), dtype=np.bool_), np.full(len(known.points), np.nan)
-    agreeing[rows] = found.points_seen >= 0
-    inside = np.einsum("kab,kb->ka", turns[seen], positions[known.points[rows]] - centers[seen])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        errors[rows] = focals[seen] * np.linalg.norm(inside[:, :2] / inside[:, 2:] - on_plane, axis=1)
-    return TriangulatedControl(positions, errors, agreeing)
 
 
 Converter = Callable[[FloatArray], tuple[FloatArray, Datum | None]]
