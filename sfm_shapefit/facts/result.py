@@ -28,12 +28,12 @@ from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import SolverResult
@@ -93,7 +93,7 @@ class LocateResult(Displayed):
     """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
     directions: PairDirections
     """All pairs that were looked at, with their support."""
-    placement: Placement
+    placement: Judged
     """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
     largest rigid piece solved, and the evidence for it, in the solver's units."""
     kept: BoolArray
@@ -113,7 +113,7 @@ class LocateResult(Displayed):
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
     where it was kept; None if there was none."""
-    further: "tuple[FurtherPiece, ...]" = ()
+    further: "tuple[LocateResult, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
@@ -222,6 +222,13 @@ class LocateResult(Displayed):
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
+    @cached_property
+    def own_cameras(self) -> list[CameraRow]:
+        """One row per camera of the piece that is placed."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+
     @property
     def agreeing_pairs(self) -> float:
         """Of the pairs of cameras in the output that say anything of a direction, the share that agrees.
@@ -316,28 +323,6 @@ def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FurtherPiece:
-    """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
-
-    placement: Placement
-    """Its solution; `placement.piece` is its number."""
-    kept: BoolArray
-    """Which of the placement's cameras are in its model; the others are not trusted enough."""
-    gauge: Gauge
-    """From the solver's units to those of its model, a unit of its own."""
-    reconstruction: "pycolmap.Reconstruction"
-    """Its seeded model."""
-    image_ids: IntArray
-    """(k,) the images of the placement's cameras."""
-
-    @cached_property
-    def camera_rows(self) -> list[CameraRow]:
-        """One row per camera of the piece."""
-        centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
-        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class GraphResult(Displayed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
@@ -347,8 +332,8 @@ class GraphResult(Displayed):
     statement: str
     """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
-    placement: Placement
-    further: tuple[Placement, ...]
+    placement: Judged
+    further: tuple[Judged, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""

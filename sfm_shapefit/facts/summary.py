@@ -30,7 +30,7 @@ from sfm_shapefit.facts.key_figures import NOISE_ONLY, SOLVER_UNITS, UNITS, key_
 from sfm_shapefit.facts.rows import piece_rows
 from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.facts.warnings import graph_warnings
-from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.judgement.judged import Judged
 
 if TYPE_CHECKING:
     import pycolmap
@@ -193,7 +193,7 @@ def _summarize(
     }
 
 
-def sigma_of(placement: Placement) -> str:
+def sigma_of(placement: Judged) -> str:
     """Say what the standard deviations of the cameras know of, and what they are relative to."""
     if placement.adjusted_covariances is None:
         return f"{NOISE_ONLY}; relative to the centroid and scale of the cameras that are held"
@@ -212,7 +212,7 @@ def _pick(kind: Any, source: object) -> Any:
     return None if source is None else {key: getattr(source, key) for key in kind.__annotations__}
 
 
-def residuals_deg(placement: Placement) -> dict[str, float]:
+def residuals_deg(placement: Judged) -> dict[str, float]:
     """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
     residuals = placement.assessment.residuals_deg[placement.pairs]
     facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}

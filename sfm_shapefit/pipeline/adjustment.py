@@ -20,6 +20,7 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
@@ -70,7 +71,7 @@ class AfterAdjustment(NamedTuple):
     directions: PairDirections
     """Measured anew at these, as far as they are usable there too."""
     placement: Placement
-    """Moved to the adjusted centers and judged there, by those directions."""
+    """Moved to the adjusted centers, with those directions."""
     adjusted: AdjustedPlacement
     """How it went."""
 
@@ -107,15 +108,10 @@ def adjust_placed(
         if adjusted.sensors:  # which stand elsewhere in their frames now
             measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
         placement = replace(placement, measured=measured)
-    moved = with_uncertainty(
-        move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
-    )
-    return AfterAdjustment(source, directions, moved, adjusted)
+    return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted)
 
 
-def with_uncertainty(
-    placement: Placement, model: PosedModel, uncertainty: Uncertainty, scale: float
-) -> Placement:
+def with_uncertainty(placement: Judged, model: PosedModel, uncertainty: Uncertainty, scale: float) -> Judged:
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
     covariances = uncertainty.covariances
     if not covariances:

@@ -12,6 +12,7 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.pairs.essential import (
     MANY_PAIRS,
@@ -22,7 +23,6 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.scene.matches import MatchBatch, RayMatches, join_rays
 
 # A pair of so few matches is never sound, see `RelativeRotations.are_sound`.
@@ -56,9 +56,12 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource, directions: PairDirections, options: LocateOptions, among: IntArray | None = None
 ) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
+    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
+
+    Only pairs `among` some images are asked, by their index; None: all.
+    """
     if options.rotations == "measured" or source.kind == "relative-poses":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
@@ -66,7 +69,7 @@ def ask_pairs(
         return concatenate([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    for batch in source.batches():
+    for batch in source.batches(among):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         likely = None
@@ -91,12 +94,12 @@ def _poses_as_given(model: PosedModel, directions: PairDirections, rows: IntArra
 
 
 def doubt_cameras(
-    placement: Placement,
+    placement: Judged,
     directions: PairDirections,
     relative: RelativeRotations | None,
     model: PosedModel,
     options: LocateOptions,
-) -> Placement:
+) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     Args:
@@ -245,7 +248,7 @@ def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> Ra
     )
 
 
-def _agreements(placement: Placement, directions: PairDirections) -> FloatArray:
+def _agreements(placement: Judged, directions: PairDirections) -> FloatArray:
     """Return 1 where a direction agrees with the solution, 0 where not, NaN where it has no part, (k,)."""
     agreements = np.full(len(directions.pairs), np.nan)
     assessment, rows = placement.assessment, placement.pairs

@@ -79,7 +79,7 @@ def examine(
     Raises:
         InputError: if the model or the database cannot be used.
     """
-    options, clock = LocateOptions(), Clock(progress) if progress else Clock()
+    options, clock = LocateOptions(), Clock.of(progress)
     with clock("read"):
         model = read_model(folder)
         inputs = choose_inputs(folder, database, options.directions)

@@ -5,7 +5,6 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
-from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from sfm_shapefit.pipeline.measure import build_graph, measure_directions
 from sfm_shapefit.pipeline.rigs import place_cameras
 from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
 from sfm_shapefit.placement.gauge import unit_gauge
+from sfm_shapefit.placement.place import Near
 
 
 class FirstPlacement(NamedTuple):
@@ -35,8 +35,8 @@ class FirstPlacement(NamedTuple):
     rotations: FloatArray
     """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
     as the others were on average."""
-    centers: FloatArray
-    """(n, 3); NaN for images that the first placement lacks."""
+    stand: Near
+    """Where the images stand."""
 
     def parameters(self) -> dict[int, list[float]]:
         """Return the parameters of the cameras that were free, or turned out to be left open, by their id."""
@@ -51,24 +51,22 @@ def adjust_first_placement(
     lenses: FreeLenses,
     *,
     thorough: bool = True,
-    executor: Executor | None = None,
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
     Args:
         source: at the averaged rotations.
         rule: what sets the gauge, with the options of the run.
-        clock: hears of progress.
+        clock: of the run.
         lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
-        executor: shares out the pairs of a database; None: all is done here.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
     model, options = source.model, rule.options
-    directions = measure_directions(source, options, clock, executor)
+    directions = measure_directions(source, options, clock, clock.executor)
     measured = rule.rigid.apply(build_graph(source, directions, options))
     placement = place_cameras(measured, options, clock)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
@@ -85,7 +83,8 @@ def adjust_first_placement(
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
         centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
-    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, posed), centers)
+    stand = Near(centers, placement.refined)
+    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, posed), stand)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

@@ -110,7 +110,7 @@ def inspect(
             diagnosis=diagnose(graph, options),
             theory=no_theory if theory else None,
         )
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress)
     with clock("read"):
         model = read_model(source)
         inputs = choose_inputs(source, database, options.directions)

@@ -53,7 +53,7 @@ class JoinedModels(NamedTuple):
     """What was told and could not be used for it, a sentence each."""
 
 
-class Told(NamedTuple):
+class ToldOfJoins(NamedTuple):
     """What the user told of images of several models."""
 
     priors: PositionPriors | None = None
@@ -64,7 +64,7 @@ class Told(NamedTuple):
 
 
 def join_models(
-    models: Sequence[MappedModel], unposed: PosedModel, database: Path, told: Told, clock: Clock
+    models: Sequence[MappedModel], unposed: PosedModel, database: Path, told: ToldOfJoins, clock: Clock
 ) -> JoinedModels:
     """Join each model to the first larger one that it can be joined to safely.
 

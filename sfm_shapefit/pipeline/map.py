@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Uncertainty
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS
+from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -42,10 +41,10 @@ from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.pipeline.gravity import read_gravity
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.joins import JoinedModels, Told, join_models
-from sfm_shapefit.pipeline.locate import Locating, locate_source
+from sfm_shapefit.pipeline.joins import JoinedModels, ToldOfJoins, join_models
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.settle import Told, settle
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -93,8 +92,8 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
-    run = _start(path, options, clock, priors)._replace(executor=executor)
+    path, clock = database_in(Path(database)), Clock.of(progress, executor)
+    run = _start(path, options, clock, priors)
     with open_database(path, run.unposed, run.without) as opened:
         return _map_opened(run._replace(opened=opened))
 
@@ -118,7 +117,7 @@ def _map_opened(run: "_Run") -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            told = Told(run.priors, options.known_distance, run.without)
+            told = ToldOfJoins(run.priors, options.known_distance, run.without)
             found = join_models(models, run.unposed, path, told, clock)
     left_out = {
         name: reasons[frame]
@@ -216,8 +215,6 @@ class _Run(NamedTuple):
     gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
-    executor: Executor | None = None
-    """Shares out pairs and tracks, if there is one."""
     opened: MatchDatabase | None = None
     """The open database, which keeps the matches that were read."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
@@ -226,7 +223,7 @@ class _Run(NamedTuple):
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
-            sharing = Sharing(self.options.num_threads(), self.executor, self.clock.advance)
+            sharing = Sharing(self.options.num_threads(), self.clock.executor, self.clock.advance)
             source = self.options.relative_rotations
             return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, source, sharing)
 
@@ -294,9 +291,7 @@ class _Run(NamedTuple):
             with open_source(model, inputs, options, self.opened) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
-                    first = adjust_first_placement(
-                        source, rule, self.clock, free, thorough=False, executor=self.executor
-                    )
+                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
                 found = first.parameters() | found
         return with_parameters(self.unposed, found)
 
@@ -374,34 +369,28 @@ class _Run(NamedTuple):
             inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
-            source, centers, uncertainty = averaged, None, Uncertainty()
-            intrinsics, sensors = self.intrinsics, NO_SENSORS
+            source, first, intrinsics = averaged, None, self.intrinsics
             if self.options.adjust:
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
-                    first = adjust_first_placement(
-                        averaged, rule, self.clock, intrinsics.free, executor=self.executor
-                    )
-                centers, uncertainty = first.centers, first.adjusted.uncertainty
+                    first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
                 intrinsics = intrinsics.after(first.adjusted.lenses)
-                sensors = first.adjusted.sensors
                 source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(
+            told = Told(
                 inputs,
                 rigid,
-                priors,
-                self.executor,
-                centers=centers,
-                uncertainty=uncertainty,
-                intrinsics=intrinsics,
-                sensors=sensors,
-                rigs=sensors_of(model.reconstruction),
+                RotationWeight(),
+                priors=priors,
                 control=control,
                 gravity=gravity,
+                intrinsics=intrinsics,
+                rigs=sensors_of(model.reconstruction),
+                near=first,
             )
             with self.clock("locate"):
-                found = locate_source(source, locating, options, Clock(self.clock.progress))
+                own = Clock.of(self.clock.progress, self.clock.executor)
+                found = settle(source, told, options, own)
         ends = members[found.directions.pairs].tolist()
         unknown = (np.nan, np.nan)
         scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)

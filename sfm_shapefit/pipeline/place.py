@@ -16,6 +16,7 @@ from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_pose
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -57,7 +58,7 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress)
     cam_from_world, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -75,9 +76,9 @@ def place_graph_file(
         if reverse:
             graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
-        placement = place(graph, options, on_iteration=clock.iteration)
+        placement = judge(place(graph, options, on_iteration=clock.iteration), options)
     with clock("further pieces"):
-        further = tuple(place_further(placement, options))
+        further = tuple(judge(piece, options) for piece in place_further(placement, options))
     return GraphResult(
         path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
         statement=statement,

@@ -77,7 +77,7 @@ def relative_rotations(
     options = MapOptions(relative_rotations=source, threads=threads)
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    path, clock = Path(database), Clock(progress) if progress else Clock()
+    path, clock = Path(database), Clock.of(progress)
     with clock("relative rotations"):
         model = read_model(read_images(path).reconstruction)
         sharing = Sharing(options.num_threads(), executor, clock.advance)

@@ -6,6 +6,7 @@ taken.
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +20,9 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.place import Near, Placement, place
 from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
@@ -108,31 +110,35 @@ def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
-def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock) -> Placement:
+def place_cameras(
+    measured: MeasuredGraph, options: LocateOptions, clock: Clock, near: Near | None = None
+) -> Placement:
     """Place the measured graph; with rigid groups, 3D points take part only where they are needed.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     hand_back_memory()  # of what the graph was made of
+    placed = partial(place, options=options, near=near, on_iteration=clock.iteration)
     if measured.groups is None or not measured.num_points or options.points == "always":
-        return place(measured, options, on_iteration=clock.iteration)
+        return placed(measured)
     try:
-        first = place(measured.without_points(), options, on_iteration=clock.iteration)
+        first = placed(measured.without_points())
     except UnsolvableError:
-        return place(measured, options, on_iteration=clock.iteration)
-    if not first.assessment.loose_groups:
+        return placed(measured)
+    held = _count_held(first, options)
+    if held == len(first.cameras):
         return first
     try:
-        second = place(measured, options, on_iteration=clock.iteration)
+        second = placed(measured)
     except UnsolvableError:
         return first
-    return second if _count_held(second) > _count_held(first) else first
+    return second if _count_held(second, options) > held else first
 
 
-def _count_held(placement: Placement) -> int:
+def _count_held(placement: Placement, options: LocateOptions) -> int:
     """Return how many of the placed cameras do not hang loose."""
-    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+    loose = sum(len(group.cameras) for group in judge(placement, options).assessment.loose_groups)
     return len(placement.cameras) - loose
 
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,11 +17,11 @@ from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.facts.result import FurtherPiece
 from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
 from sfm_shapefit.files.colmap.seed import build_seed, transform_model, turn_model
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
     ObservationShares,
     count_observations,
@@ -33,7 +32,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
-from sfm_shapefit.placement.place import Placement, place_further
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.matches import KeypointMatches
 
@@ -87,7 +86,7 @@ class Seeded(NamedTuple):
         return self._replace(reconstruction=reconstruction, gauge=gauge, adjusted=adjusted)
 
 
-def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
+def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
     kept: BoolArray = placement.assessment.trust >= min_trust
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
@@ -99,7 +98,6 @@ def build_seeded_model(
     options: LocateOptions,
     clock: Clock,
     colors: PointColors | None = None,
-    executor: Executor | None = None,
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
@@ -114,7 +112,7 @@ def build_seeded_model(
         tracks = read_tracks(source, located, seed, clock.advance)
     if not options.bundle_adjust:
         with clock("triangulation"):
-            triangulate_in_place(seed, tracks, options, clock.advance, executor)
+            triangulate_in_place(seed, tracks, options, clock.advance, clock.executor)
             del tracks
             filter_in_place(seed, options)
             seeded = seed
@@ -194,34 +192,6 @@ def _state(before: Gauge, after: Gauge) -> str:
     """Return the statement of a gauge that was found again, with what pulled the cameras before."""
     _, mark, pulled = before.statement.partition(PULLED)
     return f"{after.statement}{mark}{pulled}"
-
-
-def place_further_pieces(
-    source: MatchSource,
-    placement: Placement,
-    options: LocateOptions,
-    judge: Callable[[Placement], Placement],
-    colors: PointColors | None = None,
-) -> tuple[FurtherPiece, ...]:
-    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own.
-
-    What is trusted of a piece is what `judge` makes of it, as of the largest one.
-    """
-    pieces = []
-    for further in map(judge, place_further(placement, options)):
-        kept = select_trusted(further, options.min_trust)
-        gauge = unit_gauge(further.locations[kept])
-        seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock(), colors)
-        pieces.append(
-            FurtherPiece(
-                placement=further.without_error_samples(),
-                kept=kept & ~np.isin(source.model.image_ids[further.cameras], list(seeded.poor)),
-                gauge=seeded.gauge,
-                reconstruction=seeded.reconstruction,
-                image_ids=source.model.image_ids[further.cameras],
-            )
-        )
-    return tuple(pieces)
 
 
 def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":

@@ -14,7 +14,7 @@ from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.joins import JoinedModel
 from sfm_shapefit.facts.map_result import MapResult
-from sfm_shapefit.facts.result import FurtherPiece, GraphResult, LocateResult
+from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import folder_of, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_json, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
@@ -88,12 +88,12 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     if isinstance(found, LocateResult):
         write_model(found.reconstruction, folder)
     for piece in found.further:
-        placement = piece.placement if isinstance(piece, FurtherPiece) else piece
+        placement = piece.placement if isinstance(piece, LocateResult) else piece
         subfolder = folder / folder_of(placement.piece)
         subfolder.mkdir(parents=True)
-        if isinstance(piece, FurtherPiece):
+        if isinstance(piece, LocateResult):
             write_model(piece.reconstruction, subfolder)
-            rows = piece.camera_rows
+            rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)
         write_rows(rows, CameraRow, dimension, subfolder / "cameras.csv")

@@ -1,4 +1,4 @@
-"""A measured graph placed: split into pieces, each solved, refined and judged.
+"""A measured graph placed: split into pieces, each solved and refined.
 
 Directions say nothing of the scale between two rigid pieces, nor of where they lie, so each is a placement of
 its own. The largest is the answer; the others are kept apart. Rigid groups, such as the frames of rigs and
@@ -7,24 +7,23 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
+from sfm_shapefit.refinement.agreement import Agreement, find_agreement
+from sfm_shapefit.refinement.near import stay_near
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
@@ -37,9 +36,18 @@ _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
+class Near(NamedTuple):
+    """Where an adjustment has cameras already."""
+
+    locations: FloatArray
+    """(n, 3) of all cameras, in any scale and from any origin; NaN for those it lacks."""
+    refined: RefinedPlacement
+    """The placement that it started from."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Placement(Displayed):
-    """The locations of one rigid piece of a measured graph, and the evidence for them."""
+    """The locations of one rigid piece of a measured graph, and which directions agree with them."""
 
     measured: MeasuredGraph
     """The whole graph."""
@@ -54,19 +62,12 @@ class Placement(Displayed):
     `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
-    assessment: Assessment
-    """Evidence at these locations for the same nodes and edges, in the solver's units."""
-    second_configuration: SecondConfiguration | None
-    """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
+    agreement: Agreement
+    """Which of these edges agree with these locations."""
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
     unit: float | None
     """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
-    adjusted_covariances: FloatArray | None = None
-    """(k, 3, 3) of the centers of `cameras` where an adjustment has them, squared solver's units; NaN where
-    they are not known, None without an adjustment."""
-    scale_sigma: float | None = None
-    """Relative standard deviation of the scale, where an adjustment knows it."""
 
     @property
     def graph(self) -> ViewGraph:
@@ -99,15 +100,6 @@ class Placement(Displayed):
         return self.refined.locations[: len(self.cameras)]
 
     @property
-    def covariances(self) -> FloatArray:
-        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only."""
-        directions = self.assessment.covariances[: len(self.cameras)]
-        if self.adjusted_covariances is None:
-            return directions
-        known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
-        return np.where(known, self.adjusted_covariances, directions)
-
-    @property
     def edges(self) -> IntArray:
         """The edges of the graph that place them, ascending."""
         return self.pieces[self.piece].edges
@@ -130,7 +122,7 @@ class Placement(Displayed):
     @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
-        rejected = self.pairs[~self.assessment.inliers[self.pairs]]
+        rejected = self.pairs[~self.agreement.agrees[self.pairs]]
         return np.asarray(self.graph.edges[self.edges[rejected]])
 
     def summary(self) -> dict[str, Any]:
@@ -141,7 +133,7 @@ class Placement(Displayed):
             "num_pairs": self.num_pairs,
             "num_pairs_rejected": len(self.rejected_pairs),
             "num_pairs_filtered": len(self.dropped),
-            "residual_level_deg": self.assessment.level_deg,
+            "residual_level_deg": float(np.degrees(self.agreement.level_rad)),
             "start": self.refined.start,
             "solve": self.certified.summary(),
         }
@@ -150,7 +142,7 @@ class Placement(Displayed):
         rejected = f"{len(self.rejected_pairs)} of {self.num_pairs} pairs rejected"
         return f"{len(self.nodes)} of {self.graph.num_nodes} nodes placed, {rejected}"
 
-    def without_error_samples(self) -> "Placement":
+    def without_error_samples(self) -> Self:
         """Return the placement without the samples of its directions' errors, its largest arrays."""
         evidence = self.measured.evidence
         if evidence is None:
@@ -167,14 +159,15 @@ def place(
     measured: MeasuredGraph | ViewGraph,
     options: PlacementOptions | None = None,
     *,
+    near: Near | None = None,
     on_iteration: OnIteration | None = None,
     **overrides: Any,
 ) -> Placement:
-    """Place the cameras of a view graph: pieces, both convex starts, refinement, verdicts, trust.
+    """Place the cameras of a view graph: pieces, both convex starts, refinement.
 
         graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
         placed = place(graph)
-        placed.cameras, placed.locations, placed.assessment.trust
+        placed.cameras, placed.locations, placed.rejected_pairs
 
     This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
     collapses on long chains and under heavy corruption.
@@ -183,6 +176,8 @@ def place(
         measured: any view graph with at least one edge, best with what is known of its directions; what its
             largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
+        near: a piece all of whose cameras are there is solved for its certificate only: they stay where the
+            adjustment has them.
         on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
             False ends the solve there, and the placement goes on from the last iterate.
         **overrides: single options by name: `place(graph, refine=False)`.
@@ -196,7 +191,7 @@ def place(
         measured = MeasuredGraph(measured)
     options = merge_options(options, PlacementOptions, overrides)
     dropped, pieces = _split(measured, options)
-    return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
+    return _place_piece(_Split(measured, dropped, pieces), 0, options, near, on_iteration)
 
 
 def place_further(placement: Placement, options: PlacementOptions | None = None) -> Iterator[Placement]:
@@ -212,26 +207,30 @@ def place_further(placement: Placement, options: PlacementOptions | None = None)
     options = options or PlacementOptions()
     for k in range(1, count_large(placement.pieces, placement.num_cameras)):
         try:
-            yield _place_piece(placement.measured, placement.dropped, placement.pieces, k, options)
+            yield _place_piece(_Split(placement.measured, placement.dropped, placement.pieces), k, options)
         except UnsolvableError:
             continue
 
 
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
 def _place_piece(
-    measured: MeasuredGraph,
-    dropped: IntArray,
-    pieces: list[RigidPiece],
+    split: "_Split",
     k: int,
     options: PlacementOptions,
+    near: Near | None = None,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
-    """Solve piece k, refine it robustly, and judge its pairs and cameras."""
+    """Solve piece k, refine it robustly, and see which directions agree."""
+    measured, dropped, pieces = split
     part, _ = measured.part(pieces[k].edges)
     solved, history = _solve_part(part, options, on_iteration)
-    refined = refine_starts(part, solved, options)
+    nodes = pieces[k].nodes
+    centers = None if near is None else near.locations[nodes[nodes < measured.num_cameras]]
+    if near is None or centers is None or not np.isfinite(centers).all():
+        refined = refine_starts(part, solved, options)
+    else:
+        refined = stay_near(part, solved, centers, near.refined)
     unit = None if part.groups is None else measure_unit(part, refined.locations)
-    assessment, second = _judge(part, pieces[k].nodes, refined, options)
     return Placement(
         measured=measured,
         dropped=dropped,
@@ -239,27 +238,26 @@ def _place_piece(
         piece=k,
         certified=solved,
         refined=refined,
-        assessment=assessment,
-        second_configuration=second,
+        agreement=find_agreement(part, refined.locations),
         history=history,
         unit=unit,
     )
 
 
 @one_blas_thread()
-def replace_locations(
-    placement: Placement, refined: RefinedPlacement, options: PlacementOptions
-) -> Placement:
-    """Return a placement with other locations of the same nodes, judged anew."""
-    assessment, second = _judge(placement.measured_part(), placement.nodes, refined, options)
-    return replace(
-        placement,
-        refined=refined,
-        assessment=assessment,
-        second_configuration=second,
-        adjusted_covariances=None,
-        scale_sigma=None,
-    )
+def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
+    """Return a placement with other locations of the same nodes, and which directions agree with these."""
+    agreement = find_agreement(placement.measured_part(), refined.locations)
+    return replace(placement, refined=refined, agreement=agreement)
+
+
+class _Split(NamedTuple):
+    """A measured graph and its pieces."""
+
+    measured: MeasuredGraph
+    dropped: IntArray
+    """Edges that the filter left out."""
+    pieces: list[RigidPiece]
 
 
 def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:
@@ -292,21 +290,6 @@ def _solve_part(
     else:
         solved = solve_baseline(part.graph, options.objective)
     return solved, tuple(history)
-
-
-def _judge(
-    part: MeasuredGraph, nodes: IntArray, refined: RefinedPlacement, options: PlacementOptions
-) -> tuple[Assessment, SecondConfiguration | None]:
-    """Return the verdicts on a refined part, whose nodes these are in the whole graph."""
-    hand_back_memory()  # of the solve, before the samples are propagated
-    assessment = assess(
-        part,
-        refined.locations,
-        undetermined_nodes=refined.reset_nodes,
-        max_bytes=options.factor_memory_mb * 1_000_000,
-    )
-    second = find_second_configuration(part.graph, part.pairs, assessment.inliers, assessment.level_deg)
-    return assessment, None if second is None else replace(second, cameras=nodes[second.cameras])
 
 
 def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:

@@ -51,8 +51,8 @@ _LUD_PAIRS = 1_000_000
 _POINT_WEIGHT = 10.0
 # A relative difference of costs that says nothing where the starts disagree.
 _TIE = 1e-3
-# The width of the kernel at which unrefined starts are compared at most.
-_OPENING_RAD = 0.1
+OPENING_RAD = 0.1
+"""Largest width of the kernel at which unrefined starts are compared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -214,7 +214,7 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
         lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
-    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
+    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, OPENING_RAD)
     found = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
         locations = lud_over_groups(_weight_points(graph, classes, point_weight), groups)
@@ -310,7 +310,7 @@ def _common_levels(problem: _Problem, starts: list[Start]) -> FloatArray:
     """Return the levels at which costs are compared: the smallest of each class that a start ended with."""
     ended = [start.refined.levels_rad for start in starts if start.refined is not None]
     if not ended:
-        opening = np.full(int(problem.metric.classes.max()) + 1, _OPENING_RAD)
+        opening = np.full(int(problem.metric.classes.max()) + 1, OPENING_RAD)
         ended = [residual_levels(problem.graph, start.locations, problem.metric, opening) for start in starts]
     return np.asarray(np.min(ended, axis=0))
 
