@@ -52,7 +52,7 @@ def place(
 ) -> "Placement":
     """Return the placement of the largest rigid piece: what the command does with a graph."""
     from sfm_shapefit.graph.measured import MeasuredGraph
-    from sfm_shapefit.placement.place import place as place_graph
+    from sfm_shapefit.pipeline.place import place as place_graph
     from sfm_shapefit.refinement.options import PlacementOptions
 
     num_points = 0 if num_cameras is None else graph.num_nodes - num_cameras

@@ -28,8 +28,8 @@ from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.pipeline.inspect import inspect
 from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully

@@ -68,7 +68,7 @@ def adjust_first_placement(
     model, options = source.model, rule.options
     directions = measure_directions(source, options, clock, clock.executor)
     measured = rule.rigid.apply(build_graph(source, directions, options))
-    placement = place_cameras(measured, options, clock)
+    placement = next(place_cameras(measured, options, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = unit_gauge(placement.locations)
     if placement.unit is not None:  # the offsets of sensors have theirs

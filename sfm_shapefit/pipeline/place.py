@@ -15,17 +15,50 @@ from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
 from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.placement.place import place, place_further
+from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rotations.rotation_averaging import average_rotations
+from sfm_shapefit.solver.options import OnIteration
 
 if TYPE_CHECKING:
     import pycolmap
 
 MAX_ROTATION_ERROR_DEG = 10.0
+
+
+def place(
+    measured: MeasuredGraph | ViewGraph,
+    options: PlacementOptions | None = None,
+    *,
+    on_iteration: OnIteration | None = None,
+    **overrides: Any,
+) -> Judged:
+    """Place the largest rigid piece of a view graph: both convex starts, refinement, verdicts, trust.
+
+        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
+        placed = place(graph)
+        placed.cameras, placed.locations, placed.assessment.trust
+
+    This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
+    collapses on long chains and under heavy corruption.
+
+    Args:
+        measured: any view graph with at least one edge, best with what is known of its directions; what its
+            largest rigid piece leaves out is not placed.
+        options: settings, see `help(PlacementOptions)`; defaults if None.
+        on_iteration: as of `place_pieces`.
+        **overrides: single options by name: `place(graph, refine=False)`.
+
+    Raises:
+        InputError, UnsolvableError: as `place_pieces`.
+    """
+    options = merge_options(options, PlacementOptions, overrides)
+    graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
+    return judge(next(place_pieces(graph, options, on_iteration=on_iteration)), options)
 
 
 def place_graph_file(
@@ -76,15 +109,15 @@ def place_graph_file(
         if reverse:
             graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
-        placement = judge(place(graph, options, on_iteration=clock.iteration), options)
-    with clock("further pieces"):
-        further = tuple(judge(piece, options) for piece in place_further(placement, options))
+        placed = list(place_pieces(MeasuredGraph(graph), options, on_iteration=clock.iteration))
+    with clock("trust"):
+        judged = [judge(piece, options) for piece in placed]
     return GraphResult(
         path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
         statement=statement,
         options=options,
-        placement=placement,
-        further=further,
+        placement=judged[0],
+        further=tuple(judged[1:]),
         timings_s=clock.seconds,
         geometries=geometries,
         rotations=cam_from_world,

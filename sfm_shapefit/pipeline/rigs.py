@@ -5,6 +5,8 @@ has them: two or more are one group, whose offsets are their centers; of a singl
 taken.
 """
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +24,7 @@ from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import Near, Placement, place
+from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
@@ -112,28 +114,33 @@ def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
 
 def place_cameras(
     measured: MeasuredGraph, options: LocateOptions, clock: Clock, near: Near | None = None
-) -> Placement:
-    """Place the measured graph; with rigid groups, 3D points take part only where they are needed.
+) -> Iterator[Placement]:
+    """Place the rigid pieces of a graph; with rigid groups, 3D points take part only where they are needed.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     hand_back_memory()  # of what the graph was made of
-    placed = partial(place, options=options, near=near, on_iteration=clock.iteration)
+    placed = partial(place_pieces, options=options, near=near, on_iteration=clock.iteration)
     if measured.groups is None or not measured.num_points or options.points == "always":
-        return placed(measured)
+        yield from placed(measured)
+        return
+    first = second = None
+    with suppress(UnsolvableError):
+        first = next(placed(measured.without_points()))
+    held = 0 if first is None else _count_held(first, options)
+    if first is not None and held == len(first.cameras):
+        yield first
+        return
     try:
-        first = placed(measured.without_points())
+        second = next(placed(measured))
     except UnsolvableError:
-        return placed(measured)
-    held = _count_held(first, options)
-    if held == len(first.cameras):
-        return first
-    try:
-        second = placed(measured)
-    except UnsolvableError:
-        return first
-    return second if _count_held(second, options) > held else first
+        if first is None:
+            raise
+    is_better = second is not None and (first is None or _count_held(second, options) > held)
+    found = second if is_better else first
+    assert found is not None
+    yield found
 
 
 def _count_held(placement: Placement, options: LocateOptions) -> int:

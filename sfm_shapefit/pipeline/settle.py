@@ -59,7 +59,7 @@ from sfm_shapefit.pipeline.memory import keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
 from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
-from sfm_shapefit.placement.place import Placement, place_further
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
 
@@ -129,9 +129,9 @@ def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock
         economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
         source = opened.with_economy(economy)
         measured = add_evidence(measured, source, directions, options)
-        placed = place_cameras(measured, options, clock, None if told.near is None else told.near.stand)
-        pieces = [placed, *place_further(placed, options)]
-        del placed, measured
+        near = None if told.near is None else told.near.stand
+        pieces = list(place_cameras(measured, options, clock, near))
+        del measured
     models = []
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
         piece = pieces.pop(0)

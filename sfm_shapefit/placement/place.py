@@ -6,7 +6,8 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -155,61 +155,36 @@ class Placement(Displayed):
         return self.measured.part(self.edges)[0]
 
 
-def place(
-    measured: MeasuredGraph | ViewGraph,
-    options: PlacementOptions | None = None,
+def place_pieces(
+    measured: MeasuredGraph,
+    options: PlacementOptions,
     *,
     near: Near | None = None,
     on_iteration: OnIteration | None = None,
-    **overrides: Any,
-) -> Placement:
-    """Place the cameras of a view graph: pieces, both convex starts, refinement.
-
-        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
-        placed = place(graph)
-        placed.cameras, placed.locations, placed.rejected_pairs
-
-    This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
-    collapses on long chains and under heavy corruption.
+) -> Iterator[Placement]:
+    """Place the rigid pieces of a measured graph, each with a scale of its own, most cameras first.
 
     Args:
-        measured: any view graph with at least one edge, best with what is known of its directions; what its
-            largest rigid piece leaves out is not placed.
-        options: settings, see `help(PlacementOptions)`; defaults if None.
+        measured: with at least one edge, best with what is known of its directions.
+        options: settings.
         near: a piece all of whose cameras are there is solved for its certificate only: they stay where the
             adjustment has them.
-        on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
-            False ends the solve there, and the placement goes on from the last iterate.
-        **overrides: single options by name: `place(graph, refine=False)`.
+        on_iteration: called after each iteration of the largest piece's solve, on graphs where that costs
+            little; returning False ends the solve there, and the placement goes on from the last iterate.
+
+    Yields:
+        The largest piece, and further ones of three cameras or more but for those that the solver refuses.
 
     Raises:
         InputError: if an option does not go with rigid groups.
         UnsolvableError: if a graph of many cameras has no three that are rigid, if the pairs do not tie its
             rigid groups to one another, or see `solve`.
     """
-    if isinstance(measured, ViewGraph):
-        measured = MeasuredGraph(measured)
-    options = merge_options(options, PlacementOptions, overrides)
-    dropped, pieces = _split(measured, options)
-    return _place_piece(_Split(measured, dropped, pieces), 0, options, near, on_iteration)
-
-
-def place_further(placement: Placement, options: PlacementOptions | None = None) -> Iterator[Placement]:
-    """Place the further rigid pieces of at least three cameras, each with a scale of its own.
-
-    Args:
-        placement: the graph and its largest piece.
-        options: as they were given to `place`.
-
-    Yields:
-        Placements, most cameras first; a piece that the solver refuses is left out.
-    """
-    options = options or PlacementOptions()
-    for k in range(1, count_large(placement.pieces, placement.num_cameras)):
-        try:
-            yield _place_piece(_Split(placement.measured, placement.dropped, placement.pieces), k, options)
-        except UnsolvableError:
-            continue
+    split = _split(measured, options)
+    yield _place_piece(split, 0, options, near, on_iteration)
+    for k in range(1, count_large(split.pieces, measured.num_cameras)):
+        with suppress(UnsolvableError):
+            yield _place_piece(split, k, options, near)
 
 
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
@@ -246,9 +221,14 @@ def _place_piece(
 
 @one_blas_thread()
 def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
-    """Return a placement with other locations of the same nodes, and which directions agree with these."""
-    agreement = find_agreement(placement.measured_part(), refined.locations)
-    return replace(placement, refined=refined, agreement=agreement)
+    """Return a placement with other locations of the same nodes, and which directions agree with these.
+
+    What was judged of a placement is not of these.
+    """
+    moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
+    moved["refined"] = refined
+    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations)
+    return Placement(**moved)
 
 
 class _Split(NamedTuple):
@@ -260,16 +240,17 @@ class _Split(NamedTuple):
     pieces: list[RigidPiece]
 
 
-def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:
+def _split(measured: MeasuredGraph, options: PlacementOptions) -> _Split:
     """Return the edges that the filter leaves out, and the pieces of the others, most cameras first."""
     if measured.groups is not None:
         refuse_options_of_groups(options)
-        return np.zeros(0, dtype=np.int64), [find_tied_piece(measured)]
+        return _Split(measured, np.zeros(0, dtype=np.int64), [find_tied_piece(measured)])
     dropped = _filter_pairs(measured, options.filter)
     considered, edge_of = _drop_edges(measured.graph, dropped)
     pieces = order_pieces(considered, measured.num_cameras)
     refuse_without_triangle(considered, pieces, measured.num_cameras)
-    return dropped, [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
+    pieces = [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
+    return _Split(measured, dropped, pieces)
 
 
 def _solve_part(

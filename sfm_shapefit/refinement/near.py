@@ -16,6 +16,8 @@ from sfm_shapefit.solver.program import normalize_locations
 _CAP_OF_SIZE = 0.5
 # Smallest eigenvalue of the sum of projectors below which the rays of a point count as parallel.
 _LEAST_SPREAD = 1e-12
+# Rounds of "which residuals are inside the kernel?" and "how large are these?"; the level settles in about five.
+_ROUNDS = 10
 
 
 def stay_near(
@@ -35,13 +37,15 @@ def stay_near(
     locations[: len(centers)] = fit_similarity_l1(centers, there, rotate=False, cap=cap).apply(centers)
     locations = normalize_locations(graph, follow_cameras(measured, locations))
     metric = Metric(measured.covariance, measured.classes)
-    opening = np.full(int(metric.classes.max()) + 1, OPENING_RAD)
+    levels = np.full(int(metric.classes.max()) + 1, OPENING_RAD)
+    for _ in range(_ROUNDS):
+        levels = residual_levels(graph, locations, metric, levels)
     return replace(
         first,
         locations=locations,
         is_refined=True,
         reason=f"{first.reason}; then adjusted to the pixels, rotations too",
-        levels_deg=tuple(np.degrees(residual_levels(graph, locations, metric, opening)).tolist()),
+        levels_deg=tuple(np.degrees(levels).tolist()),
         reset_nodes=np.empty(0, dtype=np.int64),
     )
 

@@ -48,7 +48,6 @@ def test_locate_counts_pairs_and_images():
         "solve",
         "adjustment",
         "trust",
-        "further pieces",
         "structure",
         "triangulation",
         "colors",

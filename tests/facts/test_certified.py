@@ -7,7 +7,7 @@ import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.facts.certified import compare_with_certified
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.options import Status
 
 

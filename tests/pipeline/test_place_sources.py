@@ -17,8 +17,7 @@ from sfm_shapefit.files.g2o import g2o_text
 from sfm_shapefit.files.graph_text import graph_text, read_graph
 from sfm_shapefit.files.onedsfm import is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.place import place_graph_file
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place, place_graph_file
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.files.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene

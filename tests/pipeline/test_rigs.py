@@ -237,14 +237,15 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
         assessment=SimpleNamespace(loose_groups=[SimpleNamespace(cameras=[1])]), cameras=[1]
     )
 
-    def place(graph, *_, **__):
+    def place_pieces(graph, *_, **__):
         if graph != "without points":
             raise UnsolvableError("rays to far points let the start collapse")
-        return loose
+        yield loose
 
-    monkeypatch.setattr(rigs_stage, "place", place)
+    monkeypatch.setattr(rigs_stage, "place_pieces", place_pieces)
+    monkeypatch.setattr(rigs_stage, "judge", lambda placement, _: placement)
     measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
-    assert rigs_stage.place_cameras(measured, LocateOptions(), Clock()) is loose
+    assert list(rigs_stage.place_cameras(measured, LocateOptions(), Clock())) == [loose]
 
 
 def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):

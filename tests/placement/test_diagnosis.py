@@ -10,9 +10,9 @@ from sfm_shapefit import UnsolvableError, synthetic
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.placement.diagnosis import diagnose, theory_of
-from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
 from tests.problems import all_pairs, exact_graph
 from tests.program import run

@@ -11,8 +11,10 @@ from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.gauge import prior_gauge
-from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -164,7 +166,8 @@ def reset() -> tuple[Placement, np.ndarray]:
 
 def pull(placement, priors, **options):
     gauge = prior_gauge(placement.locations, priors)
-    return pull_to_priors(placement, gauge, priors, PlacementOptions(**options))
+    pulled = pull_to_priors(placement, gauge, priors, PlacementOptions(**options))
+    return pulled._replace(placement=judge(pulled.placement, PlacementOptions(**options)))
 
 
 def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):

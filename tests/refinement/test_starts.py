@@ -8,7 +8,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions

@@ -9,7 +9,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.node_tracks import Tracks, build_tracks, covering_set, join_points
