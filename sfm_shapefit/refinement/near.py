@@ -16,7 +16,7 @@ from sfm_shapefit.solver.program import normalize_locations
 _CAP_OF_SIZE = 0.5
 # Smallest eigenvalue of the sum of projectors below which the rays of a point count as parallel.
 _LEAST_SPREAD = 1e-12
-# Rounds of "which residuals are inside the kernel?" and "how large are these?"; the level settles in about five.
+# Rounds of "which residuals are inside?" and "how large are these?"; the level settles in about five.
 _ROUNDS = 10
 
 
