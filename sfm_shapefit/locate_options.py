@@ -7,7 +7,7 @@ the options of all its stages, and some that concern the whole.
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
+from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.rotations.options import Averaging, Sequencing
@@ -107,11 +107,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         False,
         "Refine poses and points by bundle adjustment from the seed; intrinsics as refine_intrinsics says.",
     )
-    adjuster: Adjuster = option(
-        "own",
-        "What adjusts if bundle_adjust is asked for: our own, whose answer is the same bit by bit and "
-        "several times faster, or pycolmap's Ceres.",
-    )
     refine_intrinsics: Refined = option(
         "auto",
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
@@ -148,8 +143,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
         if self.refine_rigs and not (self.adjust or self.bundle_adjust):
             raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
-        if self.adjuster != "own" and not self.bundle_adjust:
-            raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if (
