@@ -10,7 +10,7 @@ from typing import Any, Literal
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
-from sfm_shapefit.rotations.options import Averaging, Sequencing
+from sfm_shapefit.rotations.options import Sequencing
 from sfm_shapefit.settings import explained, option
 
 Rotations = Literal["auto", "measured", "free"]
@@ -242,15 +242,8 @@ class MapOptions(LocateOptions):
         "database stores, which is faster but less exact and keeps more false pairs.",
         also="relative",
     )
-    averaging: Averaging = option(
-        "own",
-        "Who averages the relative rotations: this package, with standard deviations and a certificate, or "
-        "pycolmap.",
-    )
     min_matches: int = option(
-        0,
-        "Pairs with fewer inlier matches are left out of the averaging. 0 leaves none out; pycolmap's "
-        "averaging then tries 15, 20, 30, 50 and 80 and keeps the rotations that agree with most matches.",
+        0, "Pairs with fewer inlier matches are left out of the averaging; 0 leaves none out."
     )
     sequence: Sequencing = option(
         "auto",

@@ -20,7 +20,6 @@ COMMANDS = """
     solve data_synthetic/graph40.txt {out}/split --method admm -q
     map data_synthetic/ring8/database.db {out}/mapped -q
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --bundle-adjust -q
-    map data_synthetic/ring8/database.db {out}/averaged --averaging pycolmap -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
     report {out}/located --scene
     convert {out}/located {out}/transforms.json -q

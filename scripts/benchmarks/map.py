@@ -333,10 +333,10 @@ def measure_rotations(database: Path, truth: Path) -> dict[str, float]:
     from benchmarks.averaging import errors_deg
     from sfm_shapefit import relative_rotations
     from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.commands.stages.averaging import average_consistently
+    from sfm_shapefit.rotations.average import average_relative_rotations
 
     relative, known = relative_rotations(database), read_model(truth)
-    found = average_consistently(len(relative.names), relative)
+    found = average_relative_rotations(len(relative.names), relative)
     row_of = {name: k for k, name in enumerate(known.names)}
     rows = [k for k, name in enumerate(relative.names) if found.registered[k] and name in row_of]
     true = known.rotations[[row_of[relative.names[k]] for k in rows]]

@@ -429,7 +429,6 @@ class Averaging(TypedDict):
     """How rotations were averaged, and how well they agree with the pairs."""
 
     statement: Annotated[str, "How the rotations were found, in words."]
-    averaging: Annotated[str, "Who averaged: own or pycolmap."]
     num_registered: Annotated[int, "Images that have a rotation."]
     num_pairs: Annotated[int, "Pairs whose residuals count."]
     agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]

@@ -19,7 +19,6 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands import relative_rotations
 from sfm_shapefit.commands.relative_rotations import measure_rotations
 from sfm_shapefit.commands.stages import execution
-from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.execution import PairTask, open_executor
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import read_pair_list
@@ -29,6 +28,7 @@ from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.results.intrinsics import describe_intrinsics
 from sfm_shapefit.results.scene_words import describe_line, describe_loops
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -234,7 +234,6 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--averaging", "ceres"], "'ceres' is not one of 'own', 'pycolmap'"),
         (["--rotations", "measured"], "map finds the rotations itself"),
         (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
         (["--rotations", "exact"], "'exact' is not one of"),
@@ -531,23 +530,20 @@ def worst_error_deg(answer, truth):
 
 def test_the_most_consistent_of_several_averagings_is_kept():
     truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    misled = average_consistently(14, relative, min_matches=15, averaging="pycolmap")
-    assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
     weights = np.sqrt(relative.num_matches)
     right = relative.num_matches == 100
-    for averaging, certified in (("pycolmap", None), ("own", True)):
-        answer = average_consistently(14, relative, averaging=averaging)
-        assert (answer.averaging, answer.certified) == (averaging, certified)
-        assert answer.registered.all()
-        assert answer.num_tried > 1
-        assert answer.num_pairs == right.sum()
-        assert worst_error_deg(answer, truth) < 0.5
-        assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
+    answer = average_relative_rotations(14, relative)
+    assert answer.certified
+    assert answer.registered.all()
+    assert answer.num_tried > 1
+    assert answer.num_pairs == right.sum()
+    assert worst_error_deg(answer, truth) < 0.5
+    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
 
 
 def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
     truth, relative = problem()
-    assert not average_consistently(14, relative).unsettled.any()
+    assert not average_relative_rotations(14, relative).unsettled.any()
     bad = (relative.pairs == 3).any(axis=1)
     unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
     answers = []
@@ -556,7 +552,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_
         rng = np.random.default_rng(1)
         rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
         part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
-        answers.append(average_consistently(14, part))
+        answers.append(average_relative_rotations(14, part))
     assert answers[0].agreements[3] < 0.25
     assert np.delete(answers[0].agreements, 3).min() > 0.8
     assert list(np.flatnonzero(answers[0].unsettled)) == [3]

@@ -10,20 +10,19 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gravity import refine_with_gravity
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.gravity import Gravity
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.viewgraph import connected_components
 from sfm_shapefit.wording import counted
 
-# Our own averaging leaves out what only unsound pairs tie to the rest, or pairs below `min_matches`;
-# pycolmap's what contradicts its answer, too.
+# What only unsound pairs, or pairs below `min_matches`, tie to the rest.
 _UNTIED = (
     "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
     "contradict the rest"
@@ -96,13 +95,13 @@ class ComponentAveraging(NamedTuple):
         """Average rotations, by the arrangement of the frames that the matches speak for."""
 
         def average(some: RelativeRotations) -> AveragedRotations:
-            return average_consistently(
-                num_frames,
-                some,
-                self.options.min_matches,
-                averaging=self.options.averaging,
-                threads=self.options.num_threads(),
-            )
+            used = some.num_matches >= self.options.min_matches
+            if not used.any():
+                raise UnsolvableError(
+                    f"none of {counted(len(used), 'pair')} has {self.options.min_matches} inlier matches; "
+                    "lower min_matches"
+                )
+            return average_relative_rotations(num_frames, some.subset(used), self.options.num_threads())
 
         averaged = average(relative)
         if not evidence.any():

@@ -25,14 +25,13 @@ from sfm_shapefit.commands.inspect import inspect
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.commands.relative_rotations import relative_rotations
-from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
-from sfm_shapefit.rotations.average import check_pairs
+from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
@@ -202,8 +201,7 @@ def average_graphs(_folder: Path) -> None:
     """Average rotations with a factor, and as on large graphs without one."""
     edges = np.ascontiguousarray(_random_graph().edges)
     problem = rotation_problem(20, edges)
-    average_consistently(20, problem.relative, threads=2)
-    average_consistently(20, problem.relative, averaging="pycolmap")
+    average_relative_rotations(20, problem.relative, threads=2)
     given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
     for is_expander in (False, True):
         system = replace(
