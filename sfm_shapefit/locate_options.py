@@ -15,8 +15,7 @@ from sfm_shapefit.settings import explained, option
 
 Rotations = Literal["auto", "measured", "free"]
 Points = Literal["auto", "never", "always"]
-Source = Literal["auto", "matches", "relative-poses", "tracks"]
-Relative = Literal["matches", "stored"]
+Source = Literal["auto", "matches", "tracks"]
 KnownDistance = tuple[str, str, float]
 Refined = Literal["auto", "focal", "all", "none"]
 Join = Literal["never", "safe"]
@@ -43,8 +42,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
 
     directions: Source = option(
         "auto",
-        "Where directions come from: the database's inlier matches, its stored relative poses, or the "
-        'model\'s own tracks; "auto" takes matches if there is a database, else tracks.',
+        "Where directions come from: the database's inlier matches, or the model's own tracks; "
+        '"auto" takes matches if there is a database, else tracks.',
     )
     points: Points = option(
         "auto",
@@ -145,11 +144,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
-        if (
-            self.max_rotation_error_deg != DirectionOptions.max_rotation_error_deg
-            and self.directions != "relative-poses"
-        ):
-            raise ValueError("max_rotation_error_deg belongs to directions=relative-poses; leave out one")
 
     def _check_rotations(self) -> None:
         """Refuse what is said of rotations where it has no effect."""
@@ -236,12 +230,6 @@ class MapOptions(LocateOptions):
         "Adjust a first placement together with its rotations on few tracks that cover the images, and "
         "locate from there. Averaged rotations are far coarser.",
     )
-    relative_rotations: Relative = option(
-        "matches",
-        "Relative rotations to be averaged: estimated from each pair's inlier matches, or those the "
-        "database stores, which is faster but less exact and keeps more false pairs.",
-        also="relative",
-    )
     min_matches: int = option(
         0, "Pairs with fewer inlier matches are left out of the averaging; 0 leaves none out."
     )
@@ -267,7 +255,7 @@ class MapOptions(LocateOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.directions == "tracks":
-            raise ValueError("a database has no tracks; directions must be auto, matches or relative-poses")
+            raise ValueError("a database has no tracks; directions must be auto or matches")
         if self.rotations != "auto" or self.rotation_sigma_deg:
             raise ValueError(
                 "map finds the rotations itself; what given ones are worth is for locate to know"

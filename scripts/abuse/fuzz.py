@@ -125,9 +125,8 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
     out = base.parent / "warm"
     database = ("--database", str(base / "database.db"))
     old = ("locate", str(base / "old"), str(out), "--overwrite", "--threads", "1", "-q")
-    poses = ("--directions", "relative-poses")
     for command in (
-        (*old, *database, *poses),
+        (*old, *database),
         (*old, "--bundle-adjust"),
         (*old, *database, "--rotations", "free"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
@@ -272,8 +271,6 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(rng, databases.WAYS)
     same = way(folder / "database.db", rng)
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
-    if not same and rng.random() < 0.15 and arguments[0] == "locate":
-        arguments = (*arguments, "--directions", "relative-poses")
     return Case(f"database: {way.__name__}", arguments=arguments, same_answer=same)
 
 

@@ -58,9 +58,8 @@ def damage_database(base: Path, folder: Path, rng: Generator) -> Case:
     shutil.copyfile(base / "database.db", folder / "database.db")
     way = mutations.pick(rng, (*databases.WAYS, odd_cameras, odd_cameras, odd_cameras))
     way(folder / "database.db", rng)
-    relative = ("--relative", "stored") if rng.random() < 0.3 else ()
     stages = mutations.pick(rng, STAGES_OF_MAP)
-    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *relative, *stages, "--threads", "1"))
+    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *stages, "--threads", "1"))
 
 
 def odd_cameras(path: Path, rng: Generator) -> bool:

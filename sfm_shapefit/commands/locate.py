@@ -183,7 +183,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         focal_doubts = question_focal_lengths(*asked, options)
 
         def judge(placement: Placement) -> Placement:
-            return doubt_cameras(placement, directions, relative, source.model, options)
+            return doubt_cameras(placement, directions, relative, source.model)
 
         placement = judge(located.placement)
         located = _judge_again(located, placement, options.min_trust)

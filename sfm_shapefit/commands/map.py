@@ -228,8 +228,7 @@ class _Run(NamedTuple):
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
             sharing = Sharing(self.options.num_threads(), self.executor, self.clock.advance)
-            source = self.options.relative_rotations
-            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, source, sharing)
+            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, sharing)
 
     def matches(self) -> MatchDatabase:
         """Return the matches of all images, but for the pairs that are left out."""

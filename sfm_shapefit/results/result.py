@@ -11,14 +11,14 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.locate_options import LocateOptions, Source
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles
@@ -55,10 +55,8 @@ class Inputs:
     """The model folder; None for a reconstruction in memory."""
     database: Path | None
     """The database whose matches were used, if any."""
-    source: Source
-    """Where the directions came from; never "auto"."""
     statement: str
-    """How that choice was made, for the user."""
+    """Where the directions came from, and how that choice was made, for the user."""
     left_out: PairNames = frozenset()
     """Pairs that are taken for unmatched."""
 
@@ -232,8 +230,8 @@ class LocateResult(Displayed):
         is_in = np.zeros(placement.num_cameras, dtype=np.bool_)
         is_in[placement.cameras[self.kept]] = True
         judged = is_in[placement.graph.edges[placement.edges[placement.pairs]]].all(axis=1)
-        against = [k for k, status in enumerate(self.directions.status) if status in CONTRADICTIONS]
-        num_against = int(np.sum(is_in[self.directions.pairs[against].reshape(-1, 2)].all(axis=1)))
+        against = self.directions.pairs[self.directions.contradicting()]
+        num_against = int(np.sum(is_in[against].all(axis=1)))
         agreeing = int(np.sum(placement.assessment.inliers[placement.pairs] & judged))
         total = int(np.sum(judged)) + num_against
         return agreeing / total if total else math.nan

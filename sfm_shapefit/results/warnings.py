@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.turns import Doubt
@@ -106,7 +106,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
             "contradiction behind; compare images of neighboring cameras before trusting them"
         )
-    against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
+    against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
             f"the matches of {against} of {len(directions.pairs)} pairs contradict the given rotations: the "

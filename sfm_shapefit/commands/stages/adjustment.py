@@ -137,8 +137,6 @@ def _measure_again(
 
     Of images whose rotations were clearly wrong, and are `corrected`, it is what their matches say now.
     """
-    if source.kind == "relative-poses":
-        return before
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
     batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
