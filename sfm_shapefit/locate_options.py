@@ -19,6 +19,7 @@ Source = Literal["auto", "matches", "tracks"]
 KnownDistance = tuple[str, str, float]
 Refined = Literal["auto", "focal", "all", "none"]
 Join = Literal["never", "safe"]
+Adjust = Literal["none", "seed", "full"]
 
 LEAST_MATCHES = 15
 """Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
@@ -87,10 +88,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Let the position priors that set the scale also pull the cameras, each by its standard "
         "deviation; priors that are far off have no part.",
     )
-    adjust: bool = option(
-        True,
-        "Adjust centers and points to the pixels after placement, all tracks at once, and rotations as far "
-        "as they are doubtful; up to 2,000 cameras. Not with objectives that deliver an optimum as it is.",
+    adjust: Adjust = option(
+        "seed",
+        'What is adjusted to the pixels: "seed", the placed cameras by all tracks at once, and rotations as '
+        "far as they are doubtful, up to 2,000 cameras and not with objectives that deliver an optimum as it "
+        'is; "full", poses and points once more by bundle adjustment from the seed; "none", nothing.',
     )
     rotations: Rotations = option(
         "auto",
@@ -101,10 +103,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     rotation_sigma_deg: float = option(
         0.0,
         "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
-    )
-    bundle_adjust: bool = option(
-        False,
-        "Refine poses and points by bundle adjustment from the seed; intrinsics as refine_intrinsics says.",
     )
     refine_intrinsics: Refined = option(
         "auto",
@@ -138,10 +136,10 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
-        if self.refine_intrinsics in ("focal", "all") and not (self.adjust or self.bundle_adjust):
-            raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
-        if self.refine_rigs and not (self.adjust or self.bundle_adjust):
-            raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
+        if self.refine_intrinsics in ("focal", "all") and self.adjust == "none":
+            raise ValueError("refine_intrinsics needs an adjustment; leave out adjust=none")
+        if self.refine_rigs and self.adjust == "none":
+            raise ValueError("refine_rigs needs an adjustment; leave out adjust=none")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
 
@@ -154,8 +152,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
                 f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
             )
         said = self.rotation_sigma_deg or self.rotations == "free"
-        if said and not (self.adjust or self.bundle_adjust):
-            raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
+        if said and self.adjust == "none":
+            raise ValueError("what rotations are worth matters only to an adjustment; leave out adjust=none")
 
     def _check_control_points(self) -> None:
         """Refuse what would set the scale beside control points."""
@@ -191,7 +189,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def adjusts_cameras(self, num_cameras: int) -> bool:
         """Return whether placed cameras are adjusted; the optimum as it is, is not."""
         as_found = self.objective not in ("auto", "lud") or not self.refine
-        return self.adjust and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
+        return self.adjust != "none" and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
         """Say whether 3D points join the view graph of so many cameras, and why."""
@@ -225,10 +223,11 @@ class MapOptions(LocateOptions):
         "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
         "keeps all. Even a wrong pose finds a few points.",
     )
-    adjust: bool = option(
-        True,
-        "Adjust a first placement together with its rotations on few tracks that cover the images, and "
-        "locate from there. Averaged rotations are far coarser.",
+    adjust: Adjust = option(
+        "seed",
+        'What is adjusted to the pixels: "seed", a first placement together with its rotations on few tracks '
+        'that cover the images, to locate from there; "full", poses and points once more by bundle '
+        'adjustment from the seed; "none", nothing: averaged rotations are far coarser.',
     )
     min_matches: int = option(
         0, "Pairs with fewer inlier matches are left out of the averaging; 0 leaves none out."

@@ -82,7 +82,7 @@ REFUSED = [
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
     (LocateOptions, {"filter": "mfas"}, "triangles"),
-    (LocateOptions, {"rotations": "free", "adjust": False}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": "free", "adjust": "none"}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
     (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),
     (MapOptions, {"rotations": "measured"}, "map finds the rotations itself"),

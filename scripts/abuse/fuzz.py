@@ -127,7 +127,7 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
     old = ("locate", str(base / "old"), str(out), "--overwrite", "--threads", "1", "-q")
     for command in (
         (*old, *database),
-        (*old, "--bundle-adjust"),
+        (*old, "--adjust", "full"),
         (*old, *database, "--rotations", "free"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
         ("locate", str(base / "openmvg/sfm_data.json"), str(out), "--overwrite", "--threads", "1", "-q"),
@@ -229,7 +229,7 @@ def _choose_command(
         return ("evaluate", *mutations.pick(rng, ((source, "truth"), ("truth", source))))
     if choice < 0.2:
         return ("inspect", source, *extra)
-    adjust = ("--bundle-adjust",) if choice < 0.24 else ()
+    adjust = ("--adjust", "full") if choice < 0.24 else ()
     json = ("--json",) if rng.random() < 0.3 else ()
     return ("locate", source, "out", *extra, *adjust, *json, "--threads", "1")
 

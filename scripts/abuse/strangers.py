@@ -27,7 +27,7 @@ _MODELS = {
 """Files of other programs, and what stands beside them."""
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
-STAGES_OF_MAP = ((), ("--bundle-adjust",), ("--no-adjust",))
+STAGES_OF_MAP = ((), ("--adjust", "full"), ("--adjust", "none"))
 """Flags of `map` that choose among its stages."""
 
 

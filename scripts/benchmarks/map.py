@@ -37,10 +37,10 @@ from harness.metrics import Check, Quantity, check_all, number, numbers, ratio, 
 from harness.process import call, thread_environment
 from harness.record import table_of, versions
 
-OURS = ("map", "map --bundle-adjust")
+OURS = ("map", "map --adjust full")
 PEERS = tuple((mapper, k) for mapper in ("global", "incremental") for k in (15, 30))
 LARGEST_RATIO = 1.15
-"""Of the mean error of `map --bundle-adjust` on a further scene, to that of the better peer."""
+"""Of the mean error of `map --adjust full` on a further scene, to that of the better peer."""
 WRONG_DEG = 5.0
 
 
@@ -380,7 +380,7 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
     yield (
         f"Made scenes: {sizes}, a share of {_LARGE['wrong_match_fraction']} of all matches wrong. The limit"
         f" of further scenes is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers, for"
-        " `map --bundle-adjust`. The better setting of a mapper is bold. With `--folder`, what a peer"
+        " `map --adjust full`. The better setting of a mapper is bold. With `--folder`, what a peer"
         " reached in an earlier run with the same threads and versions is not measured again."
     )
 

@@ -58,7 +58,7 @@ class Made(NamedTuple):
     rotation_deg: float
 
 
-BUNDLE = (("bundle_adjust", True),)
+BUNDLE = (("adjust", "full"),)
 # Meters.
 OF_STRECHA, OF_MOTION_CAPTURE = 0.001, 0.01 / np.sqrt(3.0)
 SETS = {

@@ -310,7 +310,8 @@ def _adjust(
     """Adjust the placed cameras, if that is wanted and was not done before."""
     before = _Adjusted(source, directions, located, None, known.intrinsics)
     is_adjusted = known.centers is not None and located.given.centers is None
-    if is_adjusted or not options.adjusts_cameras(len(located.placement.cameras)):
+    adjusts = source.economy.adjustment and options.adjusts_cameras(len(located.placement.cameras))
+    if is_adjusted or not adjusts:
         return before
     weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust

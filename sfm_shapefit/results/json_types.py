@@ -145,7 +145,7 @@ class RotationRefinement(TypedDict):
 
 
 class BundleAdjustment(TypedDict):
-    """What --bundle-adjust reached; mean reprojection errors."""
+    """What --adjust full reached; mean reprojection errors."""
 
     converged: Annotated[bool, "Whether the last round met its tolerance."]
     iterations: Annotated[int, "Steps of all rounds together."]

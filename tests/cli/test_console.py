@@ -108,7 +108,7 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
         return read(*arguments)
 
     monkeypatch.setattr(model, "_posed_model", talkative)
-    command = ["locate", RING / "sparse/0", tmp_path / "out", "--bundle-adjust", "--no-report"]
+    command = ["locate", RING / "sparse/0", tmp_path / "out", "--adjust", "full", "--no-report"]
     done = run(*command, *["--verbose"] * verbose, code=0)
     native = capfd.readouterr().err
     if not verbose:

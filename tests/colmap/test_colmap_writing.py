@@ -566,7 +566,7 @@ def test_adjusted_points_satisfy_the_same_filters():
 
 def test_that_no_point_can_be_adjusted_is_told():
     seed, matches = seeded(ring_model(noise_px=0.5)[0], np.zeros((NUM_IMAGES, 3)))
-    with pytest.raises(UnsolvableError, match="run with --no-adjust and without --bundle-adjust"):
+    with pytest.raises(UnsolvableError, match="run with --adjust none"):
         bundle_adjust(seed, matches)
 
 
@@ -588,7 +588,7 @@ def test_what_pycolmap_says_reaches_the_terminal_only_if_wanted(capfd, quiet):
 @pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
 def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
     folder = real_scene(name)
-    found = locate(folder / "sparse" / "0", options=LocateOptions(bundle_adjust=True)).reconstruction
+    found = locate(folder / "sparse" / "0", options=LocateOptions(adjust="full")).reconstruction
     truth = pycolmap.Reconstruction(folder / "gt")
     names = [found.image(i).name for i in sorted(found.images)]
     centers = centers_of(found)

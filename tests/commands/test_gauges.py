@@ -14,7 +14,7 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import RING
 
 EXACT = 1e-9
-ADJUSTED = [{}, {"bundle_adjust": True}]
+ADJUSTED = [{}, {"adjust": "full"}]
 NAMES = ["as placed", "adjusted"]
 
 
@@ -40,7 +40,7 @@ def ring():
 def located(model, **options):
     """Locate the ring, and return what was found with centers and rotations of the output."""
     found = sfm_shapefit.locate(model, RING / "database.db", **options)
-    assert (found.adjusted is not None) == options.get("bundle_adjust", False)
+    assert (found.adjusted is not None) == ("adjust" in options)
     return found, *poses_of(found.reconstruction, found.model)
 
 

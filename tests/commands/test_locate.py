@@ -224,7 +224,7 @@ def ring_with_pairs(folder, wanted):
 
 
 def test_bundle_adjustment_from_the_seed_converges_and_stays_there(courtyard):
-    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", bundle_adjust=True)
+    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust="full")
     assert adjusted.adjusted is not None
     assert adjusted.adjusted.converged
     assert adjusted.adjusted.final_error_px < adjusted.adjusted.initial_error_px

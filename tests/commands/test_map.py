@@ -128,7 +128,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
 
 def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
     database = RING / "database.db"
-    arguments = ["map", database, tmp_path / "out", "--bundle-adjust", "--points", "never", "--json"]
+    arguments = ["map", database, tmp_path / "out", "--adjust", "full", "--points", "never", "--json"]
     facts = json.loads(run(*arguments, code=0).stdout)
     assert facts["models"][0]["located"]["bundle_adjustment"]["final_error_px"] < 1.0
     errors = sfm_shapefit.evaluate(tmp_path / "out" / "0", RING / "sparse" / "0")
@@ -159,7 +159,7 @@ def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, 
         assert len(compared.names) == 10
         return compared.position.rms, compared.rotation_deg.rms
 
-    coarse, adjusted, likeliest = errors(adjust=False), errors(), errors(bundle_adjust=True)
+    coarse, adjusted, likeliest = errors(adjust="none"), errors(), errors(adjust="full")
     for k in range(2):
         assert adjusted[k] < 1.1 * likeliest[k]
         assert adjusted[k] < coarse[k] / 1.5
@@ -186,7 +186,7 @@ def test_images_that_see_few_points_are_left_out_with_the_reason(tmp_path):
 
 
 def test_threads_repetition_and_hashes_change_no_byte(tmp_path):
-    flags = ("--bundle-adjust",)
+    flags = ("--adjust", "full")
     assert list(determinism.differing_files(RING, tmp_path, command="map", always=flags)) == []
 
 

@@ -152,7 +152,7 @@ def locate_model(folder: Path) -> None:
 def locate_from_tracks(folder: Path) -> None:
     """Locate the cameras of a model without a database, and inspect it."""
     model = _workspace(folder, WorkspaceOptions(database=False))
-    locate(model, threads=1, bundle_adjust=True)
+    locate(model, threads=1, adjust="full")
     inspect(model, theory=True)
 
 

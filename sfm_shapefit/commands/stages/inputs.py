@@ -122,7 +122,7 @@ def open_source(
             bare = replace(
                 source.workload(),
                 adjusts=options.adjusts_cameras(model.num_images),
-                adjusts_bundle=options.bundle_adjust,
+                adjusts_bundle=options.adjust == "full",
             )
             work = replace(bare, has_points=options.uses_points(model.num_images))
             source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))

@@ -112,7 +112,7 @@ def build_seeded_model(
     with clock("structure"):
         seed = seed_of(source, located)
         tracks = read_tracks(source, located, seed, clock.advance)
-    if not options.bundle_adjust:
+    if options.adjust != "full":
         with clock("triangulation"):
             triangulate_in_place(seed, tracks, options, clock.advance, executor)
             del tracks
