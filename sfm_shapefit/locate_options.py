@@ -13,7 +13,7 @@ from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.rotations.options import Sequencing
 from sfm_shapefit.settings import explained, option
 
-Rotations = Literal["auto", "measured", "free"]
+Rotations = Literal["auto", "held", "free"] | float
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "tracks"]
 KnownDistance = tuple[str, str, float]
@@ -96,13 +96,9 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     )
     rotations: Rotations = option(
         "auto",
-        'What to make of the given rotations: "measured", as by instruments, are held and not doubted; '
-        '"free" are forgotten by the adjustment; "auto" asks the matches how far off they are, and which '
-        "cameras are turned.",
-    )
-    rotation_sigma_deg: float = option(
-        0.0,
-        "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
+        'What to make of the given rotations: "held", as measured by instruments, and not doubted; "free", '
+        "forgotten by the adjustment; a number, pulled to by that standard deviation about each axis in "
+        'degrees; "auto" asks the matches how far off they are, and which cameras are turned.',
     )
     refine_intrinsics: Refined = option(
         "auto",
@@ -144,15 +140,10 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
 
     def _check_rotations(self) -> None:
-        """Refuse what is said of rotations where it has no effect."""
-        if not 0.0 <= self.rotation_sigma_deg < 180.0:
-            raise ValueError(f"rotation_sigma_deg must lie in [0, 180), got {self.rotation_sigma_deg}")
-        if self.rotation_sigma_deg and self.rotations != "auto":
-            raise ValueError(
-                f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
-            )
-        said = self.rotation_sigma_deg or self.rotations == "free"
-        if said and self.adjust == "none":
+        """Refuse a standard deviation that is none, and freedom that no adjustment uses."""
+        if not isinstance(self.rotations, str) and not 0.0 < self.rotations < 180.0:
+            raise ValueError(f"rotations must lie between 0 and 180 degrees, got {self.rotations}")
+        if self.rotations not in ("auto", "held") and self.adjust == "none":
             raise ValueError("what rotations are worth matters only to an adjustment; leave out adjust=none")
 
     def _check_control_points(self) -> None:
@@ -255,7 +246,7 @@ class MapOptions(LocateOptions):
         super().__post_init__()
         if self.directions == "tracks":
             raise ValueError("a database has no tracks; directions must be auto or matches")
-        if self.rotations != "auto" or self.rotation_sigma_deg:
+        if self.rotations != "auto":
             raise ValueError(
                 "map finds the rotations itself; what given ones are worth is for locate to know"
             )

@@ -206,7 +206,7 @@ def measure_made(shape: str, num_images: int) -> Made:
     from sfm_shapefit.synthetic.workspace import write_workspace
 
     options = SceneOptions(shape=shape, num_images=num_images, wrong_match_fraction=0.05, seed=1)
-    ways = ({"adjust": "none"}, {}, {"adjust": "full", "rotations": "measured"})
+    ways = ({"adjust": "none"}, {}, {"adjust": "full", "rotations": "held"})
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / shape
         write_workspace(make_scene(options), workspace)
@@ -390,7 +390,7 @@ _AVERAGED_NOTE = (
 )
 _MADE_NOTE = (
     "60 images, pixels off by 0.5 px, a twentieth of the matches wrong; mean position errors in the scene's"
-    " units. Full adjustment is `--adjust full --rotations measured`."
+    " units. Full adjustment is `--adjust full --rotations held`."
 )
 _CAVEATS = (
     "Caveats: liberty* are judged against the model that gives their rotations, which flatters every method"

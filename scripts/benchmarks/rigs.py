@@ -120,7 +120,7 @@ def measure_yard(rig: str) -> Rendered:
         runs = {
             MAP: lambda: _map_ours(workspace, "seed"),
             MAP_ADJUSTED: lambda: _map_ours(workspace, "full"),
-            HELD: lambda: ours.locate(model, rotations="measured").reconstruction,
+            HELD: lambda: ours.locate(model, rotations="held").reconstruction,
             FREE: lambda: ours.locate(model, rotations="free").reconstruction,
         }
         timed = {name: ours.time_call(run) for name, run in runs.items()}

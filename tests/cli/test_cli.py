@@ -183,6 +183,7 @@ def plain(tmp_path_factory):
         ("--solver conic", "solve"),
         ("--tol 1e-3", "solve"),
         ("--directions tracks", "inputs"),
+        ("--rotations 0.05", "adjustment"),
     ],
 )
 def test_each_flag_matters(tmp_path, plain, flags, changed):

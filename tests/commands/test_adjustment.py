@@ -79,13 +79,13 @@ def test_rotations_that_are_off_are_weighted_by_about_how_much_and_end_nearer_to
 
 
 def test_measured_rotations_are_held_without_a_question_and_a_given_sigma_is_used(off):
-    held = sfm_shapefit.locate(off, DATABASE, rotations="measured", min_trust=0.0)
+    held = sfm_shapefit.locate(off, DATABASE, rotations="held", min_trust=0.0)
     assert held.adjustment.errors is None
     given = pycolmap.Reconstruction(off)
     for image_id, quat in rotations_of(held).items():
         np.testing.assert_array_equal(quat, given.image(image_id).cam_from_world().rotation.quat)
     tight, loose = (
-        sfm_shapefit.locate(off, DATABASE, rotation_sigma_deg=sigma, min_trust=0.0) for sigma in (1e-3, 0.2)
+        sfm_shapefit.locate(off, DATABASE, rotations=sigma, min_trust=0.0) for sigma in (1e-3, 0.2)
     )
     free = sfm_shapefit.locate(off, DATABASE, rotations="free", min_trust=0.0)
     turns = [np.median(one.turned_deg) for one in (tight, loose, free)]

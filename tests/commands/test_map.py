@@ -234,9 +234,9 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--rotations", "measured"], "map finds the rotations itself"),
-        (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
-        (["--rotations", "exact"], "'exact' is not one of"),
+        (["--rotations", "held"], "map finds the rotations itself"),
+        (["--rotations", "0.1"], "map finds the rotations itself"),
+        (["--rotations", "exact"], "rotations must be one of auto, held, free or of type float, got 'exact'"),
         (["--min-points-per-image", "-1"], "min_points_per_image must be"),
     ],
 )

@@ -135,11 +135,11 @@ def test_a_camera_that_is_turned_a_little_is_put_right():
 
 def test_measured_rotations_are_not_doubted():
     model, _ = turned(COURTYARD, (7,), 2.0)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="measured")
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="held")
     assert found.placement.assessment.doubts is None
     assert "rotation" not in "".join(row.reason for row in found.cameras)
     with pytest.raises(ValueError, match="map finds the rotations itself"):
-        sfm_shapefit.MapOptions(rotations="measured")
+        sfm_shapefit.MapOptions(rotations="held")
 
 
 @pytest.mark.slow

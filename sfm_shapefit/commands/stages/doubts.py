@@ -59,7 +59,7 @@ def ask_pairs(
     source: MatchSource, directions: PairDirections, options: LocateOptions
 ) -> RelativeRotations | None:
     """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
-    if options.rotations == "measured":
+    if options.rotations == "held":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
