@@ -13,14 +13,13 @@ from sfm_shapefit.cli import app
 
 COMMANDS = """
     locate data_synthetic/courtyard/sparse/0 {out}/located -q
-    locate data_synthetic/ring8/sparse/0 {out}/adjusted --bundle-adjust -q
+    locate data_synthetic/ring8/sparse/0 {out}/adjusted --adjust full -q
     evaluate {out}/located data_synthetic/courtyard/truth
     inspect data_synthetic/courtyard/sparse/0
     solve data_synthetic/graph40.txt {out}/solved -q
     solve data_synthetic/graph40.txt {out}/split --method admm -q
     map data_synthetic/ring8/database.db {out}/mapped -q
-    map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --bundle-adjust -q
-    map data_synthetic/ring8/database.db {out}/averaged --averaging pycolmap -q
+    map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
     report {out}/located --scene
     convert {out}/located {out}/transforms.json -q

@@ -24,6 +24,7 @@ from abuse import strangers
 from abuse.layouts import binary_fields, cut_records, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
 from harness.record import leave_out
+from sfm_shapefit.facts.options import Adjust
 
 HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
 _PROJECT = Path(__file__).resolve().parents[2]
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         with tempfile.TemporaryDirectory() as temporary:
             work = Path(temporary)
             different = list(differing_files(scene, work))
-            adjusted = differing_files(scene, work / "adjusted", always=("--bundle-adjust",))
+            adjusted = differing_files(scene, work / "adjusted", always=("--adjust", "full"))
             different += [f"adjusted, {name}" for name in adjusted]
             for flags in strangers.STAGES_OF_MAP if (scene / "database.db").exists() else ():
                 mapped = differing_files(scene, work / "map", command="map", always=flags)
@@ -115,7 +116,7 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
     return out
 
 
-def measure_reordering(scene: Path, work: Path, seed: int, *, adjust: bool = False) -> float:
+def measure_reordering(scene: Path, work: Path, seed: int, *, adjust: Adjust = "none") -> float:
     """Return by how much of the extent positions move when everything is listed in another order.
 
     An adjustment ends at a tolerance, which another order of sums reaches elsewhere.

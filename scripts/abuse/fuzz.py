@@ -125,10 +125,9 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
     out = base.parent / "warm"
     database = ("--database", str(base / "database.db"))
     old = ("locate", str(base / "old"), str(out), "--overwrite", "--threads", "1", "-q")
-    poses = ("--directions", "relative-poses")
     for command in (
-        (*old, *database, *poses),
-        (*old, "--bundle-adjust"),
+        (*old, *database),
+        (*old, "--adjust", "full"),
         (*old, *database, "--rotations", "free"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
         ("locate", str(base / "openmvg/sfm_data.json"), str(out), "--overwrite", "--threads", "1", "-q"),
@@ -230,7 +229,7 @@ def _choose_command(
         return ("evaluate", *mutations.pick(rng, ((source, "truth"), ("truth", source))))
     if choice < 0.2:
         return ("inspect", source, *extra)
-    adjust = ("--bundle-adjust",) if choice < 0.24 else ()
+    adjust = ("--adjust", "full") if choice < 0.24 else ()
     json = ("--json",) if rng.random() < 0.3 else ()
     return ("locate", source, "out", *extra, *adjust, *json, "--threads", "1")
 
@@ -272,8 +271,6 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(rng, databases.WAYS)
     same = way(folder / "database.db", rng)
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
-    if not same and rng.random() < 0.15 and arguments[0] == "locate":
-        arguments = (*arguments, "--directions", "relative-poses")
     return Case(f"database: {way.__name__}", arguments=arguments, same_answer=same)
 
 

@@ -27,7 +27,7 @@ _MODELS = {
 """Files of other programs, and what stands beside them."""
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
-STAGES_OF_MAP = ((), ("--bundle-adjust",), ("--averaging", "pycolmap"), ("--no-adjust",))
+STAGES_OF_MAP = ((), ("--adjust", "full"), ("--adjust", "none"))
 """Flags of `map` that choose among its stages."""
 
 
@@ -58,9 +58,8 @@ def damage_database(base: Path, folder: Path, rng: Generator) -> Case:
     shutil.copyfile(base / "database.db", folder / "database.db")
     way = mutations.pick(rng, (*databases.WAYS, odd_cameras, odd_cameras, odd_cameras))
     way(folder / "database.db", rng)
-    relative = ("--relative", "stored") if rng.random() < 0.3 else ()
     stages = mutations.pick(rng, STAGES_OF_MAP)
-    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *relative, *stages, "--threads", "1"))
+    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *stages, "--threads", "1"))
 
 
 def odd_cameras(path: Path, rng: Generator) -> bool:

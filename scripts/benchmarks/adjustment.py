@@ -104,7 +104,7 @@ def compare(name: str, folder: Path, repeats: int) -> Compared:
     """Adjust one start by both, in turns; to be called in a process of one thread."""
     import pycolmap
 
-    located = ours.locate(folder / "sparse" / "0", adjust=False).reconstruction
+    located = ours.locate(folder / "sparse" / "0", adjust="none").reconstruction
     adjust_own(located, 1e-3)  # a warm-up
     own, ceres = [], []
     for _ in range(repeats):

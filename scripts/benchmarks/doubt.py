@@ -197,7 +197,7 @@ def judge(model: "PosedModel", scene: Scene) -> "tuple[PairDirections, Placement
         measured = add_evidence(measured, source, directions, options)
         placement = place_cameras(measured, options, clock)
         relative = ask_pairs(source, directions, options)
-    return directions, doubt_cameras(placement, directions, relative, model, options)
+    return directions, doubt_cameras(placement, directions, relative, model)
 
 
 def num_still_off(scene: Scene, changed: "PosedModel", cameras: "IntArray", least_deg: float) -> int:

@@ -37,10 +37,10 @@ from harness.metrics import Check, Quantity, check_all, number, numbers, ratio, 
 from harness.process import call, thread_environment
 from harness.record import table_of, versions
 
-OURS = ("map", "map --bundle-adjust")
+OURS = ("map", "map --adjust full")
 PEERS = tuple((mapper, k) for mapper in ("global", "incremental") for k in (15, 30))
 LARGEST_RATIO = 1.15
-"""Of the mean error of `map --bundle-adjust` on a further scene, to that of the better peer."""
+"""Of the mean error of `map --adjust full` on a further scene, to that of the better peer."""
 WRONG_DEG = 5.0
 
 
@@ -333,10 +333,10 @@ def measure_rotations(database: Path, truth: Path) -> dict[str, float]:
     from benchmarks.averaging import errors_deg
     from sfm_shapefit import relative_rotations
     from sfm_shapefit.files.colmap.model import read_model
-    from sfm_shapefit.rotations.trusted import average_consistently
+    from sfm_shapefit.rotations.average import average_relative_rotations
 
     relative, known = relative_rotations(database), read_model(truth)
-    found = average_consistently(len(relative.names), relative)
+    found = average_relative_rotations(len(relative.names), relative)
     row_of = {name: k for k, name in enumerate(known.names)}
     rows = [k for k, name in enumerate(relative.names) if found.registered[k] and name in row_of]
     true = known.rotations[[row_of[relative.names[k]] for k in rows]]
@@ -380,7 +380,7 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
     yield (
         f"Made scenes: {sizes}, a share of {_LARGE['wrong_match_fraction']} of all matches wrong. The limit"
         f" of further scenes is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers, for"
-        " `map --bundle-adjust`. The better setting of a mapper is bold. With `--folder`, what a peer"
+        " `map --adjust full`. The better setting of a mapper is bold. With `--folder`, what a peer"
         " reached in an earlier run with the same threads and versions is not measured again."
     )
 

@@ -174,7 +174,7 @@ def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> Measured:
     found = runs[-1].found
     adjusted, adjustment_s = None, math.nan
     if args.bundle_adjust:
-        refined = _locate(model, bundle_adjust=True).found
+        refined = _locate(model, adjust="full").found
         adjusted = compare(refined.reconstruction, truth)
         adjustment_s = refined.timings_s["bundle adjustment"]
     return Measured(
@@ -183,7 +183,7 @@ def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> Measured:
         num_placed=len(found.placement.cameras),
         num_pairs=len(found.directions.pairs),
         num_pairs_used=len(found.placement.pairs),
-        placed=compare(_locate(model, adjust=False).found.reconstruction, truth),
+        placed=compare(_locate(model, adjust="none").found.reconstruction, truth),
         errors=compare(found.reconstruction, truth),
         statement=_treatment(found.summary()["adjustment"]),
         gap=found.certified.gap,
@@ -206,7 +206,7 @@ def measure_made(shape: str, num_images: int) -> Made:
     from sfm_shapefit.synthetic.workspace import write_workspace
 
     options = SceneOptions(shape=shape, num_images=num_images, wrong_match_fraction=0.05, seed=1)
-    ways = ({"adjust": False}, {}, {"bundle_adjust": True, "rotations": "measured"})
+    ways = ({"adjust": "none"}, {}, {"adjust": "full", "rotations": "held"})
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / shape
         write_workspace(make_scene(options), workspace)
@@ -222,7 +222,7 @@ def _treatment(adjustment: Mapping[str, Any]) -> str:
     return f"{adjustment['rotations']}{by} (chance: {number(chance_deg)})"
 
 
-def _locate(model: Path, **options: bool) -> ours.Timed:
+def _locate(model: Path, **options: str) -> ours.Timed:
     """Locate and write."""
     with tempfile.TemporaryDirectory() as folder:
         return ours.time_call(lambda: ours.locate_and_write(model, Path(folder) / "out", **options))
@@ -235,13 +235,13 @@ def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
 
     model, truth = average_rotations(folder / "database.db", folder / "sparse" / "0"), folder / scene.truth
     measured = []
-    for adjust in (False, True):
+    for adjust in ("none", "seed"):
         run = ours.time_call(lambda adjust=adjust: ours.locate(model, folder / "database.db", adjust=adjust))
         rotation = evaluate(run.found.reconstruction, truth).rotation_deg
         measured.append(
             Averaged(
                 scene=scene,
-                rotations="adjusted" if adjust else "kept",
+                rotations="kept" if adjust == "none" else "adjusted",
                 errors=compare(run.found.reconstruction, truth),
                 rotation_deg=(rotation.median, rotation.mean, rotation.max),
                 cpu_s=run.cpu_s,
@@ -306,7 +306,7 @@ def tables(measured: Mapping[str, Measured | Made], _args: argparse.Namespace) -
             "rotations": lambda one: one.statement,
         },
     )
-    yield "## The placement alone (`--no-adjust`)"
+    yield "## The placement alone (`--adjust none`)"
     yield table_of(
         found,
         {
@@ -386,11 +386,11 @@ _ADJUSTED_NOTE = (
 _AVERAGED_NOTE = (
     "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15 matches or"
     " more), intrinsics of sparse/0, no centers; position error median / mean / max and rotation error in"
-    " degrees, once with `--no-adjust` and once without. The target is that of the kept rotations."
+    " degrees, once with `--adjust none` and once without. The target is that of the kept rotations."
 )
 _MADE_NOTE = (
     "60 images, pixels off by 0.5 px, a twentieth of the matches wrong; mean position errors in the scene's"
-    " units. Full adjustment is `--bundle-adjust --rotations measured`."
+    " units. Full adjustment is `--adjust full --rotations held`."
 )
 _CAVEATS = (
     "Caveats: liberty* are judged against the model that gives their rotations, which flatters every method"

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic import RigScene
     from sfm_shapefit.synthetic.layouts import SceneCameras
 
-LOCATE, ADJUSTED, MAPPING = "locate", "locate --bundle-adjust", "global mapping, its best setting"
-MAP, MAP_ADJUSTED = "map", "map --bundle-adjust"
+LOCATE, ADJUSTED, MAPPING = "locate", "locate --adjust full", "global mapping, its best setting"
+MAP, MAP_ADJUSTED = "map", "map --adjust full"
 HELD, FREE = "locate, true rotations held", "locate, true rotations free"
 LARGEST_SCALE_ERROR, LARGEST_RATIO = 0.001, 1.2
 """Of `map` on a rendered yard: the scale, and the mean error to that of `locate`."""
@@ -118,26 +118,27 @@ def measure_yard(rig: str) -> Rendered:
         write_rendered_workspace(scene, workspace, WorkspaceOptions(model="rotations"))
         model = workspace / "sparse" / "0"
         runs = {
-            MAP: lambda: _map_ours(workspace, bundle_adjust=False),
-            MAP_ADJUSTED: lambda: _map_ours(workspace, bundle_adjust=True),
-            HELD: lambda: ours.locate(model, rotations="measured").reconstruction,
+            MAP: lambda: _map_ours(workspace, "seed"),
+            MAP_ADJUSTED: lambda: _map_ours(workspace, "full"),
+            HELD: lambda: ours.locate(model, rotations="held").reconstruction,
             FREE: lambda: ours.locate(model, rotations="free").reconstruction,
         }
         timed = {name: ours.time_call(run) for name, run in runs.items()}
     return Rendered(rig, {name: compare(scene, run.found, run.wall_s) for name, run in timed.items()})
 
 
-def _map_ours(workspace: Path, *, bundle_adjust: bool) -> "pycolmap.Reconstruction":
+def _map_ours(workspace: Path, adjust: Any) -> "pycolmap.Reconstruction":
     from sfm_shapefit import map_database
 
-    found = map_database(workspace / "database.db", bundle_adjust=bundle_adjust)
+    found = map_database(workspace / "database.db", adjust=adjust)
     return found.models[0].located.reconstruction
 
 
 def _run(method: str, scene: "RigScene", workspace: Path) -> Outcome:
     if method == MAPPING:
         return _best_mapping(scene, workspace)
-    run = ours.time_call(lambda: ours.locate(workspace / "sparse" / "0", bundle_adjust=method == ADJUSTED))
+    adjust = "full" if method == ADJUSTED else "seed"
+    run = ours.time_call(lambda: ours.locate(workspace / "sparse" / "0", adjust=adjust))
     return compare(scene.scene, run.found.reconstruction, run.wall_s)
 
 

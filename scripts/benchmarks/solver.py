@@ -219,7 +219,7 @@ def _turn(solver: Callable[[float], object], tol: float) -> list[ours.Timed]:
 
 def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     """Solve the graph of a real set, with points or without; to be called in a process of one thread."""
-    placement = ours.locate(folder / "sparse" / "0", points=points, adjust=False).placement
+    placement = ours.locate(folder / "sparse" / "0", points=points, adjust="none").placement
     graph, nodes = placement.graph.restricted_to(placement.edges)
     num_points = int((nodes >= placement.num_cameras).sum())
     tight = solve_ours(graph, 1e-11)

@@ -58,7 +58,7 @@ class Made(NamedTuple):
     rotation_deg: float
 
 
-BUNDLE = (("bundle_adjust", True),)
+BUNDLE = (("adjust", "full"),)
 # Meters.
 OF_STRECHA, OF_MOTION_CAPTURE = 0.001, 0.01 / np.sqrt(3.0)
 SETS = {
@@ -68,7 +68,7 @@ SETS = {
     },
     "lego100": Scene("lego100"),
     "lego100-exact": Scene("lego100", model="gt"),
-    "lego100-measured": Scene("lego100", model="gt", options=(("rotations", "measured"),)),
+    "lego100-measured": Scene("lego100", model="gt", options=(("rotations", "held"),)),
     "castle-P30, bundle-adjusted": Scene("castle-P30", options=BUNDLE, truth_sigma=OF_STRECHA),
     "Herz-Jesus-P25, bundle-adjusted": Scene("Herz-Jesus-P25", options=BUNDLE, truth_sigma=OF_STRECHA),
     "robots-1": Scene("robots-1", truth_sigma=OF_MOTION_CAPTURE),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 EQUAL = 1.05
 """Differences below count as equal: the truth is no better."""
 SAME_DIRECTIONS, BY_DEFAULT = "ours, the same directions", "ours, `locate` by default"
-SAME_OPTIONS: dict[str, Any] = {"threads": 1, "points": "never", "min_trust": 0.0, "adjust": False}
+SAME_OPTIONS: dict[str, Any] = {"threads": 1, "points": "never", "min_trust": 0.0, "adjust": "none"}
 POSITIONING, MAPPING = "pycolmap positioning", "pycolmap mapping"
 _MAPPING_MATCHES = (15, 30)
 _ON_DIRECTIONS = tuple(one.name for one in GRAPH_CONTENDERS if one.package is not None)

@@ -75,6 +75,7 @@ _METAVARS: dict[Any, str] = {
     "without": "FILE",
     "control_points": "FILE",
     "gravity": "FILE|database",
+    "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",
@@ -86,6 +87,9 @@ _METAVARS: dict[Any, str] = {
 
 _REPEATED = {"known_distance": (str, str, float)}
 """Flags of several values that may be repeated, of which typer knows none, and the types of their values."""
+
+_WORDS_OR_NUMBERS = {"rotations"}
+"""Flags that take a word or a number, of which typer knows none either."""
 
 # No argument of a program can hold this.
 _JOINT = "\0"
@@ -206,10 +210,10 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
                 rich_help_panel=group.title,
                 metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
             )
-            repeated = item.name in _REPEATED
-            annotation: Any = Annotated[(list[str] if repeated else kinds[item.name]) | None, flagged]
-            kind = inspect.Parameter.KEYWORD_ONLY
-            parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
+            kind = str if item.name in _WORDS_OR_NUMBERS else kinds[item.name]
+            annotation: Any = Annotated[(list[str] if item.name in _REPEATED else kind) | None, flagged]
+            keyword = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(item.name, keyword, default=None, annotation=annotation))
     return parameters
 
 
@@ -242,6 +246,14 @@ def _values_of(name: str, text: str) -> tuple[Any, ...]:
         raise typer.BadParameter(f"{_flag_of(name)} takes {_METAVARS[name]}") from error
 
 
+def _word_or_number(text: str) -> str | float:
+    """Return the number that a text is, or the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
     """Return options from a TOML file, if there is one, and the flags that were given, which win.
 
@@ -254,9 +266,11 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
     earlier = {item.metadata["also"]: item.name for item in fields(settings)}
     known = {item.name for item in fields(settings)}
     values = _read_toml(config, known, earlier) if config else {}
-    values |= {name: value for name, value in given.items() if value is not None and name in known}
-    for name in _REPEATED.keys() & {name for name in known if given.get(name) is not None}:
-        values[name] = tuple(_values_of(name, text) for text in given[name])
+    flags = {name: value for name, value in given.items() if value is not None and name in known}
+    for name in _REPEATED.keys() & flags.keys():
+        flags[name] = tuple(_values_of(name, text) for text in flags[name])
+    flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
+    values |= flags
     try:
         return settings(**values)
     except (TypeError, ValueError) as error:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     "map",
     cls=GroupedCommand,
     short_help="From the matches of a database alone: rotations, then locate.",
-    epilog="Example: sfm-shapefit map database.db out --bundle-adjust",
+    epilog="Example: sfm-shapefit map database.db out --adjust full",
 )
 @takes(MapOptions, OutputFlags)
 def map_command(

@@ -145,7 +145,7 @@ class RotationRefinement(TypedDict):
 
 
 class BundleAdjustment(TypedDict):
-    """What --bundle-adjust reached; mean reprojection errors."""
+    """What --adjust full reached; mean reprojection errors."""
 
     converged: Annotated[bool, "Whether the last round met its tolerance."]
     iterations: Annotated[int, "Steps of all rounds together."]
@@ -429,7 +429,6 @@ class Averaging(TypedDict):
     """How rotations were averaged, and how well they agree with the pairs."""
 
     statement: Annotated[str, "How the rotations were found, in words."]
-    averaging: Annotated[str, "Who averaged: own or pycolmap."]
     num_registered: Annotated[int, "Images that have a rotation."]
     num_pairs: Annotated[int, "Pairs whose residuals count."]
     agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]

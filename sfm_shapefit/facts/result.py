@@ -19,7 +19,7 @@ from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.facts.key_figures import figure_rows
 from sfm_shapefit.facts.notebook import notebook_html
-from sfm_shapefit.facts.options import LocateOptions, Source
+from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.summary import summarize_graph, summarize_model
 from sfm_shapefit.facts.tables import CameraRow, PairRow
@@ -32,7 +32,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
-from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -55,10 +55,8 @@ class Inputs:
     """The model folder; None for a reconstruction in memory."""
     database: Path | None
     """The database whose matches were used, if any."""
-    source: Source
-    """Where the directions came from; never "auto"."""
     statement: str
-    """How that choice was made, for the user."""
+    """Where the directions came from, and how that choice was made, for the user."""
     left_out: PairNames = frozenset()
     """Pairs that are taken for unmatched."""
 
@@ -239,8 +237,8 @@ class LocateResult(Displayed):
         is_in = np.zeros(placement.num_cameras, dtype=np.bool_)
         is_in[placement.cameras[self.kept]] = True
         judged = is_in[placement.graph.edges[placement.edges[placement.pairs]]].all(axis=1)
-        against = [k for k, status in enumerate(self.directions.status) if status in CONTRADICTIONS]
-        num_against = int(np.sum(is_in[self.directions.pairs[against].reshape(-1, 2)].all(axis=1)))
+        against = self.directions.pairs[self.directions.contradicting()]
+        num_against = int(np.sum(is_in[against].all(axis=1)))
         agreeing = int(np.sum(placement.assessment.inliers[placement.pairs] & judged))
         total = int(np.sum(judged)) + num_against
         return agreeing / total if total else math.nan

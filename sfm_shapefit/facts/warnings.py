@@ -13,7 +13,7 @@ from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
@@ -107,7 +107,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
             "contradiction behind; compare images of neighboring cameras before trusting them"
         )
-    against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
+    against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
             f"the matches of {against} of {len(directions.pairs)} pairs contradict the given rotations: the "

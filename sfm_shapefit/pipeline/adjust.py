@@ -60,7 +60,7 @@ def bundle_adjust(
         adjusted = bundle_adjust(model, hold_rotations=True)             # rotations that were measured
         adjusted = bundle_adjust(model, rotation_sigma_deg=0.03)         # or pulled to, so far
 
-    Unlike `locate(..., bundle_adjust=True)`, nothing is triangulated or filtered here. Rigs hold their
+    Unlike `locate(..., adjust="full")`, nothing is triangulated or filtered here. Rigs hold their
     sensors. Lenses that are no case of OPENCV, such as fisheyes, are undistorted and stay what they are.
 
     Args:

@@ -44,9 +44,9 @@ _SAID_OF_MATCHES = (
 
 def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     """Return how given rotations are treated; None: as the matches say."""
-    if options.rotation_sigma_deg:
-        return RotationWeight(sigma_rad=math.radians(options.rotation_sigma_deg))
-    return {"auto": None, "measured": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+    if not isinstance(options.rotations, str):
+        return RotationWeight(sigma_rad=math.radians(options.rotations))
+    return {"auto": None, "held": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
 
 
 def pull_cameras(
@@ -133,8 +133,6 @@ def _measure_again(
 
     Of images whose rotations were clearly wrong, and are `corrected`, it is what their matches say now.
     """
-    if source.kind == "relative-poses":
-        return before
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
     batches = _without_pairs(source.counted(source.batches(), clock.advance), others)

@@ -62,7 +62,7 @@ def ask_pairs(
 
     Only pairs `among` some images are asked, by their index; None: all.
     """
-    if options.rotations == "measured" or source.kind == "relative-poses":
+    if options.rotations == "held":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
@@ -98,21 +98,17 @@ def doubt_cameras(
     directions: PairDirections,
     relative: RelativeRotations | None,
     model: PosedModel,
-    options: LocateOptions,
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     Args:
         placement: of some of the images.
         directions: of all pairs.
-        relative: what `ask_pairs` returned; if None, trust stays as it is.
+        relative: what `ask_pairs` returned; if None, the given rotations are believed.
         model: that has the given rotations.
-        options: whether these were measured.
     """
-    if options.rotations == "measured":
-        return replace(placement, assessment=believe_rotations(placement.assessment))
     if relative is None:
-        return placement
+        return replace(placement, assessment=believe_rotations(placement.assessment))
     place_of = np.full(model.num_images, -1)
     place_of[placement.cameras] = np.arange(len(placement.cameras))
     pairs = weigh_pairs(directions, _agreements(placement, directions), relative, model.rotations)
@@ -132,11 +128,9 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, options: 
     As `doubt_cameras` judges them, but for the baselines, which are not known yet.
     """
     model = source.model
-    if options.rotations == "measured":
-        return np.ones(model.num_images, dtype=np.bool_)
     relative = ask_pairs(source, directions, options)
     if relative is None:
-        return np.zeros(model.num_images, dtype=np.bool_)
+        return np.ones(model.num_images, dtype=np.bool_)
     pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
     pairs = pairs.subset(_weighed(directions, model.num_images))
     _, labels = np.unique(model.frame_ids, return_inverse=True)
@@ -154,7 +148,7 @@ def question_focal_lengths(
     model = source.model
     images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
     ids, labels = np.unique([image.camera_id for image in images], return_inverse=True)
-    if source.kind != "matches" or not 1 < len(ids) <= _MOST_CAMERAS:
+    if source.database is None or not 1 < len(ids) <= _MOST_CAMERAS:
         return ()
     kinds = [model.camera(k).model_name for k in range(model.num_images)]
     lenses = Lenses(

@@ -33,11 +33,10 @@ from sfm_shapefit.pipeline.relative_rotations import relative_rotations
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
-from sfm_shapefit.rotations.average import check_pairs
+from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
-from sfm_shapefit.rotations.trusted import average_consistently
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import IterativeSolver
@@ -153,7 +152,7 @@ def locate_model(folder: Path) -> None:
 def locate_from_tracks(folder: Path) -> None:
     """Locate the cameras of a model without a database, and inspect it."""
     model = _workspace(folder, WorkspaceOptions(database=False))
-    locate(model, threads=1, bundle_adjust=True)
+    locate(model, threads=1, adjust="full")
     inspect(model, theory=True)
 
 
@@ -202,8 +201,7 @@ def average_graphs(_folder: Path) -> None:
     """Average rotations with a factor, and as on large graphs without one."""
     edges = np.ascontiguousarray(_random_graph().edges)
     problem = rotation_problem(20, edges)
-    average_consistently(20, problem.relative, threads=2)
-    average_consistently(20, problem.relative, averaging="pycolmap")
+    average_relative_rotations(20, problem.relative, threads=2)
     given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
     for is_expander in (False, True):
         system = replace(

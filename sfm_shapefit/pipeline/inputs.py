@@ -36,8 +36,6 @@ class MatchSource:
     """A model with the matches of its images, which can be read again and again."""
 
     model: PosedModel
-    kind: Source
-    """What directions are made from; never "auto"."""
     database: MatchDatabase | None
     """The open database; None where the model's own tracks serve."""
     economy: Economy = ECONOMIES[0]
@@ -112,19 +110,19 @@ def open_source(
         InputError: if the matches cannot be read, or there is no way to stay below the limit.
     """
     if inputs.database is None:
-        yield MatchSource(model=model, kind=inputs.source, database=None)
+        yield MatchSource(model=model, database=None)
         return
     with ExitStack() as stack:
         if opened is None:
             database = stack.enter_context(open_database(inputs.database, model, inputs.left_out))
         else:
             database = opened.among(model, inputs.left_out)
-        source = MatchSource(model=model, kind=inputs.source, database=database)
+        source = MatchSource(model=model, database=database)
         if options is not None and options.max_memory_mb:
             bare = replace(
                 source.workload(),
                 adjusts=options.adjusts_cameras(model.num_images),
-                adjusts_bundle=options.bundle_adjust,
+                adjusts_bundle=options.adjust == "full",
             )
             work = replace(bare, has_points=options.uses_points(model.num_images))
             source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
@@ -166,9 +164,7 @@ def choose_inputs(
     if source == "tracks":
         if database is not None:
             raise InputError("directions from tracks use no database; leave out one of the two")
-        return Inputs(
-            folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
-        )
+        return Inputs(folder=folder, database=None, statement="the model's own tracks, as asked")
     # The pixels of other programs' model files may differ from those of a database beside them.
     is_folder = folder is not None and not folder.is_file()
     found = find_database(folder) if folder is not None and is_folder else None
@@ -177,8 +173,6 @@ def choose_inputs(
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one with --database")
         statement = "the model's own tracks; no database.db was given or found beside the model"
-        return Inputs(folder=folder, database=None, source="tracks", statement=statement)
-    what = "stored relative poses" if source == "relative-poses" else "inlier matches"
-    statement = f"{what} of {path}" + (" (found beside the model)" if database is None else "")
-    chosen: Source = "relative-poses" if source == "relative-poses" else "matches"
-    return Inputs(folder=folder, database=path, source=chosen, statement=statement)
+        return Inputs(folder=folder, database=None, statement=statement)
+    statement = f"inlier matches of {path}" + (" (found beside the model)" if database is None else "")
+    return Inputs(folder=folder, database=path, statement=statement)

@@ -76,7 +76,7 @@ def map_database(
         database: with keypoints and two-view geometries, or the folder that holds it as database.db; it is
             never changed. Intrinsics are the database's.
         options: settings, see `help(MapOptions)`; defaults if None.
-        **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
+        **overrides: single options by name: `map_database(database, adjust="full")`.
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
             "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
@@ -102,7 +102,7 @@ def _map_opened(run: "_Run") -> MapResult:
     """Do what `map_database` does, once the matches are open."""
     options, path, clock = run.options, run.database, run.clock
     relative = run.measure()
-    if options.adjust and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
+    if options.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
         if differ_in_rays(known, run.unposed):
             run = run._replace(unposed=known)
@@ -224,8 +224,7 @@ class _Run(NamedTuple):
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
             sharing = Sharing(self.options.num_threads(), self.clock.executor, self.clock.advance)
-            source = self.options.relative_rotations
-            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, source, sharing)
+            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, sharing)
 
     def matches(self) -> MatchDatabase:
         """Return the matches of all images, but for the pairs that are left out."""
@@ -370,7 +369,7 @@ class _Run(NamedTuple):
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
             source, first, intrinsics = averaged, None, self.intrinsics
-            if self.options.adjust:
+            if self.options.adjust != "none":
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
                     first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)

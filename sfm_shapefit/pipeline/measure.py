@@ -14,13 +14,8 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
-from sfm_shapefit.pairs.estimate import estimate_directions, from_relative_poses
-from sfm_shapefit.pairs.pair_directions import (
-    CONTRADICTIONS,
-    DirectionStatus,
-    PairDirections,
-    concatenate,
-)
+from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -43,11 +38,6 @@ def measure_directions(
 ) -> PairDirections:
     """Return the direction of every pair that the source has; an executor shares them out, if it can."""
     model = source.model
-    if source.database is not None and source.kind == "relative-poses":
-        poses = source.database.relative_poses()
-        if len(poses.pairs) == 0:
-            raise UnsolvableError("the database has no stored relative pose; use directions from matches")
-        return from_relative_poses(poses, model.rotations, options)
     if executor is not None and source.database is not None:
         work = PairWork(estimate=partial(estimate_directions, options=options))
         parts = measure_with_workers(source.database, model, work, executor, clock.advance)
@@ -94,9 +84,7 @@ def build_graph(source: MatchSource, directions: PairDirections, options: Locate
 
 def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
     """Return whether the errors of the directions are sampled together."""
-    if source.kind == "relative-poses" or not source.economy.samples:
-        return False
-    return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
+    return source.economy.samples and len(directions.usable()) <= _MAX_SAMPLED_PAIRS
 
 
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:
@@ -137,10 +125,10 @@ def sample_errors(
 def collect_evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
     """Return what the matches say of the cameras beyond the usable directions."""
     usable = directions.usable()
-    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
+    against = directions.contradicting()
     return Evidence(
         support=directions.num_matches[usable],
-        contradicting=directions.pairs[against].reshape(-1, 2),
+        contradicting=directions.pairs[against],
         contradicting_support=directions.num_matches[against],
         errors=errors,
     )

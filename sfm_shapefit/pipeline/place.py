@@ -21,7 +21,7 @@ from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.rotations.rotation_averaging import average_rotations
+from sfm_shapefit.rotations.average import average_rotations
 from sfm_shapefit.solver.options import OnIteration
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def place_graph_file(
             see `formats.read_g2o`, or a pose graph.
         options: settings; defaults if None.
         rotations: of the cameras of relative poses: 1DSfM's rots.txt, see `formats.read_rotations`, or the
-            vertices of a g2o file; averaged by pycolmap if None.
+            vertices of a g2o file; averaged if None, see `average_rotations`.
         max_rotation_error_deg: relative poses whose rotation contradicts those of the cameras by more are
             left out, as `locate` leaves them out.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
@@ -99,7 +99,8 @@ def place_graph_file(
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
         with clock("rotations"):
-            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg)
+            threads = options.num_threads()
+            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg, threads)
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
@@ -136,7 +137,7 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
 
 
 def _orient(
-    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float
+    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float, threads: int
 ) -> tuple[ViewGraph, FloatArray, str]:
     """Return the directions of the pairs that agree with the rotations, of a file or averaged, and these."""
     if path is not None:
@@ -144,8 +145,10 @@ def _orient(
         (rotations, known), origin = read(path, geometries.names), f"of {path}"
     else:
         total = len(geometries.names)
-        rotations, known = average_rotations(total, geometries.pairs, geometries.rotations)
-        origin = "averaged by pycolmap"
+        averaged = average_rotations(
+            geometries.pairs, geometries.rotations, num_images=total, threads=threads
+        )
+        rotations, known, origin = averaged.rotations, averaged.registered, "averaged"
     agreeing = np.flatnonzero(geometries.mismatch_deg(rotations) <= max_rotation_error_deg)
     total, kept = len(geometries.pairs), len(agreeing)
     if kept == 0:

@@ -5,13 +5,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
-from sfm_shapefit.facts.options import MapOptions, Relative
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.pairs.essential import (
+    RelativeSource,
     concatenate,
     estimate_relative_rotations,
     stored_relative_rotations,
@@ -19,6 +19,7 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+from sfm_shapefit.solver.options import SolverOptions
 
 # About a second of work, be they many pairs of few matches or few of many.
 _MATCHES_PER_TASK = 100_000
@@ -46,7 +47,7 @@ def relative_rotations(
     database: Path | str,
     *,
     min_matches: int = LEAST_MATCHES,
-    source: Relative = "matches",
+    source: RelativeSource = "matches",
     threads: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -74,7 +75,9 @@ def relative_rotations(
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options = MapOptions(relative_rotations=source, threads=threads)
+    options = SolverOptions(threads=threads)
+    if source not in get_args(RelativeSource):
+        raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
     path, clock = Path(database), Clock.of(progress)
@@ -82,7 +85,10 @@ def relative_rotations(
         model = read_model(read_images(path).reconstruction)
         sharing = Sharing(options.num_threads(), executor, clock.advance)
         with open_database(path, model) as matches:
-            found = measure_rotations(matches, model, min_matches, source, sharing)
+            if source == "stored":
+                found = stored_relative_rotations(matches, model, min_matches)
+            else:
+                found = measure_rotations(matches, model, min_matches, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 
@@ -91,16 +97,14 @@ def measure_rotations(
     database: MatchDatabase,
     model: PosedModel,
     min_matches: int = LEAST_MATCHES,
-    source: Relative = "matches",
     sharing: Sharing | None = None,
 ) -> RelativeRotations:
-    """Return the relative rotations of a database; pairs are indices into the model's images.
+    """Return relative rotations estimated from matches; pairs are indices into the model's images.
 
     Args:
         database: open, of the model.
         model: all its images, with the identity as their rotation (see `database_images`).
         min_matches: pairs with fewer inlier matches are left out.
-        source: estimated from the matches, or as stored.
         sharing: one thread if None.
 
     Raises:
@@ -108,8 +112,6 @@ def measure_rotations(
         WorkerError: if a worker died and the executor does not replace it.
     """
     sharing = sharing or Sharing()
-    if source == "stored":
-        return stored_relative_rotations(database, model, min_matches)
     if sharing.executor is None:
         parts = _estimate_here(database, min_matches, sharing)
     else:

@@ -265,7 +265,8 @@ def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> S
     located = stand.located
     num_cameras, is_pulled = len(located.placement.cameras), located.given.centers is not None
     is_small = located.placement.piece > 0 and num_cameras < _SMALLEST_ADJUSTED
-    if is_small or (told.near is not None and not is_pulled) or not options.adjusts_cameras(num_cameras):
+    adjusts = stand.source.economy.adjustment and options.adjusts_cameras(num_cameras)
+    if is_small or (told.near is not None and not is_pulled) or not adjusts:
         return stand
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
         after = adjust_placed(stand.source, stand.directions, located, options, clock, told.rotations)
@@ -294,9 +295,7 @@ def _judge(stand: Stand, given: PosedModel, options: LocateOptions) -> Judged:
     among = placement.cameras if placement.piece else None
     relative = ask_pairs(stand.source, stand.directions, options, among)
     judged = with_uncertainty(judge(placement, options), given, stand.uncertainty, stand.scale)
-    return doubt_cameras(
-        judged.without_error_samples(), stand.directions, relative, stand.source.model, options
-    )
+    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
 
 
 def _choose(located: Located, judged: Judged, min_trust: float) -> Located:

@@ -174,7 +174,7 @@ def plain(tmp_path_factory):
     ("flags", "changed"),
     [
         (
-            "--min-inlier-ratio 0.95 --bundle-adjust --scale unit",
+            "--min-inlier-ratio 0.95 --adjust full --scale unit",
             "num_pairs_rejected bundle_adjustment scale",
         ),
         ("--inlier-threshold-px 0.3", "num_pairs_rejected"),
@@ -183,6 +183,7 @@ def plain(tmp_path_factory):
         ("--solver conic", "solve"),
         ("--tol 1e-3", "solve"),
         ("--directions tracks", "inputs"),
+        ("--rotations 0.05", "adjustment"),
     ],
 )
 def test_each_flag_matters(tmp_path, plain, flags, changed):
@@ -306,7 +307,7 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
     assert "the output" not in said  # what stands there is the earlier one
 
 
-@pytest.mark.parametrize("extra", [(), ("--bundle-adjust", "--no-adjust")])
+@pytest.mark.parametrize("extra", [(), ("--adjust", "full")])
 def test_an_interrupt_in_an_adjustment_leaves_nothing(tmp_path, monkeypatch, extra):
     calls = []
 
@@ -453,7 +454,7 @@ def test_options_and_names_may_begin_with_the_mark_of_a_windows_editor(tmp_path)
     for name, flag in (("names.txt", "--fix"), ("options.toml", "--config")):
         file = tmp_path / name
         file.write_bytes(b"\xef\xbb\xbf" + (BUNDLED / name).read_bytes().replace(b"\n", b"\r\n"))
-        done = run("locate", RING_MODEL, tmp_path / flag, flag, file, "--no-report", "--no-adjust")
+        done = run("locate", RING_MODEL, tmp_path / flag, flag, file, "--no-report", "--adjust", "none")
         assert done.exit_code == 0, done.stderr
 
 

@@ -26,7 +26,7 @@ def problems(facts, name):
 
 def commands(out):
     return {
-        "locate": ("locate", RING_MODEL, out, "--rotations", "free", "--bundle-adjust", "--no-report"),
+        "locate": ("locate", RING_MODEL, out, "--rotations", "free", "--adjust", "full", "--no-report"),
         "solve_graph": ("place", BUNDLED / "graph40.txt", out, "--no-report"),
         "inspect": ("inspect", RING_MODEL, "--theory"),
         "evaluate": ("evaluate", RING_MODEL, RING_MODEL),

@@ -133,11 +133,11 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
     last = [economy for economy in ECONOMIES if economy.adjustment][-1]
     needed = forecast(describe_work(crowded, measured, LocateOptions()), last).peak_mb
     options = LocateOptions(max_memory_mb=int(needed) - 1)
-    economy, _, changed = keep_within_memory(crowded, measured, options, ECONOMIES[0])
+    economy = keep_within_memory(crowded, measured, options, ECONOMIES[0])[0]
     assert "not adjusted" in economy.statement
-    assert not changed.adjust
+    assert not economy.adjustment
     plenty = replace(options, max_memory_mb=10**6)
-    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[2].adjust
+    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[0].adjustment
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,7 @@ def test_a_1dsfm_folder_is_placed_from_given_or_averaged_rotations(tmp_path, ave
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     assert list(found) == [str(10 * k) for k in range(9)]
     assert worst_error(np.array(list(found.values())), centers) < 1e-6  # averaging stops at its own tolerance
-    assert ("averaged by pycolmap" in facts["inputs"]["directions"]) == averaged
+    assert ("9 of 9 rotations averaged" in facts["inputs"]["directions"]) == averaged
     assert facts["residuals_deg"]["quantile_90"] < 1e-4
 
 

@@ -160,7 +160,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
 
 
 def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
-    located = sfm_shapefit.locate(workspace / "sparse" / "0", bundle_adjust=True, points="never")
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", adjust="full", points="never")
     assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
     fit = fit_similarity(centers_of(located.reconstruction)[1], rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
@@ -216,11 +216,11 @@ def poses(reconstruction):
     }
 
 
-@pytest.mark.parametrize("bundle_adjust", [False, True])
-def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring, bundle_adjust):
+@pytest.mark.parametrize("adjust", ["seed", "full"])
+def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring, adjust):
     model, centers, names, all_names = moved_ring
     given = poses(model)
-    options = LocateOptions(fix=str(names), bundle_adjust=bundle_adjust)
+    options = LocateOptions(fix=str(names), adjust=adjust)
     found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     after = poses(found.reconstruction)
     for name in all_names[:5]:
@@ -397,14 +397,13 @@ def disturbed(tmp_path_factory):
     return scene, model, workspace / "database.db"
 
 
-@pytest.mark.parametrize("way", ["map", "locate", "ceres"])
+@pytest.mark.parametrize("way", ["map", "locate"])
 def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(disturbed, way):
     scene, model, database = disturbed
     if way == "locate":
         found = sfm_shapefit.locate(model, database, refine_rigs=True)
     else:
-        ceres = {"bundle_adjust": True, "adjuster": "ceres"} if way == "ceres" else {}
-        found = sfm_shapefit.map_database(database, refine_rigs=True, **ceres).models[0].located
+        found = sfm_shapefit.map_database(database, refine_rigs=True).models[0].located
     said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
     (rig,) = found.reconstruction.rigs.values()
     poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
@@ -464,7 +463,7 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
         with pytest.raises(InputError, match="no rig of several cameras to refine; leave out refine_rigs"):
             call()
     with pytest.raises(ValueError, match="refine_rigs needs an adjustment"):
-        LocateOptions(refine_rigs=True, adjust=False)
+        LocateOptions(refine_rigs=True, adjust="none")
 
 
 def keep_few_matches(connection):
@@ -511,7 +510,7 @@ def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rot
     scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
     write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
     # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
-    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, bundle_adjust=True)
+    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, adjust="full")
 
 
 def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_path):

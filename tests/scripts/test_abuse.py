@@ -96,11 +96,11 @@ def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
 @pytest.mark.parametrize(
     ("scene", "adjust", "most"),
     [
-        (RING, False, 1e-12),
-        (FACADE, False, 1e-12),
-        (COURTYARD, False, 1e-12),
+        (RING, "none", 1e-12),
+        (FACADE, "none", 1e-12),
+        (COURTYARD, "none", 1e-12),
         # The adjustment ends where a step lowers the cost by less than 1e-5 of it.
-        (RING, True, 1e-5),
+        (RING, "seed", 1e-5),
     ],
 )
 def test_the_order_of_images_pairs_matches_and_points_does_not_matter(scene, adjust, most, tmp_path):
@@ -115,7 +115,7 @@ def test_reordering_changes_every_file_of_the_input(tmp_path):
 
 @pytest.mark.slow
 def test_no_variant_of_a_run_changes_a_byte(tmp_path):
-    assert list(determinism.differing_files(COURTYARD, tmp_path, always=("--bundle-adjust",))) == []
+    assert list(determinism.differing_files(COURTYARD, tmp_path, always=("--adjust", "full"))) == []
 
 
 WARM_UP = 10
