@@ -22,7 +22,8 @@ COMMANDS = """
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --bundle-adjust -q
     map data_synthetic/ring8/database.db {out}/averaged --averaging pycolmap -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
-    report {out}/located --scene
+    report {out}/located
+    convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q
     synth {out}/drive --shape drive --num-images 6 --num-points 300
     inspect data_synthetic/ring8/sparse/0 --theory

@@ -1,6 +1,7 @@
 """Flags are the fields of the settings classes, in their groups, and their help is each field's sentence."""
 
 import inspect
+import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -10,7 +11,6 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.executors import ExecutorKind
 from sfm_shapefit.settings import Settings, groups_of, option
 
 Options = TypeVar("Options", bound=Settings)
@@ -19,9 +19,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="MODEL", help="COLMAP model folder, binary or text; or a file of Bundler, openMVG or OpenSfM."
-    ),
+    typer.Argument(metavar="MODEL", help="COLMAP model folder, binary or text."),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
@@ -43,23 +41,27 @@ PriorsFile = Annotated[
         "folder of the images, for the GPS positions of their EXIF data.",
     ),
 ]
+
+
+def _check_executor(name: str) -> str:
+    """Refuse an executor that does not exist."""
+    if not re.fullmatch("serial|processes|dask(:.+)?", name):
+        raise typer.BadParameter(f"{name!r} is not one of serial, processes, dask, dask:ADDRESS")
+    return name
+
+
 ExecutorName = Annotated[
-    ExecutorKind,
+    str,
     typer.Option(
         "--executor",
-        help="Who measures pairs and triangulates tracks: this process, as many others as --threads says, or "
-        "a cluster of dask.",
+        metavar="serial|processes|dask[:ADDRESS]",
+        callback=_check_executor,
+        help="Where pairs are measured and tracks triangulated: in this process, in as many others as "
+        "--threads says, or on a cluster of dask, started here or that of a running scheduler's address.",
     ),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Scene = Annotated[
-    bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
-]
 Images = Annotated[
     Path | None,
     typer.Option(
@@ -101,7 +103,6 @@ class OutputFlags(Settings):
     config: str = option("", "Options from a TOML file; flags win over it.")
     overwrite: bool = option(False, "Replace an earlier output of this command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
-    scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
     images: str = option("", "Folder of the images: report.html has small pictures of them, 4 MB at most.")
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')

@@ -21,7 +21,6 @@ from sfm_shapefit.directions.pair_directions import DirectionStatus
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.graph_text import read_graph
-from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.diagnosis import Diagnosis, Theory, diagnose, theory_of
 from sfm_shapefit.settings import merge_options
@@ -97,7 +96,7 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = merge_options(options, LocateOptions, overrides)
-    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
+    if isinstance(source, Path | str) and Path(source).is_file():
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         graph = read_graph(source)

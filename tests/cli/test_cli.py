@@ -101,7 +101,7 @@ def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
     assert "solve" not in listed
-    assert run("view", "-h").stdout.startswith("Usage:")
+    assert run("report", "-h").stdout.startswith("Usage:")
 
 
 def test_help_lists_commands_in_groups_the_most_used_first():
@@ -475,9 +475,16 @@ def test_map_takes_a_folder_by_its_database_and_refuses_one_without(tmp_path):
     assert "without a database.db" in run_refused("map", RING_MODEL, tmp_path / "out")
 
 
-def test_what_is_not_installed_has_an_exit_code_of_its_own(ring_run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert "the viewer needs viser: pip install" in run_refused("view", ring_run[1], code=5)
+def test_what_is_not_installed_has_an_exit_code_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--executor", "dask", "-q", code=5)
+    assert "the executor dask needs dask.distributed: pip install" in said
+
+
+@pytest.mark.parametrize("name", ["threads", "dask:", "serial:1", "processes:2"])
+def test_an_executor_that_does_not_exist_is_refused_as_a_value(name, tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--executor", name, code=2).output
+    assert "serial, processes, dask, dask:ADDRESS" in said
 
 
 def test_the_values_that_flags_take_are_named_in_words():
