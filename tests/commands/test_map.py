@@ -10,8 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from abuse import determinism
-from abuse.verdicts import read_cameras
 from sfm_shapefit.colmap import triangulation
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.merge import merge_models
@@ -32,6 +30,8 @@ from sfm_shapefit.results.scene_words import describe_line, describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.abuse import determinism
+from tests.abuse.verdicts import read_cameras
 from tests.commands.test_execution import die_once
 from tests.program import run, run_python
 from tests.results.test_schema import problems
