@@ -192,7 +192,7 @@ _OTHERS = {
     "help/all": "--help",
     "help/version": "--version",
     **{
-        f"help/{command}": f"{command} --help"
+        f"help/{command}": f"{command} --help-all"
         for command in ("locate", "map", "solve", "inspect", "evaluate", "report", "convert", "synth")
     },
 }
