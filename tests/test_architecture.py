@@ -54,7 +54,6 @@ DOORS = {
         "synthetic/rendered_workspace.py",
     },
     "sqlite3": {"files/colmap/", "synthetic/workspace.py"},
-    "viser": {"report/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }
@@ -148,7 +147,7 @@ def test_only_the_command_that_is_called_is_loaded():
     code = "import sys; from sfm_shapefit.cli.root import load_commands; load_commands(sys.argv[1:]); "
     code += "print(*sorted(set(map('sfm_shapefit.cli.{}'.format, sys.argv[-1].split())) & set(sys.modules)))"
     every = "convert evaluate inspect locate map place report synth warm_up"
-    for words, loaded in (("locate", "locate"), ("--version view", "report"), ("warm-up", "warm_up")):
+    for words, loaded in (("locate", "locate"), ("--version report", "report"), ("warm-up", "warm_up")):
         done = run_python("-c", code, *words.split(), every)
         assert done.stdout.split() == [f"sfm_shapefit.cli.{loaded}"]
     for words in ("--help", "locat"):

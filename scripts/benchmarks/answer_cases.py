@@ -50,7 +50,7 @@ _PLACEMENT = {
 
 _LOCATE = {
     **_PLACEMENT,
-    **_name_flags("--min-trust 0", "--points never", "--points always", "--threads 1", "--scene"),
+    **_name_flags("--min-trust 0", "--points never", "--points always", "--threads 1"),
     **_name_flags(
         "--scale unit", "--scale input", "--scale prior", "--rotations free", "--no-adjust", "--bundle-adjust"
     ),
@@ -115,13 +115,13 @@ _SOLVE = {
     **{name: flags.replace("--solver", "--method") for name, flags in _PLACEMENT.items()},
     "default": "--json",
     "formats": "--g2o --1dsfm",
-    **_name_flags("--g2o", "--reverse", "--scene"),
+    **_name_flags("--g2o", "--reverse"),
     "rotations-txt": "--rotations graphs/1dsfm/rots.txt",
     "rotations-g2o": "--rotations graphs/poses.g2o",
     "max-rotation-error": "--max-rotation-error 0.3",
 }
 _SOLVED = {
-    "graph40.txt": f"{' '.join(_PLACEMENT)} formats reverse scene",
+    "graph40.txt": f"{' '.join(_PLACEMENT)} formats reverse",
     "random300.txt": " ".join(_PLACEMENT),
     "chain.txt": "objective-shapefit objective-lud objective-least-squares solver-admm no-refine",
     "pieces.txt": "objective-shapefit objective-least-squares formats solver-conic",
@@ -158,7 +158,7 @@ _WRONG = {
     "priors-of-others": "locate RING OUT --priors scenes/rig/priors.txt",
     "fix-unknown": "locate RING OUT --fix scenes/rig/fixed.txt",
     "config-unknown-key": "locate RING OUT --config wrong.toml",
-    "scheduler-without-dask": "locate RING OUT --scheduler tcp://127.0.0.1:1",
+    "unknown-executor": "locate RING OUT --executor threads",
     "solve-missing": "solve graphs/nowhere.txt OUT",
     "solve-malformed": "solve graphs/malformed.txt OUT",
     "solve-model": "solve RING OUT",
@@ -178,6 +178,8 @@ _OTHERS = {
     "convert/nerf": "convert RING OUT.json",
     "convert/tum": "convert RING OUT.tum",
     "convert/csv": "convert RING OUT.csv",
+    "convert/glb": "convert RING OUT.glb",
+    "convert/ply": "convert RING OUT.ply",
     **{
         f"synth/{shape}": f"synth OUT --shape {shape} --num-images 8 --num-points 300 "
         "--corrupted-pair-fraction 0.2"
@@ -190,8 +192,8 @@ _OTHERS = {
     "help/all": "--help",
     "help/version": "--version",
     **{
-        f"help/{command}": f"{command} --help"
-        for command in ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
+        f"help/{command}": f"{command} --help-all"
+        for command in ("locate", "map", "solve", "inspect", "evaluate", "report", "convert", "synth")
     },
 }
 _QUICK = (

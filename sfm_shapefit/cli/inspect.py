@@ -76,20 +76,13 @@ def inspect_command(
         if as_json:
             print_json(found.summary())
         else:
-            what = "node" if _is_graph(source) else "image"
+            what = "node" if source.is_file() else "image"
             print_table(f"{counted(found.num_images, what)} of {source}", _inspection_table(found))
             if not found.diagnosis.obstacle:
                 command = "place" if what == "node" else "locate"
                 print_steps([f"sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)
-
-
-def _is_graph(source: Path) -> bool:
-    """Tell a bare graph's file from a model, which may be another program's file."""
-    from sfm_shapefit.files.models import is_model_file
-
-    return source.is_file() and not is_model_file(source)
 
 
 def _inspection_table(found: "Inspection") -> Rows:

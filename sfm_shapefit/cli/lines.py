@@ -83,11 +83,6 @@ def picture_rows(flags: OutputFlags, names: Iterable[str]) -> Rows:
     return [("warning", f"{folder} has none of the images, so the report has no pictures")]
 
 
-def name_pictures(flags: OutputFlags) -> str:
-    """Name the pictures that were written, to follow the names of other files."""
-    return ", report.html" * flags.report + ", scene.glb, scene.ply" * flags.scene
-
-
 def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str]:
     """Return what to do next, a line each: look at the report, then the command that the report names."""
     from sfm_shapefit.report.first_screen import next_step

@@ -9,7 +9,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import further_piece_rows, name_pictures, next_steps
+from sfm_shapefit.cli.lines import further_piece_rows, next_steps
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
 
@@ -113,7 +113,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
         verdict=found.verdict,
         steps=next_steps(facts, out, flags),
         timings_s=found.timings_s,
-        written=f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
+        written=f"{out}: locate.json, cameras.csv, pairs.csv{', report.html' * flags.report}",
     )
 
 

@@ -10,7 +10,6 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.graph_text import read_graph
-from sfm_shapefit.files.models import is_model_file
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.doubts import confirm_rotations
@@ -97,7 +96,7 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = merge_options(options, LocateOptions, overrides)
-    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
+    if isinstance(source, Path | str) and Path(source).is_file():
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         graph = read_graph(source)

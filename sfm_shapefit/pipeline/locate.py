@@ -43,8 +43,8 @@ def locate(
         sfm_shapefit.write_result(found, "out")                 # the model, tables, and report.html
 
     Args:
-        reconstruction: a pycolmap.Reconstruction or a model folder, or a model file of Bundler, openMVG or
-            OpenSfM; nothing of it is changed, and its camera centers never place a camera.
+        reconstruction: a pycolmap.Reconstruction or a model folder; nothing of it is changed, and its camera
+            centers never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings, see `help(LocateOptions)`; defaults if None.

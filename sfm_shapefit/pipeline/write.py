@@ -1,4 +1,4 @@
-"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`, scenes if wanted.
+"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`.
 
 Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each. A
 bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `map.json` beside them; models
@@ -30,7 +30,6 @@ class WriteOptions(Settings):
         (), "Paths that the folder must not be or contain, beside the inputs of the result."
     )
     report: bool = option(True, "Write report.html, one page that explains the result and works offline.")
-    scene: bool = option(False, "Write scene.glb and scene.ply, cameras and points for any 3D viewer.")
     images: Path | str = option("", "Folder of the images, of which report.html is to have small pictures.")
 
 
@@ -102,8 +101,8 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     if isinstance(found, LocateResult) and found.doubtful_pairs:
         write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
     write_json(facts, folder / MARKER)
-    if options.report or options.scene:
-        _draw(found, folder, options)
+    if options.report:
+        _report(found, folder, options)
 
 
 def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
@@ -112,13 +111,12 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
     write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
     write_json(found.summary(), folder / MARKER)
-    if options.report or options.scene:
-        _draw(found, folder, options)
+    if options.report:
+        _report(found, folder, options)
 
 
-def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
-    """Write the report and the scenes that are wanted."""
-    from sfm_shapefit.report.mesh import write_meshes
+def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
+    """Write report.html."""
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.read_back import draw_result, read_output
     from sfm_shapefit.report.thumbnails import thumbnails_of
@@ -127,8 +125,4 @@ def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options
         drawing, facts = read_output(folder)
     else:
         drawing, facts = draw_result(found), found.summary()
-    if options.report:
-        pictures = thumbnails_of(drawing, options.images)
-        write_report(drawing, facts, folder / "report.html", pictures)
-    if options.scene:
-        write_meshes(drawing, folder)
+    write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))

@@ -10,8 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from abuse import determinism
-from abuse.verdicts import read_cameras
 from sfm_shapefit.adjustment import structure as triangulation
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
@@ -31,6 +29,8 @@ from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.abuse import determinism
+from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.pipeline.test_execution import die_once
 from tests.program import run, run_python

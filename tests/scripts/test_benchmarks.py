@@ -18,7 +18,7 @@ from tests.scenes import RING, ROOT, fingerprint
 SCRIPTS = ROOT / "scripts"
 PARTS = {"answer_cases", "answer_differences", "answer_inputs"}
 """Modules that belong to another one."""
-SECTIONS = sorted(set(INDEX) - {"answers", "reliability"})
+SECTIONS = sorted(set(INDEX) - {"answers"})
 
 
 def test_the_index_names_every_module_and_every_section_the_command_that_writes_it():

@@ -24,9 +24,8 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
-from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera, reconstruction_of
+from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.files.models import is_model_file, read_model_file
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.scene.posed_model import PosedModelFile
@@ -153,8 +152,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified; or a model file of Bundler,
-            openMVG or OpenSfM.
+            3.12 on, rigs and frames; or a reconstruction, which is not modified.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
@@ -164,8 +162,6 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     is_checked = False
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
-    elif is_model_file(source):
-        label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
     else:
         label, reconstruction = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"

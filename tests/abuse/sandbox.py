@@ -12,13 +12,11 @@ import resource
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import NamedTuple
 
 CPU_LIMIT_S = 10
-# Several times the former, for the machine may be shared.
+# Several times the processor time, for the machine may be shared.
 WALL_LIMIT_S = 90.0
 MEMORY_LIMIT_BYTES = 2_000_000_000
 
@@ -40,7 +38,7 @@ class Outcome(NamedTuple):
     stderr: str
     cpu_s: float
     peak_bytes: int
-    """Largest resident set, what the parent shares with the child included."""
+    """Largest resident set, including what the parent shares with the child."""
     deeds: tuple[str, ...]
     """What the child did outside the folders it may write to, and what nobody may do, from audit events."""
 
@@ -51,37 +49,24 @@ class Child(NamedTuple):
     pid: int
     logs: tuple[Path, ...]
 
-    def finish(self) -> Outcome:
+    def finish(self):
         """Wait for its end and tell how it ended."""
         _, status, usage = os.wait4(self.pid, 0)
-        texts = [log.read_text(encoding="utf-8", errors="replace") for log in self.logs]
+        stdout, stderr, deeds = (log.read_text(encoding="utf-8", errors="replace") for log in self.logs)
         for log in self.logs:
             log.unlink()
-        return Outcome(
-            code=os.waitstatus_to_exitcode(status),
-            stdout=texts[0],
-            stderr=texts[1],
-            cpu_s=usage.ru_utime + usage.ru_stime,
-            peak_bytes=usage.ru_maxrss * 1024,
-            deeds=tuple(texts[2].splitlines()),
-        )
+        cpu_s, peak_bytes = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
+        code = os.waitstatus_to_exitcode(status)
+        return Outcome(code, stdout, stderr, cpu_s, peak_bytes, tuple(deeds.splitlines()))
 
 
-def start_forked(
-    function: Callable[[], None],
-    work: Path,
-    writable: Sequence[Path],
-    *,
-    encoding: str = "utf-8",
-    logs: str = "log",
-) -> Child:
+def start_forked(function, work, writable, *, encoding="utf-8", logs="log"):
     """Call a function in a forked child, and return as soon as it is called.
 
     SystemExit gives the exit code, any other exception a traceback on stderr and code 1. The folder `work`
     becomes the working directory; what the child prints is kept beside it, and `logs` tells children apart.
     """
-    kinds = ("stdout", "stderr", "deeds")
-    paths = tuple(work.parent / f"{work.name}.{logs}.{kind}" for kind in kinds)
+    paths = tuple(work.parent / f"{work.name}.{logs}.{kind}" for kind in ("stdout", "stderr", "deeds"))
     ready, tell = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -92,21 +77,12 @@ def start_forked(
     return Child(pid, paths)
 
 
-def run_forked(
-    function: Callable[[], None], work: Path, writable: Sequence[Path], *, encoding: str = "utf-8"
-) -> Outcome:
+def run_forked(function, work, writable, *, encoding="utf-8"):
     """Call a function in a forked child and tell how it ended; see `start_forked`."""
     return start_forked(function, work, writable, encoding=encoding).finish()
 
 
-def _be_child(
-    function: Callable[[], None],
-    work: Path,
-    writable: Sequence[Path],
-    logs: Sequence[Path],
-    encoding: str,
-    ready: int,
-) -> None:
+def _be_child(function, work, writable, logs, encoding, ready):
     """Run the function and end the process; never returns."""
     code = 1
     try:
@@ -129,9 +105,9 @@ def _be_child(
         os._exit(code)
 
 
-def _redirect(logs: Sequence[Path], encoding: str) -> None:
+def _redirect(logs, encoding):
     """Send both standard streams to files, those of native code too."""
-    for number, log in zip((1, 2), logs, strict=False):
+    for number, log in ((1, logs[0]), (2, logs[1])):
         descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(descriptor, number)
         os.close(descriptor)
@@ -140,48 +116,52 @@ def _redirect(logs: Sequence[Path], encoding: str) -> None:
     sys.stderr = os.fdopen(2, "w", encoding=encoding, errors="backslashreplace", closefd=False)
 
 
-def _limit() -> None:
+def mapped_bytes():
+    """Return the size of this process's address space."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def _limit():
     """Bound processor time, wall-clock time and address space of this process."""
-    address_space = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limit = address_space + MEMORY_LIMIT_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, (mapped_bytes() + MEMORY_LIMIT_BYTES,) * 2)
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_LIMIT_S, CPU_LIMIT_S + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, WALL_LIMIT_S)
 
 
-def _loads_kernel() -> bool:
+def _loads_kernel():
     """Return whether a compiled kernel is loaded from its cache, which unpickles what it wrote itself."""
-    frame: FrameType | None = sys._getframe()
+    frame = sys._getframe()
     while frame is not None and not frame.f_code.co_filename.endswith("kernel_cache.py"):
         frame = frame.f_back
     return frame is not None
 
 
-def _watch(writable: Sequence[Path], log: int) -> None:
+def _watch(writable, log):
     """Write every deed that is not allowed to `log`."""
     allowed = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in writable)
 
-    def is_allowed(path: object) -> bool:
+    def is_allowed(path):
         if not isinstance(path, str | bytes | os.PathLike):
             return isinstance(path, int)  # a descriptor that was opened before, and judged then
         text = os.fsdecode(path)
         absolute = os.path.join(os.path.realpath(os.path.dirname(text) or "."), os.path.basename(text))
         return absolute.startswith(allowed) or absolute in _HARMLESS or absolute in map(str, writable)
 
-    def hook(event: str, arguments: tuple[object, ...]) -> None:
+    def hook(event, arguments):
+        touched = ()
         if event == "open":
             path, mode, flags = arguments
-            changes = isinstance(flags, int) and bool(flags & _WRITING)
-            changes = changes or (isinstance(mode, str) and any(letter in mode for letter in "wax+"))
-            if changes and not is_allowed(path):
-                os.write(log, f"open {path!r} {mode} {flags}\n".encode())
+            by_flags = isinstance(flags, int) and flags & _WRITING
+            by_mode = isinstance(mode, str) and any(letter in mode for letter in "wax+")
+            touched = (path,) if by_flags or by_mode else ()
         elif event in _CHANGING:
-            for path in arguments[: 2 if event in ("os.rename", "os.link") else 1]:
-                if not is_allowed(path):
-                    os.write(log, f"{event} {path!r}\n".encode())
+            touched = arguments[: 2 if event in ("os.rename", "os.link") else 1]
         elif event.startswith(_FORBIDDEN) and not (event == "pickle.find_class" and _loads_kernel()):
             os.write(log, f"{event} {arguments!r}\n".encode())
+        for path in touched:
+            if not is_allowed(path):
+                os.write(log, f"{event} {path!r}\n".encode())
 
     sys.addaudithook(hook)

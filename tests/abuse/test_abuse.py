@@ -1,4 +1,4 @@
-"""Hostile input, faults, determinism and many calls: `benchmark.py reliability` in small."""
+"""Hostile input, faults, determinism and many calls: short rounds of `python -m tests.abuse`."""
 
 import gc
 import os
@@ -8,23 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from abuse import determinism, verdicts
-from abuse.fuzz import make_base
 from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.write import write_result
+from tests.abuse import determinism, verdicts
+from tests.abuse.fuzz import make_base
 from tests.program import run_python
-from tests.scenes import COURTYARD, FACADE, RING, ROOT
-
-SCRIPTS = ROOT / "scripts"
-ENVIRONMENT = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
-
-
-def reliability(*arguments):
-    return run_python(SCRIPTS / "benchmark.py", "reliability", *arguments, **ENVIRONMENT)
+from tests.scenes import COURTYARD, FACADE, RING
 
 
 def test_damaged_inputs_end_in_a_correct_result_or_one_sentence():
-    done = reliability("fuzz", "--cases", 40, "--seed", 44)  # among them every kind of damage at least twice
+    # Every kind of damage is among them, at least twice.
+    done = run_python("-m", "tests.abuse", "fuzz", "--cases", 40, "--seed", 0)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "40 cases, 0 failed" in done.stdout
 
@@ -32,7 +26,7 @@ def test_damaged_inputs_end_in_a_correct_result_or_one_sentence():
 SINS = """
 import os, signal, sys
 from pathlib import Path
-from abuse import sandbox, verdicts
+from tests.abuse import sandbox, verdicts
 
 def traceback(): raise ZeroDivisionError
 def crash(): os.kill(os.getpid(), signal.SIGSEGV)
@@ -58,7 +52,7 @@ for sin in (traceback, crash, outside, network, shell, memory, chatter, loop, go
 
 def test_the_sandbox_sees_every_sin(tmp_path):
     (tmp_path / "work").mkdir()
-    done = run_python("-c", SINS, tmp_path / "work", **ENVIRONMENT)
+    done = run_python("-c", SINS, tmp_path / "work")
     assert done.returncode == 0, done.stderr
     seen = dict(line.split(": ", 1) for line in done.stdout.splitlines())
     words = {
@@ -88,7 +82,7 @@ def test_the_verdict_sees_a_changed_input_and_another_answer(tmp_path):
 
 
 def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
-    done = reliability("faults", "--moments", 2, "--cold", 0, "--rivals", 1)
+    done = run_python("-m", "tests.abuse", "faults", "--moments", 2, "--cold", 0, "--rivals", 1)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("held") == 9
 
