@@ -201,8 +201,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     sensors = dict(known.sensors)
     for done in (adjustment, seeded.adjusted):
         sensors |= {} if done is None else done.sensors
-    if options.refine_rigs and not sensors:
-        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out refine_rigs")
+    if options.rigs == "free" and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, placement.scale_sigma)
     located = located._replace(placement=placement, gauge=gauge)
@@ -258,7 +258,7 @@ def _place(
     placement = place_cameras(add_evidence(measured, source, directions, options), options, clock)
     if known.centers is not None:
         placement = _at_known_centers(placement, known, model, options)
-    given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
+    given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.rigs == "free")
     located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
     if known.priors is not None and options.refine_with_priors:
         located = pull_cameras(model, located, known.priors, options)
