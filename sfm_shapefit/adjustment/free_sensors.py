@@ -19,7 +19,7 @@ _SHARED_NOISE = 7.0
 _LARGEST_TURN_RAD = math.radians(1.0)
 _OPEN_SENSOR = (
     "the matches do not tell where {camera} is in its rig: its images see too little that others see too, or "
-    "the rig never turns; leave out refine_rigs, or give more frames"
+    "the rig never turns; leave out rigs=free, or give more frames"
 )
 
 

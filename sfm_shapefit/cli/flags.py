@@ -107,11 +107,11 @@ _PLACE = (
 _FIRST_SCREEN = {
     "locate": (
         *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
-        *("refine_intrinsics", "bundle_adjust", "scale", "images", "overwrite", "json", "threads"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "map": (
         *("priors", "control_points", "known_distance", "gravity", "without", "sequence", "join"),
-        *("refine_intrinsics", "bundle_adjust", "scale", "images", "overwrite", "json", "threads"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "place": _PLACE,
     "solve": _PLACE,

@@ -139,7 +139,7 @@ def intrinsics_warnings(intrinsics: Intrinsics, rows: list[CameraIntrinsics]) ->
             "undetermined",
             "which the matches do not tell: the scene is flat, or the camera hardly turns and shifts",
         ),
-        ("held", "which stays as it is: --refine-intrinsics auto, and an adjustment, would refine it"),
+        ("held", "which stays as it is: --intrinsics auto, and an adjustment, would refine it"),
     ):
         cameras = [str(row["camera"]) for row in guessed if row["decided_by"] == how]
         if cameras:

@@ -18,7 +18,8 @@ Rotations = Literal["auto", "held", "free"] | float
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "tracks"]
 KnownDistance = tuple[str, str, float]
-Refined = Literal["auto", "focal", "all", "none"]
+IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
+RigFreedom = Literal["held", "free"]
 Join = Literal["never", "safe"]
 Adjust = Literal["none", "seed", "full"]
 
@@ -99,18 +100,19 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "forgotten by the adjustment; a number, pulled to by that standard deviation about each axis in "
         'degrees; "auto" asks the matches how far off they are, and which cameras are turned.',
     )
-    refine_intrinsics: Refined = option(
+    intrinsics: IntrinsicsFreedom = option(
         "auto",
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
         'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
-        'their distortion too; "none", nothing. What was given pulls by its own weight, and stays where the '
+        'their distortion too; "held", nothing. What was given pulls by its own weight, and stays where the '
         "matches do not tell it. Cameras that images share stay shared.",
     )
-    refine_rigs: bool = option(
-        False,
-        "Let the adjustments change where sensors stand in their rigs, each by one pose for all frames. "
-        "The reference sensors stay, and so does the mean distance of the others from them: the scale is "
-        "still that of the rigs. Refused where the matches do not tell a sensor's pose.",
+    rigs: RigFreedom = option(
+        "held",
+        'Where sensors stand in their rigs: "held", where they are; "free", the adjustments change it, each '
+        "by one pose for all frames. The reference sensors stay, and so does the mean distance of the others "
+        "from them: the scale is still that of the rigs. Refused where the matches do not tell a sensor's "
+        "pose.",
     )
     min_trust: float = option(
         0.6,
@@ -131,10 +133,10 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
-        if self.refine_intrinsics in ("focal", "all") and self.adjust == "none":
-            raise ValueError("refine_intrinsics needs an adjustment; leave out adjust=none")
-        if self.refine_rigs and self.adjust == "none":
-            raise ValueError("refine_rigs needs an adjustment; leave out adjust=none")
+        if self.intrinsics in ("focal", "all") and self.adjust == "none":
+            raise ValueError(f"intrinsics={self.intrinsics} needs an adjustment; leave out adjust=none")
+        if self.rigs == "free" and self.adjust == "none":
+            raise ValueError("rigs=free needs an adjustment; leave out adjust=none")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
 

@@ -165,7 +165,7 @@ def focal_warnings(
 ) -> Iterator[str]:
     """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
     for doubt in doubts:
-        advice = "--refine-intrinsics focal lets it change"
+        advice = "--intrinsics focal lets it change"
         if doubt.camera in tried:
             advice = "the adjustment could not tell, so calibrate that camera"
         focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())

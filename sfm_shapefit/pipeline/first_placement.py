@@ -77,7 +77,7 @@ def adjust_first_placement(
     seed = seed_of(source, located)
     del directions, measured  # arrays of all pairs
     tracks = partial(read_tracks, source, located, seed, clock.advance)
-    given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
+    given = GivenPoses(lenses=lenses, free_rigs=options.rigs == "free")
     adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)

@@ -26,19 +26,19 @@ def settle_intrinsics(
         model: as given, of which nothing changes.
         inputs: whose database, if there is one, says which intrinsics are guesses; pairs that are left out
             say nothing of focal lengths.
-        options: `refine_intrinsics`.
+        options: `intrinsics`.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    wanted, database = options.refine_intrinsics, inputs.database
+    wanted, database = options.intrinsics, inputs.database
     guessed = {} if database is None else find_uncalibrated(database, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
     origins |= {i: found.origin for i, found in guessed.items()}
-    doubts = {} if wanted == "none" else doubt_lenses(cameras, origins)
+    doubts = {} if wanted == "held" else doubt_lenses(cameras, origins)
     factors = {}
-    if database is not None and guessed and wanted != "none":
+    if database is not None and guessed and wanted != "held":
         asked = [found.database_id for found in guessed.values()]
         by_database = calibrate_view_graph(database, asked, inputs.left_out)
         factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}

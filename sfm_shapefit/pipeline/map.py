@@ -164,8 +164,8 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         unposed = read_model(images.reconstruction)
         frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
         if not _has_shared_frames(frame_of_image):
-            if options.refine_rigs:
-                raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
+            if options.rigs == "free":
+                raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
             if options.scale == "rig":
                 raise InputError(
                     f"{path} has no rig of several cameras to take the scale from; use another scale"
@@ -417,7 +417,7 @@ class _Run(NamedTuple):
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = _has_shared_frames(self.frame_of_image[members])
-        settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
+        settings["rigs"] = settings["rigs"] if has_rigs else "held"
         if settings["scale"] == "rig" and not has_rigs:  # that of other components
             settings["scale"] = "auto"
         is_told = bool(known or has_priors or has_rigs or self.options.control_points)

@@ -61,8 +61,8 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
-    if options.refine_rigs and not model.has_rigs:
-        raise InputError("the model has no rig of several cameras to refine; leave out refine_rigs")
+    if options.rigs == "free" and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
     if count and has_priors:
         raise InputError(
             "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"

@@ -149,7 +149,7 @@ def of_further_piece(options: LocateOptions) -> LocateOptions:
         control_points="",
         fix="",
         refine_with_priors=False,
-        refine_rigs=False,
+        rigs="held",
     )
 
 
@@ -193,8 +193,8 @@ def finish_piece(
     sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
     for done in (stand.adjustment, seeded.adjusted):
         sensors |= {} if done is None else done.sensors
-    if options.refine_rigs and not sensors:
-        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out refine_rigs")
+    if options.rigs == "free" and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     model, directions = stand.source.model, stand.directions
@@ -248,7 +248,7 @@ def _start(
     rule = GaugeRule(model, told.rigid, options, told.priors)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
-    given = GivenPoses(lenses=told.intrinsics.free, free_rigs=options.refine_rigs)
+    given = GivenPoses(lenses=told.intrinsics.free, free_rigs=options.rigs == "free")
     located = Located(placement, everyone, gauge, told.rigid.fixed, rule, given)
     if told.priors is not None and options.refine_with_priors:
         located = pull_cameras(model, located, told.priors, options)

@@ -459,7 +459,7 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
 
 def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
     path = changed(RING, tmp_path, wrong_focal_length(1.01))
-    found = sfm_shapefit.map_database(path, refine_intrinsics="none", **FAST)
+    found = sfm_shapefit.map_database(path, intrinsics="held", **FAST)
     located = found.models[0].located
     assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
     assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)

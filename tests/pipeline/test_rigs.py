@@ -401,9 +401,9 @@ def disturbed(tmp_path_factory):
 def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(disturbed, way):
     scene, model, database = disturbed
     if way == "locate":
-        found = sfm_shapefit.locate(model, database, refine_rigs=True)
+        found = sfm_shapefit.locate(model, database, rigs="free")
     else:
-        found = sfm_shapefit.map_database(database, refine_rigs=True).models[0].located
+        found = sfm_shapefit.map_database(database, rigs="free").models[0].located
     said = np.array([pose.translation for pose in model.rig(1).non_ref_sensors.values()])
     (rig,) = found.reconstruction.rigs.values()
     poses = {sensor.id: pose for sensor, pose in rig.non_ref_sensors.items()}
@@ -453,17 +453,17 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
     write_workspace(scene, tmp_path / "facade")
     sentence = r"the matches do not tell where camera [34] is in its rig"
     with pytest.raises(InputError, match=sentence):
-        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", refine_rigs=True)
+        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", rigs="free")
     with pytest.raises(InputError, match=sentence):
-        sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", refine_rigs=True)
+        sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", rigs="free")
     for call in (
-        lambda: sfm_shapefit.map_database(RING / "database.db", refine_rigs=True),
-        lambda: sfm_shapefit.locate(RING / "sparse" / "0", refine_rigs=True),
+        lambda: sfm_shapefit.map_database(RING / "database.db", rigs="free"),
+        lambda: sfm_shapefit.locate(RING / "sparse" / "0", rigs="free"),
     ):
-        with pytest.raises(InputError, match="no rig of several cameras to refine; leave out refine_rigs"):
+        with pytest.raises(InputError, match="no rig of several cameras to refine; leave out rigs=free"):
             call()
-    with pytest.raises(ValueError, match="refine_rigs needs an adjustment"):
-        LocateOptions(refine_rigs=True, adjust="none")
+    with pytest.raises(ValueError, match="rigs=free needs an adjustment"):
+        LocateOptions(rigs="free", adjust="none")
 
 
 def keep_few_matches(connection):
