@@ -108,10 +108,11 @@ _OF_ALL = " ".join(name for name in _LOCATE if name not in _NOT_OF_ALL)
 _LOCATED = {
     "courtyard": _OF_ALL,
     "castle-P19": " ".join(name for name in _OF_ALL.split() if not name.startswith("control")),
-    "ring8": "tracks tracks-adjusted points-never distance priors fixed-names fixed-solved shapefit adjusted "
-    "control-adjusted",
+    "ring8": "tracks tracks-adjusted points-never distance priors fixed-names fixed-solved shapefit "
+    "adjusted control-adjusted",
     "ring8-guessed": "adjusted lenses-held lenses-focal lenses-all",
-    "facade9": "tracks-adjusted points-never priors priors-pull fixed-names fixed-solved control adjusted shapefit",
+    "facade9": "tracks-adjusted points-never priors priors-pull fixed-names fixed-solved control adjusted "
+    "shapefit",
     "photographed": "adjusted rotations-free rotations-held rotations-sigma unadjusted points-never "
     "fixed-names priors-pull shapefit unrefined thresholds control-adjusted lenses-all without-pairs",
     "photographed-guessed": "adjusted lenses-held lenses-focal lenses-all",
