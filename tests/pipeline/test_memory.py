@@ -136,6 +136,8 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
     economy = keep_within_memory(crowded, measured, options, ECONOMIES[0])[0]
     assert "not adjusted" in economy.statement
     assert not economy.adjustment
+    free = replace(options, rotations="free")  # which without an adjustment would have no effect
+    assert keep_within_memory(crowded, measured, free, ECONOMIES[0])[2] == free
     plenty = replace(options, max_memory_mb=10**6)
     assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[0].adjustment
 
