@@ -13,7 +13,7 @@ from pathlib import Path
 import pdoc
 
 NAMES = (
-    *("baselines", "colmap.model", "synthetic.rendered_workspace", "colmap.quiet", "synthetic.workspace"),
+    *("colmap.model", "synthetic.rendered_workspace", "colmap.quiet", "synthetic.workspace"),
     *(
         "placement.diagnosis",
         "directions",
@@ -33,7 +33,7 @@ NAMES = (
         "judgement",
         "solver",
     ),
-    *("synthetic", "synthetic.fixtures", "theory", "viewgraph"),
+    *("synthetic", "synthetic.fixtures", "viewgraph"),
 )
 MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
 

@@ -72,7 +72,7 @@ REFUSED = [
         for settings in OUT_OF_RANGE
         for name, value in OUT_OF_RANGE[settings]
     ),
-    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (PlacementOptions, {"objective": "l2"}, "shapefit"),
     (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
     (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
     (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
@@ -81,7 +81,6 @@ REFUSED = [
     (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-    (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
     (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
     (LocateOptions, {"rotations": "free", "adjust": False}, "matters only to an adjustment"),

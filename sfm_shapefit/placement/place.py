@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.heap import hand_back_memory
@@ -20,14 +19,14 @@ from sfm_shapefit.judgement.second_configuration import SecondConfiguration, fin
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.measured import MeasuredGraph
-from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
-from sfm_shapefit.refinement.options import Filter, PlacementOptions
+from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.rigs.groups import RigidGroups
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.solve import refuse_admm, solve_groups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -43,15 +42,13 @@ class Placement(Displayed):
 
     measured: MeasuredGraph
     """The whole graph."""
-    dropped: IntArray
-    """Its edges that the filter left out, ascending."""
     pieces: list[RigidPiece]
-    """The parallel-rigid pieces of the others, most cameras first; or the one of tied rigid groups."""
+    """Its parallel-rigid pieces, most cameras first; or the one of tied rigid groups."""
     piece: int
     """The one that is placed: 0, the largest, or one of the further ones."""
     certified: SolverResult
-    """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
-    `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
+    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to its
+    edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
@@ -123,11 +120,6 @@ class Placement(Displayed):
         return len(self.measured.pairs)
 
     @property
-    def considered(self) -> ViewGraph:
-        """The whole graph without the edges that the filter left out."""
-        return _drop_edges(self.graph, self.dropped)[0]
-
-    @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
         rejected = self.pairs[~self.assessment.inliers[self.pairs]]
@@ -140,7 +132,6 @@ class Placement(Displayed):
             "num_placed": len(self.nodes),
             "num_pairs": self.num_pairs,
             "num_pairs_rejected": len(self.rejected_pairs),
-            "num_pairs_filtered": len(self.dropped),
             "residual_level_deg": self.assessment.level_deg,
             "start": self.refined.start,
             "solve": self.certified.summary(),
@@ -195,8 +186,7 @@ def place(
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)
     options = merge_options(options, PlacementOptions, overrides)
-    dropped, pieces = _split(measured, options)
-    return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
+    return _place_piece(measured, _split(measured, options), 0, options, on_iteration)
 
 
 def place_further(placement: Placement, options: PlacementOptions | None = None) -> Iterator[Placement]:
@@ -212,7 +202,7 @@ def place_further(placement: Placement, options: PlacementOptions | None = None)
     options = options or PlacementOptions()
     for k in range(1, count_large(placement.pieces, placement.num_cameras)):
         try:
-            yield _place_piece(placement.measured, placement.dropped, placement.pieces, k, options)
+            yield _place_piece(placement.measured, placement.pieces, k, options)
         except UnsolvableError:
             continue
 
@@ -220,7 +210,6 @@ def place_further(placement: Placement, options: PlacementOptions | None = None)
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
 def _place_piece(
     measured: MeasuredGraph,
-    dropped: IntArray,
     pieces: list[RigidPiece],
     k: int,
     options: PlacementOptions,
@@ -234,7 +223,6 @@ def _place_piece(
     assessment, second = _judge(part, pieces[k].nodes, refined, options)
     return Placement(
         measured=measured,
-        dropped=dropped,
         pieces=pieces,
         piece=k,
         certified=solved,
@@ -262,22 +250,20 @@ def replace_locations(
     )
 
 
-def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:
-    """Return the edges that the filter leaves out, and the pieces of the others, most cameras first."""
+def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiece]:
+    """Return the pieces, most cameras first; or the one of tied rigid groups."""
     if measured.groups is not None:
-        refuse_options_of_groups(options)
-        return np.zeros(0, dtype=np.int64), [find_tied_piece(measured)]
-    dropped = _filter_pairs(measured, options.filter)
-    considered, edge_of = _drop_edges(measured.graph, dropped)
-    pieces = order_pieces(considered, measured.num_cameras)
-    refuse_without_triangle(considered, pieces, measured.num_cameras)
-    return dropped, [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
+        refuse_admm(options)
+        return [find_tied_piece(measured)]
+    pieces = order_pieces(measured.graph, measured.num_cameras)
+    refuse_without_triangle(measured.graph, pieces, measured.num_cameras)
+    return pieces
 
 
 def _solve_part(
     part: MeasuredGraph, options: PlacementOptions, on_iteration: OnIteration | None
 ) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
-    """Return the optimum of the convex program, or a baseline's answer, and the iterations that led to it."""
+    """Return the optimum of the convex program, and the iterations that led to it."""
     history: list[IterationInfo] = []
 
     def watch(info: IterationInfo) -> bool | None:
@@ -287,10 +273,8 @@ def _solve_part(
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
         solved = solve_groups(part.graph, part.groups, options, watched)
-    elif options.solves_shapefit:
-        solved = solve(part.graph, options, on_iteration=watched)
     else:
-        solved = solve_baseline(part.graph, options.objective)
+        solved = solve(part.graph, options, on_iteration=watched)
     return solved, tuple(history)
 
 
@@ -307,25 +291,6 @@ def _judge(
     )
     second = find_second_configuration(part.graph, part.pairs, assessment.inliers, assessment.level_deg)
     return assessment, None if second is None else replace(second, cameras=nodes[second.cameras])
-
-
-def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:
-    """Return the edges that a filter leaves out; it looks at pairs of cameras only."""
-    pairs = measured.pairs
-    if name == "none":
-        return pairs[:0]
-    dropped: IntArray = pairs[~FILTERS[name](measured.pair_graph)]
-    if len(dropped) == len(pairs):
-        raise UnsolvableError(
-            f"the filter {name} leaves none of the {len(pairs)} pairs; use another, or none"
-        )
-    return dropped
-
-
-def _drop_edges(graph: ViewGraph, dropped: IntArray) -> tuple[ViewGraph, IntArray]:
-    """Return a graph of the same nodes without some of its edges, and the index of each edge that is left."""
-    kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    return graph.subset(kept) if len(dropped) else graph, kept
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

@@ -17,7 +17,6 @@ from sfm_shapefit.rigidity import left_out_reasons
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
-_FILTERED = "left out by the filter"
 _OUTSIDE = "outside the pieces that are solved"
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
@@ -46,7 +45,7 @@ def camera_rows(
     for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
         for camera in placement.pieces[k].nodes.tolist():
             homes[camera] = k
-    reasons = left_out_reasons(placement.considered, placement.pieces)
+    reasons = left_out_reasons(graph, placement.pieces)
     folders: dict[int, list[str]] = {}
     for piece in further:
         for camera in piece.cameras.tolist():
@@ -142,10 +141,7 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     judged: dict[int, tuple[Placement, int, float]] = {}
     for piece in (placement, *further):
         dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
-        if not piece.certified.status.has_certificate:
-            dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
-    dropped = set(placement.dropped.tolist())
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
@@ -159,8 +155,7 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             inner = placement.groups is not None and bool(
                 placement.groups.group_of[i] == placement.groups.group_of[j]
             )
-            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
-            rows.append(replace(row, reason=_INNER if inner else elsewhere))
+            rows.append(replace(row, reason=_INNER if inner else _OUTSIDE))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

@@ -20,8 +20,9 @@ from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
+from sfm_shapefit.placement.tied_groups import is_scaled
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Extent of the fixed centers, of their distance from the origin, that counts as none.
@@ -76,7 +77,7 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
             f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
             "points"
         )
-    refuse_options_of_groups(options)
+    refuse_admm(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 
 from harness import ours
+from paper.baselines import locate_least_squares, locate_lud
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines import locate_least_squares, locate_lud
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import differences
