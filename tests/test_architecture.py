@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
 # Bottom first; the modules of a folder, and rooms on one floor, may import each other.
 LAYERS = [
-    {"errors", "arrays", "atomic_folder", "settings", "display", "extras", "wording", "heap"},
+    {"errors", "arrays", "atomic_folder", "settings", "display", "wording"},
     {"jit", "kernel_cache", "kernel_code", "executors"},
     {"geometry"},
     {"viewgraph"},

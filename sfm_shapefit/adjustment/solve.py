@@ -28,10 +28,9 @@ from sfm_shapefit.adjustment.residuals import (
     sum_losses,
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.settings import merge_options
 

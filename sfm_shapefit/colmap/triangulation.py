@@ -41,7 +41,7 @@ from sfm_shapefit.adjustment.triangulation import (
     joining_limits_px,
     triangulate_tracks,
 )
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
 from sfm_shapefit.colmap.adjustment import add_points, read_frames
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.colmap.seed import copy_without_points
@@ -49,7 +49,6 @@ from sfm_shapefit.colmap.structure import Advance, filter_in_place
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.colmap.tracks import TrackSource
 from sfm_shapefit.executors import answers
-from sfm_shapefit.heap import hand_back_memory
 
 # Tracks that are triangulated and become Python objects at a time; the answer does not depend on it.
 _TRACKS_A_BLOCK = 20_000

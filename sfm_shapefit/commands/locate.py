@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.commands.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjusted import AdjustedPlacement, Uncertainty

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.commands.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.other_programs import relative_poses_of
 from sfm_shapefit.colmap.rotation_averaging import average_rotations

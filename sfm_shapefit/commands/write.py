@@ -12,6 +12,7 @@ from typing import Any
 
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.colmap.seed import write_model
+from sfm_shapefit.display import draw_pages_by
 from sfm_shapefit.results.joins import JoinedModel
 from sfm_shapefit.results.map_result import MapResult
 from sfm_shapefit.results.result import FurtherPiece, GraphResult, LocateResult
@@ -114,6 +115,17 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_json(found.summary(), folder / MARKER)
     if options.report or options.scene:
         _draw(found, folder, options)
+
+
+def draw_page(found: LocateResult | GraphResult) -> str:
+    """Return the page of a result's report, as notebooks show it."""
+    from sfm_shapefit.report.page import report_html
+    from sfm_shapefit.report.read_back import draw_result
+
+    return report_html(draw_result(found), found.summary())
+
+
+draw_pages_by(draw_page)
 
 
 def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:

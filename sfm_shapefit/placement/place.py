@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray, hand_back_memory
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.judgement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread

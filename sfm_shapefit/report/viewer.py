@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.extras import MissingExtraError
+from sfm_shapefit.errors import MissingExtraError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners, input_centers
 from sfm_shapefit.report.first_screen import banner

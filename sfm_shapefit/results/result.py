@@ -12,7 +12,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
-from sfm_shapefit.display import Displayed
+from sfm_shapefit.display import Displayed, report_in_notebook
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
@@ -29,7 +29,6 @@ from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.results.key_figures import figure_rows
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
-from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
@@ -166,7 +165,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -372,7 +371,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sfm_shapefit.heap import hand_back_memory
+from sfm_shapefit.arrays import hand_back_memory
 from sfm_shapefit.solver.options import IterationInfo
 
 Progress = Callable[[str, int, int], None]

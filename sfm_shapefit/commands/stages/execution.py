@@ -26,9 +26,8 @@ from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.database_pairs import PairRows
 from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.matches import MatchBatch
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.errors import InputError, MissingExtraError
 from sfm_shapefit.executors import ExecutorKind, WorkerError, answers
-from sfm_shapefit.extras import MissingExtraError
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
 Measured = TypeVar("Measured")

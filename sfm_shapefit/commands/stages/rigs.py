@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray
+from sfm_shapefit.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import Placement, place

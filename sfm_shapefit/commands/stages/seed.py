@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, IntArray
+from sfm_shapefit.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.colmap.adjusted import Adjusted
 from sfm_shapefit.colmap.adjustment_run import GivenPoses
 from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
@@ -30,7 +30,6 @@ from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import KeypointMatches
 from sfm_shapefit.geometry import Similarity
-from sfm_shapefit.heap import hand_back_memory
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
