@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.certified import Departure, compare_with_certified
 from sfm_shapefit.facts.columns import Column, TableName, table_of
@@ -18,7 +18,6 @@ from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.facts.key_figures import figure_rows
-from sfm_shapefit.facts.notebook import notebook_html
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.summary import summarize_graph, summarize_model
@@ -164,7 +163,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -355,7 +354,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

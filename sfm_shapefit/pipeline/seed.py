@@ -13,9 +13,8 @@ from sfm_shapefit.adjustment.filter import filter_in_place
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import TrackSource, collect_matches
 from sfm_shapefit.adjustment.structure import triangulate_in_place
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.model import PosedModel
