@@ -72,7 +72,7 @@ EDITS = {
 # Command line: passes, solves, assessments, openings, conversions.
 COUNTS = {
     "locate COURTYARD/sparse/0 OUT": Counts(7, 1, 1, 3, 6),
-    "locate COURTYARD/sparse/0 OUT --adjust full": Counts(7, 1, 2, 3, 9),
+    "locate COURTYARD/sparse/0 OUT --adjust full": Counts(7, 1, 1, 3, 9),
     "locate RING/sparse/0 OUT --directions tracks": Counts(4, 1, 1, 0, 5),
     "locate RIGS/sparse/0 OUT": Counts(7, 1, 2, 3, 6),
     "locate HINGED/sparse/0 OUT --points never": Counts(7, 2, 2, 3, 7),
