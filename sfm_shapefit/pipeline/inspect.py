@@ -1,6 +1,6 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,12 @@ from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import (
+    Wanted,
+    add_evidence,
     build_graph,
-    collect_evidence,
     count_work,
-    measure_directions,
+    measure,
+    wants_points,
 )
 from sfm_shapefit.pipeline.memory import Forecast, describe_work, forecast
 from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
@@ -101,18 +103,18 @@ def inspect(
         inputs = choose_inputs(source, database, options.directions)
     with open_source(model, inputs) as matches:
         with clock("directions"):
-            directions = measure_directions(matches, options, clock)
+            measured = measure(matches, options, clock, Wanted(tracks=wants_points(matches, options)))
+            directions = measured.directions
         with clock("diagnosis"):
-            measured = build_graph(matches, directions, options)
-            measured = replace(measured, evidence=collect_evidence(directions))
-            grouped = group_frames(model, measured)
+            with_points = add_evidence(build_graph(model, measured), measured)
+            grouped = group_frames(model, with_points)
             work = describe_work(count_work(matches, directions), grouped, options)
             return Inspection(
                 directions=inputs.statement,
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
-                points=options.points_statement(model.num_images, measured.num_points),
-                diagnosis=diagnose(measured, options, confirm_rotations(matches, directions, options)),
+                points=options.points_statement(model.num_images, with_points.num_points),
+                diagnosis=diagnose(with_points, options, confirm_rotations(matches, directions, options)),
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),
             )

@@ -54,7 +54,14 @@ from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.measure import add_evidence, build_graph, count_work, measure_directions
+from sfm_shapefit.pipeline.measure import (
+    Wanted,
+    add_evidence,
+    build_graph,
+    count_work,
+    measure,
+    wants_points,
+)
 from sfm_shapefit.pipeline.memory import keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
 from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
@@ -122,16 +129,19 @@ def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock
         clock: of the run.
     """
     with clock("directions"):
-        directions = measure_directions(opened, options, clock, clock.executor)
+        wanted = Wanted(tracks=wants_points(opened, options), errors=opened.economy.samples)
+        measured = measure(opened, options, clock, wanted)
+    directions = measured.directions
     with clock("solve"):
-        measured = told.rigid.apply(build_graph(opened, directions, options))
+        graph = told.rigid.apply(build_graph(opened.model, measured))
         work = count_work(opened, directions)
-        economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
+        economy, graph, options = keep_within_memory(work, graph, options, opened.economy)
         source = opened.with_economy(economy)
-        measured = add_evidence(measured, source, directions, options)
-        near = None if told.near is None else told.near.stand
-        pieces = list(place_cameras(measured, options, clock, near))
+        graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
+        near = None if told.near is None else told.near.stand
+        pieces = list(place_cameras(graph, options, clock, near))
+        del graph
     models = []
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
         piece = pieces.pop(0)
