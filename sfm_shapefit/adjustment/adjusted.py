@@ -18,7 +18,7 @@ class RefinedLenses(NamedTuple):
     """What an adjustment makes of the lenses that it may change, by the ids of their cameras."""
 
     sigmas: Mapping[int, float]
-    """Standard deviation of the focal length, as a share of it; NaN where it is not known, as with Ceres."""
+    """Standard deviation of the focal length, as a share of it."""
     undetermined: tuple[int, ...]
     """Those whose focal length the points leave open: it is what was given."""
     free: FreeLenses = ALL_HELD
@@ -54,7 +54,7 @@ class Adjusted:
     iterations: int
     """Steps of all solves together."""
     uncertainty: Uncertainty
-    """Nothing is known with Ceres, and of large models."""
+    """Empty for models of more frames than are worth the time."""
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
     sensors: Mapping[int, SensorSigma] = field(default_factory=dict)

@@ -1,26 +1,20 @@
-"""Bundle adjustment from a seed: our own (`adjustment_run`), or pycolmap's Ceres (`ceres_adjustment`)."""
+"""Bundle adjustment of reconstructions: from a seed by all points, on few tracks, or after a placement."""
 
-import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 
 import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentOptions
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement, RefinedLenses, Uncertainty
-from sfm_shapefit.adjustment.ceres_adjustment import adjust_by_ceres
+from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.adjustment.filter import filter_points
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
+from sfm_shapefit.adjustment.free_sensors import NO_SENSORS
 from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
-from sfm_shapefit.adjustment.sources import TrackSource, read_bundle
-from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.adjustment.views import read_frames, rotations_of_frames
-from sfm_shapefit.tracks.options import Adjuster, StructureOptions
-
-# Of the last round of Ceres, by which its answer is judged.
-_CERES_LOSS_PX = 1.0
+from sfm_shapefit.adjustment.sources import TrackSource
+from sfm_shapefit.adjustment.views import rotations_of_frames
+from sfm_shapefit.tracks.options import StructureOptions
 
 
 def bundle_adjust(
@@ -28,7 +22,6 @@ def bundle_adjust(
     tracks: TrackSource,
     structure_options: StructureOptions | None = None,
     *,
-    adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
     given: GivenPoses | None = None,
 ) -> Adjusted:
@@ -38,59 +31,35 @@ def bundle_adjust(
         seed: the placed images; any points are ignored, for `tracks` are triangulated at its poses.
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None.
-        adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: what is known of poses, and how it is treated; nothing if None, and with Ceres. Lenses that may
-            change are free with both.
+        given: what is known of poses and lenses, and how it is treated; nothing if None.
 
     Returns:
-        The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
-        frames, rigs and known centers do not hold stays near the seed's: by our own, the centers' best
-        similarity to the seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs
-        stay what they are, and intrinsics that are not free to the bit.
+        The adjusted model, with ids and colors of points as from `triangulate`. The gauge stays the seed's
+        where fixed frames, rigs and known centers leave it open: the best similarity of the centers to the
+        seed's is the identity. Sensors and intrinsics that are not free stay what they are to the bit.
 
     Raises:
-        UnsolvableError: if no point can be triangulated, or Ceres diverges.
+        UnsolvableError: if no point can be triangulated.
     """
     structure_options, given = structure_options or StructureOptions(), given or GivenPoses()
-    if adjuster == "ceres":
-        start = triangulate(seed, tracks, structure_options)
-        initial_error_px = start.compute_mean_reprojection_error()
-        unfiltered, iterations, converged = adjust_by_ceres(
-            start, tracks, structure_options, fixed_frames, given.lenses, free_rigs=given.free_rigs
-        )
-        uncertainty, sensors = Uncertainty(), _judge_sensors_of_ceres(unfiltered, fixed_frames, given)
-        refined = RefinedLenses(dict.fromkeys(given.lenses.with_free_focal(), math.nan), (), given.lenses)
-    else:
-        run = AdjustmentRun(seed, tracks, structure_options, fixed_frames, given)
-        run.weight = given.weight_of(run.frames.frame_ids)
-        if given.model is not None:
-            run.given_rotations = rotations_of_frames(given.model, run.frames.frame_ids)
-        unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
-        iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
-        refined, sensors = run.refined, run.judge_sensors(last)
+    run = AdjustmentRun(seed, tracks, structure_options, fixed_frames, given)
+    run.weight = given.weight_of(run.frames.frame_ids)
+    if given.model is not None:
+        run.given_rotations = rotations_of_frames(given.model, run.frames.frame_ids)
+    unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
+    uncertainty, sensors = run.uncertainty(last), run.judge_sensors(last)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
         initial_error_px=initial_error_px,
         final_error_px=answer.compute_mean_reprojection_error(),
-        converged=converged,
-        iterations=iterations,
+        converged=run.converged,
+        iterations=run.iterations,
         uncertainty=uncertainty,
-        lenses=refined,
+        lenses=run.refined,
         sensors=sensors,
     )
-
-
-def _judge_sensors_of_ceres(
-    adjusted: pycolmap.Reconstruction, fixed_frames: Collection[int], given: GivenPoses
-) -> Mapping[int, SensorSigma]:
-    """Return how well the free sensors of a model that Ceres has adjusted are known."""
-    frames = read_frames(adjusted, fixed_frames, free_rigs=given.free_rigs)
-    if not frames.free_sensors:
-        return NO_SENSORS
-    options = AdjustmentOptions(loss_scale_px=_CERES_LOSS_PX)
-    return judge_sensors(frames, read_bundle(adjusted, frames)[1], options)
 
 
 def adjust_thinly(

@@ -43,7 +43,6 @@ from sfm_shapefit.adjustment import (
     reprojection_errors_px,
 )
 from sfm_shapefit.adjustment.adjusted import RefinedLenses, Uncertainty
-from sfm_shapefit.adjustment.ceres_adjustment import refuse_without_points
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
 from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
@@ -181,7 +180,7 @@ class AdjustmentRun:
     ) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
         """Return tracks and points at the pixel threshold, as `triangulate` does, and the problem of all."""
         joined, found = self._triangulate(1.0, checked=checked)
-        refuse_without_points(len(found.points))
+        _refuse_without_points(len(found.points))
         return joined, found, self.frames.problem(joined, found)
 
     def _of_checked_points(self, problem: AdjustmentProblem) -> AdjustmentProblem:
@@ -198,7 +197,7 @@ class AdjustmentRun:
         self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
-        refuse_without_points(len(found.points))
+        _refuse_without_points(len(found.points))
         thin = tracks.of_points(found.points_seen)
         images = self.frames.images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, len(self.frames.image_ids), times)
@@ -362,7 +361,7 @@ class AdjustmentRun:
         """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
         joined, found = self._triangulate(1.0, checked=True)
         loosely, loose = self._triangulate(_THIN_LIMIT, checked=True)
-        refuse_without_points(len(loose.points))
+        _refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self._adjust_by_few(self._thin_problem(loosely, loose))
@@ -372,6 +371,15 @@ class AdjustmentRun:
         colors = None if isinstance(tracks, MatchedKeypoints) else tracks
         add_points(answer, self.frames, joined, found, colors)
         return answer, initial_error_px, adjusted
+
+
+def _refuse_without_points(num_points: int) -> None:
+    """Raise UnsolvableError if there is no point to adjust."""
+    if num_points == 0:
+        raise UnsolvableError(
+            "no 3D point can be triangulated at these camera positions, so there is nothing to adjust; "
+            "run with --no-adjust and without --bundle-adjust"
+        )
 
 
 def _mean_error_px(problem: AdjustmentProblem) -> float:

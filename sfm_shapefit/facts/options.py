@@ -12,7 +12,7 @@ from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.rotations.options import Averaging, Sequencing
-from sfm_shapefit.tracks.options import Adjuster, StructureOptions
+from sfm_shapefit.tracks.options import StructureOptions
 
 Rotations = Literal["auto", "measured", "free"]
 Points = Literal["auto", "never", "always"]
@@ -106,11 +106,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         False,
         "Refine poses and points by bundle adjustment from the seed; intrinsics as refine_intrinsics says.",
     )
-    adjuster: Adjuster = option(
-        "own",
-        "What adjusts if bundle_adjust is asked for: our own, whose answer is the same bit by bit and "
-        "several times faster, or pycolmap's Ceres.",
-    )
     refine_intrinsics: Refined = option(
         "auto",
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
@@ -147,8 +142,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
         if self.refine_rigs and not (self.adjust or self.bundle_adjust):
             raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
-        if self.adjuster != "own" and not self.bundle_adjust:
-            raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if (

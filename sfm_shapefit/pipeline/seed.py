@@ -120,14 +120,7 @@ def build_seeded_model(
             seeded = seed
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(
-                seed,
-                tracks,
-                options,
-                adjuster=options.adjuster,
-                fixed_frames=frames,
-                given=located.given,
-            )
+            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames, given=located.given)
             seeded = adjusted.reconstruction
             del tracks
     hand_back_memory()  # of the tracks, before their matches are read again
@@ -146,7 +139,7 @@ def build_seeded_model(
     if poor:
         lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
         located = located._replace(kept=located.kept & ~lost)
-    is_held = located.given.centers is not None and options.adjuster == "own"
+    is_held = located.given.centers is not None
     if (adjusted is not None or poor) and not is_held:
         seeded, gauge = _set_gauge(seeded, source.model, located)
     elif gauge.axes is not None:

@@ -83,7 +83,6 @@ REFUSED = [
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
     (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
-    (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
     (LocateOptions, {"rotations": "free", "adjust": False}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
     (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),

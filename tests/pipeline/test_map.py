@@ -237,7 +237,6 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
         (["--rotations", "measured"], "map finds the rotations itself"),
         (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
         (["--rotations", "exact"], "'exact' is not one of"),
-        (["--adjuster", "ceres"], "adjuster has no effect without bundle_adjust"),
         (["--min-points-per-image", "-1"], "min_points_per_image must be"),
     ],
 )

@@ -1,10 +1,10 @@
 """Where pycolmap's own messages go: nowhere, unless the caller wants to hear them.
 
-pycolmap logs through glog, resets its level in every bundle adjustment, and links Ceres and CHOLMOD, which
-have no level at all. So three things are silenced, each only as long as a call that needs it:
+pycolmap logs through glog, resets its level in some calls, and links Ceres and CHOLMOD, which have no level
+at all. So three things are silenced, each only as long as a call that needs it:
 
     quiet_log       glog's level                     calls that read
-    quiet_stderr    file descriptor 2                bundle adjustment, estimation
+    quiet_stderr    file descriptor 2                estimation, view graph calibration
     quiet_output    file descriptors 1 and 2         rotation averaging: CHOLMOD writes to stdout
 
 The one switch for all is `hear_pycolmap`; it holds for the code that runs inside it, and not for other
@@ -37,11 +37,6 @@ def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
         yield
     finally:
         _heard.reset(token)
-
-
-def is_heard() -> bool:
-    """Return whether pycolmap's messages are let through."""
-    return _heard.get()
 
 
 @contextmanager
