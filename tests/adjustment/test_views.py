@@ -9,7 +9,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
+from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly, bundle_adjust
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
@@ -18,6 +18,7 @@ from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks, rea
 from sfm_shapefit.adjustment.views import read_frames, with_points, with_poses
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.scene import lens
 from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
@@ -282,7 +283,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert found.lenses.undetermined == ()
     assert 0.0 < found.lenses.sigmas[1] < 0.01
-    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
     held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert 1 not in held.lenses.sigmas
@@ -291,7 +292,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
     again = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=held.lenses.free))
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
-    monkeypatch.setattr(free_lenses, "_MOST_DISTORTION", 0.0)
+    monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
     held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
     assert held.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == given
@@ -301,7 +302,7 @@ def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monk
     truth = scene("PINHOLE")
     start = disturbed(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
     found = adjust_placement(
         start, matches_of(truth), StructureOptions(), None, given=GivenPoses(lenses=free)
     )
