@@ -12,7 +12,7 @@ from sfm_shapefit.adjustment import AdjustmentProblem
 from sfm_shapefit.adjustment.views import CUBE, PosedFrames, read_frames
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.lenses import focal_length_px, is_adjusted
+from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
@@ -160,13 +160,13 @@ def _look_up(
         image = reconstruction.image(frames.image_ids[k])
         camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
         xy = points2d_xy(image)[keypoints[own]]
-        if is_adjusted(camera):
+        if lens_of(camera).is_adjustable:
             pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
             continue
         rays = camera_rays(camera, xy)
         view = np.argmax(rays @ CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
         local = np.einsum("mab,mb->ma", CUBE[view], rays)
         on_plane[own] = local[:, :2] / local[:, 2:]
-        pixels[own] = focal_length_px(camera) * on_plane[own]
+        pixels[own] = lens_of(camera).focal_px * on_plane[own]
         cameras[own] += view
     return cameras, pixels, on_plane

@@ -16,7 +16,7 @@ import pycolmap
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.files.colmap.lenses import is_adjusted, lens_of
+from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
@@ -129,7 +129,7 @@ def read_frames(
     translations = np.array([_pose(reconstruction.frame(i)).translation for i in frame_ids]).reshape(-1, 3)
     camera_ids = sorted({image.camera_id for image in images})
     views = {i: _views(reconstruction.camera(i)) for i in camera_ids}
-    lenses = tuple(lens_of(reconstruction.camera(i)) for i in camera_ids)
+    lenses = tuple(_lens(reconstruction.camera(i)) for i in camera_ids)
     sensors = [_sensor_from_rig(reconstruction, image) for image in images]
     counts = np.array([len(views[image.camera_id]) for image in images], dtype=np.int64)
     of_image = np.repeat(np.arange(len(images)), counts)
@@ -280,9 +280,13 @@ def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
 
 def _views(camera: pycolmap.Camera) -> FloatArray:
     """Return the views of a camera, (v, 3, 3) view_from_camera: itself if it is adjusted as it is."""
-    if is_adjusted(camera):
-        return np.eye(3)[None]
-    return CUBE
+    return np.eye(3)[None] if lens_of(camera).is_adjustable else CUBE
+
+
+def _lens(camera: pycolmap.Camera) -> Lens:
+    """Return the lens of a camera, or that of its views."""
+    lens = lens_of(camera)
+    return lens if lens.is_adjustable else Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True)
 
 
 def _is_reference(reconstruction: pycolmap.Reconstruction, image: pycolmap.Image) -> bool:

@@ -1,4 +1,6 @@
-"""Lenses: the intrinsics of COLMAP's models that are cases of OPENCV, and how far given ones may be off.
+"""Lenses of any of COLMAP's models, those that an adjustment may change, and how far given ones may be off.
+
+What is adjusted are the five cases of OPENCV:
 
 u = x/z, v = y/z, s = u^2 + v^2,
 pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
@@ -29,32 +31,54 @@ _PLACES = {
     "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
 }
 
+ADJUSTABLE_MODELS = tuple(_PLACES)
+"""The cases of OPENCV."""
+
+
+_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")
+"""How the names of models with a single focal length begin."""
+
 
 @dataclass(frozen=True, slots=True)
 class Lens:
     """The intrinsics that one or several cameras look through."""
 
     model: str
-    """SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
+    """COLMAP's name of it. What is said of OPENCV below holds for its cases only."""
     parameters: tuple[float, ...]
     """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
     fixed: bool = False
     """Whether it stays what it is even where focal lengths or distortion are free."""
     focal_fixed: bool = False
     """Whether its focal lengths stay even where they are free."""
+    id: int = 0
+    """COLMAP's id of the camera."""
+    width: int = 0
+    """Of the pictures, in pixels; 0 if unknown, as is the height."""
+    height: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse unknown models and impossible parameters."""
-        if self.model not in _PLACES:
-            known = ", ".join(_PLACES)
-            raise InputError(
-                f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
-            )
+        """Refuse impossible parameters of the cases of OPENCV; of other models any are taken."""
+        if not self.is_adjustable:
+            return
         wanted = len(_PLACES[self.model])
         if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
             raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
         if min(self.values()[:2]) <= 0.0:
             raise InputError("a lens has a focal length that is not positive; correct its parameters")
+
+    @property
+    def is_adjustable(self) -> bool:
+        """Whether the model is a case of OPENCV; images through others are undistorted to be adjusted."""
+        return self.model in _PLACES
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
+        if self.model == "EQUIRECTANGULAR":
+            return self.parameters[0] / (2.0 * np.pi)  # its width covers a full turn
+        has_one = self.model.startswith(_ONE_FOCAL_LENGTH)
+        return self.parameters[0] if has_one else 0.5 * (self.parameters[0] + self.parameters[1])
 
     def values(self) -> FloatArray:
         """Return the parameters of the same lens as OPENCV model, (8,)."""
