@@ -29,7 +29,7 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.known_positions import KnownPositions
-from sfm_shapefit.scene.lens import ADJUSTABLE_MODELS, NUM_VALUES, Lens
+from sfm_shapefit.scene.lens import NUM_VALUES, Lens
 
 _ORTHONORMAL = 1e-6  # largest entry of R R^T - I
 
@@ -136,9 +136,8 @@ class AdjustmentProblem:
         for name in ("cameras_seeing", "points_seen"):
             self._take(name, np.int64, (len(self.pixels),))
         _check_rotations(self.rotations, "rotation")
-        for model in {lens.model for lens in self.lenses if not lens.is_adjustable}:
-            known = ", ".join(ADJUSTABLE_MODELS)
-            raise InputError(f"lens model {model} cannot be adjusted; undistort it, or give one of {known}")
+        for lens in self.lenses:
+            lens.refuse_impossible()
         _check_range(self.points_seen, self.num_points, "point")
         _check_range(self.lens_of_camera, len(self.lenses), "lens")
         self._check_rig()

@@ -122,8 +122,7 @@ def with_rays_of(frames: PosedFrames, tracks: Tracks) -> Tracks:
     for k, own in enumerate(frames.lenses):
         rows = np.flatnonzero(lens == k)
         if not own.fixed and len(rows):
-            camera = pycolmap.Camera(model=own.model, width=1, height=1, params=list(own.parameters))
-            on_plane[rows] = np.asarray(camera.cam_from_img(tracks.pixels[rows])).reshape(-1, 2)
+            on_plane[rows] = own.undistort(tracks.pixels[rows])
     return replace(tracks, on_plane=on_plane)
 
 
