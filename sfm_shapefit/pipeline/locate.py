@@ -13,11 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.settings import merge_options
@@ -47,6 +45,7 @@ from sfm_shapefit.pipeline.adjustment import (
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import bring_to_control_points, read_control
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
+from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import (
@@ -145,15 +144,10 @@ class Locating(NamedTuple):
     rigid: Rigid
     priors: PositionPriors | None = None
     executor: Executor | None = None
-    centers: FloatArray | None = None
-    """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for those it lacks.
-    None if there was no adjustment."""
-    uncertainty: Uncertainty = Uncertainty()
-    """Of these centers, in their units."""
+    first: FirstPlacement | None = None
+    """Where an adjustment has the images, and how well it knows that; None if there was no adjustment."""
     intrinsics: Intrinsics = NO_DOUBTS
     """Which of the images' are in doubt, and what became of them so far."""
-    sensors: Mapping[int, SensorSigma] = NO_SENSORS
-    """Those that an adjustment has moved in their rigs so far, and how well it knows them."""
     rigs: Mapping[int, Any] | None = None
     """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
     control: ControlPoints | None = None
@@ -195,9 +189,9 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     seeded, of_gravity = turn_model_upright(seeded, source.model, known.gravity)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
+        placement = with_uncertainty(placement, model, seeded.adjusted, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
-    sensors = dict(known.sensors)
+    sensors = {} if known.first is None else dict(known.first.adjusted.sensors)
     for done in (adjustment, seeded.adjusted):
         sensors |= {} if done is None else done.sensors
     if options.refine_rigs and not sensors:
@@ -255,8 +249,8 @@ def _place(
     economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
     source = opened.with_economy(economy)
     placement = place_cameras(add_evidence(measured, source, directions, options), options, clock)
-    if known.centers is not None:
-        placement = _at_known_centers(placement, known, model, options)
+    if known.first is not None:
+        placement = _at_known_centers(placement, known.first, model, options)
     given = GivenPoses(lenses=known.intrinsics.free, free_rigs=options.refine_rigs)
     located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
     if known.priors is not None and options.refine_with_priors:
@@ -270,22 +264,21 @@ def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:
 
 
 def _at_known_centers(
-    placement: Placement, known: Locating, model: PosedModel, options: LocateOptions
+    placement: Placement, first: FirstPlacement, model: PosedModel, options: LocateOptions
 ) -> Placement:
     """Return the placement with its cameras where an adjustment had them, and how well it knew that.
 
     In units of the solver, those of the rigs are then as long as the adjustment has them, not as the
     directions had: all pixels say it better.
     """
-    assert known.centers is not None
-    centers = known.centers[placement.cameras]
+    centers = first.centers[placement.cameras]
     placed = bring_to_scale(placement, centers)
     there = np.isfinite(centers).all(axis=1)
     scale = median_spread(centers[there]) / median_spread(placed[there])
     moved = move_cameras(placement, placed, options)
     if moved.unit is not None:
         moved = replace(moved, unit=measure_unit(moved.measured_part(), moved.refined.locations))
-    return with_uncertainty(moved, model, known.uncertainty, scale)
+    return with_uncertainty(moved, model, first.adjusted, scale)
 
 
 class _Adjusted(NamedTuple):
@@ -294,7 +287,7 @@ class _Adjusted(NamedTuple):
     source: MatchSource
     directions: PairDirections
     located: Located
-    adjustment: AdjustedPlacement | None
+    adjustment: Estimate | None
     intrinsics: Intrinsics
 
 
@@ -308,17 +301,17 @@ def _adjust(
 ) -> _Adjusted:
     """Adjust the placed cameras, if that is wanted and was not done before."""
     before = _Adjusted(source, directions, located, None, known.intrinsics)
-    is_adjusted = known.centers is not None and located.given.centers is None
+    is_adjusted = known.first is not None and located.given.centers is None
     if is_adjusted or not options.adjusts_cameras(len(located.placement.cameras)):
         return before
-    weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
+    weight = weight_of_rotations(options) if known.first is None else RotationWeight()
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
         after = adjust_placed(source, directions, located, options, clock, weight)
         intrinsics = known.intrinsics.after(after.adjusted.lenses)
+        frames = source.model.images.frames
         given = located.given._replace(
-            weight=after.adjusted.weight,
-            weight_frames=after.adjusted.frame_ids,
-            model=source.model.reconstruction,
+            weight=after.adjusted.weight.among(after.part.frames, len(frames.ids)),
+            rotations=frames.rotations,
             lenses=intrinsics.free,
         )
         moved = located._replace(placement=after.placement, given=given)

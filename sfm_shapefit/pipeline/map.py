@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Uncertainty
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -374,17 +372,14 @@ class _Run(NamedTuple):
             inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options, self.opened) as averaged:
-            source, centers, uncertainty = averaged, None, Uncertainty()
-            intrinsics, sensors = self.intrinsics, NO_SENSORS
+            source, first, intrinsics = averaged, None, self.intrinsics
             if self.options.adjust:
                 with self.clock("first placement"):
                     rule = GaugeRule(model, rigid, options, priors)
                     first = adjust_first_placement(
                         averaged, rule, self.clock, intrinsics.free, executor=self.executor
                     )
-                centers, uncertainty = first.centers, first.adjusted.uncertainty
                 intrinsics = intrinsics.after(first.adjusted.lenses)
-                sensors = first.adjusted.sensors
                 source = averaged.turned(self._pose_as(image_ids, first))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             locating = Locating(
@@ -392,10 +387,8 @@ class _Run(NamedTuple):
                 rigid,
                 priors,
                 self.executor,
-                centers=centers,
-                uncertainty=uncertainty,
+                first=first,
                 intrinsics=intrinsics,
-                sensors=sensors,
                 rigs=sensors_of(model.reconstruction),
                 control=control,
                 gravity=gravity,
@@ -440,7 +433,7 @@ class _Run(NamedTuple):
 
     def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
         """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
-        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
         run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
         return run._pose(image_ids, first.rotations, first.parameters())
 

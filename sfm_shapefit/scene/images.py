@@ -15,10 +15,11 @@ an image of frame f through lens l, the coordinates
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.scene.lens import Lens
 
 
@@ -162,3 +163,15 @@ class Images:
     def with_sensors(self, rotations: FloatArray, translations: FloatArray) -> "Images":
         """Return the images with other poses of their sensors, (l, 3, 3) and (l, 3)."""
         return replace(self, sensors=replace(self.sensors, rotations=rotations, translations=translations))
+
+
+class Pictures(Protocol):
+    """The keypoints of images, by the images' rows."""
+
+    def count(self, image: int) -> int:
+        """Return how many keypoints an image has."""
+        ...
+
+    def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
+        """Return pixels (k, 2) and rays (k, 3), of any length, of keypoints; NaN for pixels without a ray."""
+        ...

@@ -7,7 +7,7 @@ import pytest
 from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.points import Pictures, add_points, move_points, points_of
+from sfm_shapefit.files.colmap.points import ModelPictures, add_points, move_model, points_of
 from sfm_shapefit.files.colmap.seed import copy_without_points
 from tests.adjustment.test_views import DISTORTIONS, scene
 from tests.files.test_colmap_writing import dump
@@ -111,7 +111,7 @@ def test_points_read_and_added_again_are_the_same():
     points, bare = points_of(model, images), copy_without_points(model)
     assert points.lengths().tolist() == [model.point3D(i).track.length() for i in points.ids.tolist()]
     add_points(bare, images, points, model)
-    move_points(bare, points)
+    bare = move_model(bare, images, points)
     errors = [[p.error for _, p in sorted(one.points3D.items())] for one in (bare, model)]
     np.testing.assert_allclose(*errors, rtol=1e-12)  # sums in the order of tracks
     for one in (bare, model):
@@ -126,7 +126,7 @@ def test_points_read_and_added_again_are_the_same():
 def test_rays_of_pictures_lead_back_to_their_pixels(name):
     model = scene(name)
     images = images_of(model)
-    pictures, camera = Pictures(model, images), model.camera(1)
+    pictures, camera = ModelPictures(model, images), model.camera(1)
     chosen = np.arange(0, pictures.count(2), 3)
     pixels, rays = pictures.look_up(2, chosen)
     known = [model.image(int(images.ids[2])).point2D(k).xy for k in chosen.tolist()]

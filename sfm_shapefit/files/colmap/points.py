@@ -3,15 +3,16 @@
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
 
-class Pictures:
-    """The points2D of the images of a reconstruction; an image is told by its row in `Images`."""
+class ModelPictures:
+    """The points2D of the images of a reconstruction, see `Pictures`."""
 
     def __init__(self, reconstruction: pycolmap.Reconstruction, images: Images) -> None:
         self._reconstruction, self._ids = reconstruction, images.ids.tolist()
@@ -20,11 +21,8 @@ class Pictures:
         """Return how many points2D an image has."""
         return int(self._reconstruction.image(self._ids[image]).num_points2D())
 
-    def look_up(self, image: int, keypoints: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (k, 2) and rays (k, 3), of any length, of points2D; NaN for pixels without a ray.
-
-        Rays through a lens that is a case of OPENCV have the depth 1.
-        """
+    def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
+        """Return pixels (k, 2) and rays (k, 3) of points2D; through a case of OPENCV, of depth 1."""
         own = self._reconstruction.image(self._ids[image])
         camera, xy = self._reconstruction.camera(own.camera_id), points2d_xy(own)[keypoints]
         if not lens_of(camera).is_adjustable:
@@ -76,8 +74,13 @@ def add_points(
         begin = end
 
 
-def move_points(reconstruction: pycolmap.Reconstruction, points: Points) -> None:
-    """Move points of our own `reconstruction`, and update the errors of all."""
+def move_model(
+    reconstruction: pycolmap.Reconstruction, images: Images, points: Points
+) -> pycolmap.Reconstruction:
+    """Return a copy with some images and points elsewhere, see `put_images`; all errors are updated."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    put_images(copy, images)
     for point_id, xyz in zip(points.ids.tolist(), points.xyz, strict=True):
-        reconstruction.point3D(point_id).xyz = xyz
-    reconstruction.update_point_3d_errors()
+        copy.point3D(point_id).xyz = xyz
+    copy.update_point_3d_errors()
+    return copy
