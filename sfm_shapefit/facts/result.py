@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
@@ -98,9 +98,9 @@ class LocateResult(Displayed):
     points."""
     gauge: Gauge
     """From the solver's units to the output's."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
-    adjustment: AdjustedPlacement | None
+    adjustment: Estimate | None
     """What became of the placement and of the given rotations, before any bundle adjustment; None if the
     placement stayed as it was found."""
     timings_s: dict[str, float]

@@ -428,7 +428,7 @@ class _Run(NamedTuple):
 
     def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
         """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
-        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
         run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
         return run._pose(image_ids, first.rotations, first.parameters())
 

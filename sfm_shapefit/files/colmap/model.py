@@ -24,9 +24,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
+from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.scene.posed_model import PosedModelFile
 
@@ -54,6 +56,8 @@ class PosedModel:
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
+    images: Images
+    """The same n images as arrays, in the same order."""
     image_ids: IntArray
     """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
@@ -137,6 +141,7 @@ def from_posed_cameras(scene: PosedModelFile) -> PosedModel:
         reconstruction.add_image_with_trivial_frame(image)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_of(reconstruction),
         image_ids=image_ids,
         names=scene.names,
         rotations=scene.rotations,
@@ -325,8 +330,10 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
+    images_as_arrays = images_of(reconstruction)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_as_arrays.part(np.flatnonzero(np.isin(images_as_arrays.ids, image_ids))),
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
         names=names,
         rotations=frozen(rotations),
