@@ -97,7 +97,7 @@ def compare(reconstruction: object, truth: Path) -> Errors:
 
 def flags(parser: argparse.ArgumentParser) -> None:
     add = partial(parser.add_argument, action="store_true")
-    add("--adjust", "full", help="also run with bundle adjustment, once")
+    add("--bundle-adjust", help="also run with bundle adjustment, once")
     add("--averaged", help="also on rotations from averaging, without and with the adjustment, once each")
 
 
