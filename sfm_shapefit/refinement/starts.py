@@ -249,7 +249,7 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 
 def _is_point(graph: ViewGraph, t: FloatArray) -> bool:
-    """Return whether most cameras of a start have collapsed to one point, where angles say nothing any more."""
+    """Return whether most cameras of a start stand in one point, where angles say nothing any more."""
     lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
     return bool(np.median(lengths) <= _POINT_LENGTH * np.mean(lengths))
 
