@@ -89,8 +89,9 @@ def test_lud_is_taken_if_asked_and_without_refinement_the_better_start_as_it_is(
 TRIANGLE = ViewGraph(3, [(0, 1), (1, 2), (2, 0)], normalized(np.eye(3) - np.roll(np.eye(3), -1, axis=0)))
 
 
-def start(name: str, locations=np.eye(3)) -> Start:
-    return Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
+def start(name: str, locations=None) -> Start:
+    there = np.eye(3) if locations is None else locations
+    return Start(name=name, locations=there, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
 
 
 @pytest.mark.parametrize(
