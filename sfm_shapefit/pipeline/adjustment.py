@@ -17,7 +17,7 @@ from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
+from sfm_shapefit.files.colmap.model import PosedModel, turned_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
@@ -26,7 +26,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.seed import Located, PosedPart, as_written, posed_images, read_links, seed_of
+from sfm_shapefit.pipeline.seed import Located, PosedPart, pose_images, posed_part, read_links
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
@@ -93,19 +93,15 @@ def adjust_placed(
     """
     model, placement = source.model, located.placement
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    seed = seed_of(source, everyone)
-    posed = posed_images(seed, model)
-    links = read_links(source, everyone, seed, posed, clock.advance)
+    posed = posed_part(pose_images(model, everyone))
+    links = read_links(source, everyone, posed, clock.advance)
     adjusted = adjust_placement(posed.images, links, options, weight, located.given_of(posed, model))
     del links
-    _, written = as_written(seed, adjusted.images)
-    centers = np.full((model.num_images, 3), np.nan)
-    centers[posed.rows] = written
-    centers = centers[placement.cameras]
-    similarity = located.gauge.similarity
-    locations = (centers - similarity.translation) / similarity.scale
+    similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
+    centers[posed.rows] = adjusted.images.centers
+    locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.turned(with_frame_rotations(model, seed))
+        source = source.turned(turned_model(model, adjusted.images))
         corrected = posed.frames[adjusted.weight.singled_out(len(posed.frames))]
         is_corrected = np.isin(model.images.frame_of, corrected)
         directions = _measure_again(source, directions, is_corrected, options, clock)

@@ -21,7 +21,7 @@ from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.rigs import place_cameras
-from sfm_shapefit.pipeline.seed import Located, as_written, posed_images, read_links, seed_of
+from sfm_shapefit.pipeline.seed import Located, pose_images, posed_part, read_links
 from sfm_shapefit.placement.gauge import unit_gauge
 from sfm_shapefit.placement.place import Near
 
@@ -74,15 +74,13 @@ def adjust_first_placement(
     if placement.unit is not None:  # the offsets of sensors have theirs
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
-    seed = seed_of(source, located)
     del graph
-    posed = posed_images(seed, model)
-    links = partial(read_links, source, located, seed, posed, clock.advance)
+    posed = posed_part(pose_images(model, located))
+    links = partial(read_links, source, located, posed, clock.advance)
     given = GivenPoses(lenses=lenses, free_rigs=options.rigs == "free")
     adjusted = adjust_thinly(posed.images, links, options, given, thorough=thorough)
-    there = as_written(seed, adjusted.images)
     rotations, centers = model.rotations.copy(), np.full((model.num_images, 3), np.nan)
-    rotations[posed.rows], centers[posed.rows] = there
+    rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(model.num_images), posed.rows)
     stand = Near(centers, placement.refined)
     return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, is_posed), stand)

@@ -12,12 +12,12 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
+from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
-from sfm_shapefit.files.colmap.images import images_of, put_images
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.own_tracks import triangulate_own_tracks
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
@@ -153,10 +153,11 @@ def _make_points(
         options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
     )
     with clock("structure"):
-        seed = seed_of(source, located)
-        posed = posed_images(seed, model)
+        images = pose_images(model, located)
+        seed = build_seed(model, images, None if source.database is None else source.database.keypoints)
+        posed = posed_part(images)
         if own is None or options.adjust == "full":
-            links = read_links(source, located, seed, posed, clock.advance)
+            links = read_links(source, located, posed, clock.advance)
     with clock("bundle adjustment" if options.adjust == "full" else "triangulation"):
         if options.adjust == "full":  # which triangulates at the seed's poses itself
             assert links is not None
@@ -215,19 +216,8 @@ def _state(before: Gauge, after: Gauge) -> str:
     return f"{after.statement}{mark}{pulled}"
 
 
-def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":
-    """Return the model with its cameras moved, without points."""
-    model, placement = source.model, located.placement
-    is_placed = np.zeros(model.num_images, dtype=np.bool_)
-    is_placed[located.cameras] = True
-    centers = np.full((model.num_images, 3), np.nan)
-    centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
-    keypoints = None if source.database is None else source.database.keypoints
-    return build_seed(model, is_placed, centers, keypoints, located.fixed)
-
-
 class PosedPart(NamedTuple):
-    """The posed images of a seed, in the order of their ids: that of the sums of an adjustment."""
+    """The placed images of a model, in the order of their ids: that of the sums of an adjustment."""
 
     images: Images
     rows: IntArray
@@ -236,51 +226,47 @@ class PosedPart(NamedTuple):
     """(f,) rows of their frames among those of the model."""
 
 
-def posed_images(seed: "pycolmap.Reconstruction", model: PosedModel) -> PosedPart:
-    """Return the posed images of a seed of a model."""
-    every = images_of(seed)
-    own = every.part(np.flatnonzero(every.is_posed))
-    own = own.part(np.argsort(own.ids))
-    by_id = np.argsort(model.image_ids)
-    return PosedPart(
-        images=own,
-        rows=by_id[np.searchsorted(model.image_ids, own.ids, sorter=by_id)],
-        frames=np.searchsorted(model.images.frames.ids, own.frames.ids),
-    )
+def pose_images(model: PosedModel, located: Located) -> Images:
+    """Return the images of the model where they are placed, fixed ones as they were; NaN where neither."""
+    locations = located.placement.locations[located.kept]
+    placed = model.images.placed(located.cameras, located.gauge.similarity.apply(locations))
+    if located.fixed is None:
+        return placed
+    frames, fixed = placed.frames, np.zeros((len(placed.frames.ids), 1), dtype=np.bool_)
+    fixed[model.images.frame_of[located.fixed]] = True
+    return placed.posed(frames.rotations, np.where(fixed, model.images.frames.centers, frames.centers))
 
 
-def as_written(seed: "pycolmap.Reconstruction", images: Images) -> tuple[FloatArray, FloatArray]:
-    """Put images into our own seed; return rotations (i, 3, 3) and centers (i, 3) as it has them then."""
-    put_images(seed, images)
-    own = [seed.image(i) for i in images.ids.tolist()]
-    rotations = np.array([image.cam_from_world().rotation.matrix() for image in own])
-    return rotations, np.array([image.projection_center() for image in own])
+def posed_part(images: Images) -> PosedPart:
+    """Return those of a model's images that have a pose."""
+    rows = np.flatnonzero(images.is_posed)
+    rows = rows[np.argsort(images.ids[rows])]
+    return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
 
 
 def read_links(
-    source: MatchSource,
-    located: Located,
-    seed: "pycolmap.Reconstruction",
-    posed: PosedPart,
-    advance: Callable[[int, int], None],
+    source: MatchSource, located: Located, posed: PosedPart, advance: Callable[[int, int], None]
 ) -> Links:
-    """Return what joins the keypoints of the posed images of a seed; all rays are forgotten.
+    """Return what joins the keypoints of placed images; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
-    model, placement, pictures = source.model, located.placement, ModelPictures(seed, posed.images)
-    if source.database is None:
+    model, placement, database = source.model, located.placement, source.database
+    if database is None:
+        pictures = ModelPictures(model.reconstruction, posed.images)
         return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
-    source.database.forget_rays()
+    rows = posed.rows.tolist()
+    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: database.keypoints(rows[k]))
+    database.forget_rays()
     hand_back_memory()
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
-    counted = _clear_after(source.database, source.counted(matches, advance))
+    matches = database.iter_keypoints(1, among, placement.rejected_pairs)
+    counted = _clear_after(database, source.counted(matches, advance))
     place = np.full(model.num_images, -1)
     place[posed.rows] = np.arange(len(posed.rows))
-    links = collect_matches(posed.images, pictures, place, counted, source.database.num_matches)
-    source.database.forget_rays()  # of matches that are too many to be kept, and were read again
+    links = collect_matches(posed.images, pictures, place, counted, database.num_matches)
+    database.forget_rays()  # of matches that are too many to be kept, and were read again
     return links
 
 

@@ -156,6 +156,16 @@ class Images:
         """Return the images with their frames at other rotations (f, 3, 3) and centers (f, 3)."""
         return replace(self, frames=replace(self.frames, rotations=rotations, centers=centers))
 
+    def placed(self, rows: IntArray, centers: FloatArray) -> "Images":
+        """Return the images with some of them (k,) at centers (k, 3), rotations as they are.
+
+        Others of a frame move along with its first one; frames without any become NaN.
+        """
+        frames, first = np.unique(self.frame_of[rows], return_index=True)
+        moved = np.full_like(self.frames.centers, np.nan)
+        moved[frames] = (centers - self.offsets[rows])[first]
+        return self.posed(self.frames.rotations, moved)
+
     def with_lenses(self, lenses: Sequence[Lens]) -> "Images":
         """Return the images with other parameters of their lenses."""
         return replace(self, lenses=tuple(lenses))

@@ -88,7 +88,8 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     centers = 2.0 * (model.centers - model.frame_offsets) + [1.0, 2.0, 3.0] + model.frame_offsets
     placed = model.frame_ids != 5
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
-    seed = build_seed(model, placed, centers)
+    rows = np.flatnonzero(placed)
+    seed = build_seed(model, model.images.placed(rows, centers[rows]))
     ids, found = centers_of(seed)
     expected = model.frame_ids != 5
     assert ids == model.image_ids[expected].tolist()

@@ -106,6 +106,21 @@ def test_parts_are_posed_as_the_whole_is(images, data):
     assert values_of(back) == values_of(images)
 
 
+@given(scenes(), st.data())
+def test_the_first_image_of_a_frame_places_it_and_frames_without_one_are_gone(images, data):
+    rows, rng = chosen_of(data, images.num_images), np.random.default_rng(0)
+    images = images.posed(
+        Rotation.random(len(images.frames.ids), rng).as_matrix(), np.zeros_like(images.frames.centers)
+    )
+    centers = rng.standard_normal((len(rows), 3))
+    found = images.placed(rows, centers)
+    frames = images.frame_of[rows]
+    is_first = [frame not in frames[:k] for k, frame in enumerate(frames)]
+    np.testing.assert_allclose(found.centers[rows[is_first]], centers[is_first], atol=1e-12)
+    np.testing.assert_array_equal(found.is_posed, np.isin(images.frame_of, frames))
+    np.testing.assert_array_equal(found.rotations, images.rotations)
+
+
 @given(scenes())
 def test_images_stand_where_frames_and_sensors_put_them(images):
     sensors, frames = images.sensors, images.frames

@@ -24,7 +24,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
-from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.graph.groups import RigidGroups
@@ -178,30 +178,16 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
-    """Return the model with the frames' rotations, the rigs and the intrinsics of another; no input changes.
+def turned_model(model: PosedModel, turned: Images) -> PosedModel:
+    """Return the model with the frames' rotations, the sensors and the lenses of images; no input changes.
 
     Args:
         model: the posed images.
-        turned: with the cameras and some of the frames of it. Frames turn about their own centers; where a
-            rotation is the same, the pose keeps its bits.
+        turned: some of them. Frames turn about their own centers; what is the same keeps its bits.
     """
-    copy = pycolmap.Reconstruction(model.reconstruction)
-    for camera_id, camera in turned.cameras.items():
-        if camera.params.tolist() != copy.camera(camera_id).params.tolist():
-            copy.camera(camera_id).params = camera.params
-    for rig_id, rig in turned.rigs.items():
-        for sensor, sensor_from_rig in rig.non_ref_sensors.items():
-            copy.rig(rig_id).set_sensor_from_rig(sensor, sensor_from_rig)
-    for frame_id in sorted(turned.reg_frame_ids()):
-        frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
-        pose = frame.rig_from_world
-        assert pose is not None  # posed frames of one model are posed in the other
-        assert other is not None
-        rotation = other.rotation
-        if (rotation.quat != pose.rotation.quat).any():
-            center = -(pose.rotation.matrix().T @ pose.translation)
-            frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    own, copy = model.images.frames, pycolmap.Reconstruction(model.reconstruction)
+    rows = np.searchsorted(own.ids, turned.frames.ids)
+    put_images(copy, turned.posed(turned.frames.rotations, own.centers[rows]))
     return read_model(copy)
 
 

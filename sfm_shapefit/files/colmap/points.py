@@ -1,5 +1,7 @@
 """The door between reconstructions and `Points`, and pixels and rays of the points2D that observe them."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pycolmap
 
@@ -10,25 +12,36 @@ from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
+Keypoints = Callable[[int], FloatArray | None]
+"""Returns the pixels (k, 2) of the keypoints of an image by its row, if there are any."""
+
 
 class ModelPictures:
-    """The points2D of the images of a reconstruction, see `Pictures`."""
+    """The points2D of images of a reconstruction, or keypoints instead of them, see `Pictures`."""
 
-    def __init__(self, reconstruction: pycolmap.Reconstruction, images: Images) -> None:
-        self._reconstruction, self._ids = reconstruction, images.ids.tolist()
+    def __init__(
+        self, reconstruction: pycolmap.Reconstruction, images: Images, keypoints: Keypoints | None = None
+    ) -> None:
+        self._images = [reconstruction.image(i) for i in images.ids.tolist()]
+        self._cameras = [reconstruction.camera(image.camera_id) for image in self._images]
+        self._keypoints = keypoints
 
     def count(self, image: int) -> int:
         """Return how many points2D an image has."""
-        return int(self._reconstruction.image(self._ids[image]).num_points2D())
+        return len(self._pixels(image))
 
     def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
         """Return pixels (k, 2) and rays (k, 3) of points2D; through a case of OPENCV, of depth 1."""
-        own = self._reconstruction.image(self._ids[image])
-        camera, xy = self._reconstruction.camera(own.camera_id), points2d_xy(own)[keypoints]
+        camera, xy = self._cameras[image], self._pixels(image)[keypoints]
         if not lens_of(camera).is_adjustable:
             return xy, camera_rays(camera, xy)
         on_plane = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
         return xy, np.concatenate([on_plane, np.ones((len(xy), 1))], axis=1)
+
+    def _pixels(self, image: int) -> FloatArray:
+        """Return the pixels of an image, (k, 2)."""
+        xy = None if self._keypoints is None else self._keypoints(image)
+        return points2d_xy(self._images[image]) if xy is None or not len(xy) else xy
 
 
 def points_of(reconstruction: pycolmap.Reconstruction, images: Images) -> Points:
