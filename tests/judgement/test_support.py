@@ -8,8 +8,8 @@ import sfm_shapefit
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.facts.grade import Grade
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.support import (
     ObservationCounts,
     count_observations,
