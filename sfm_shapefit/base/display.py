@@ -29,15 +29,32 @@ def row(label: str, text: str) -> Row:
     return Row(label, [text] if text else [])
 
 
+class NextStep(NamedTuple):
+    """What to do next, and the command that does it.
+
+    In the command, {out} stands for the folder of the result, and {out_further} for one beside it.
+    """
+
+    text: str
+    command: str
+
+
 class Telling(NamedTuple):
     """What is told of a result in a terminal."""
 
+    counted: str
+    """What was looked at, as "8 images"."""
     figures: Sequence[Row]
     """What everybody should see: how much is placed, how well, what is not and why, warnings."""
     details: Sequence[Row] = ()
     """What `--verbose` adds, before the figures."""
     elsewhere: str = "see cameras.csv"
     """Where lines stand that are too many to be shown."""
+    written: str = ""
+    """What stands in OUT beside the report."""
+    step: NextStep = NextStep("", "")
+    folder: str = "."
+    """The folder in OUT that the next step is about, which has the report."""
 
 
 class Displayed:

@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Generic
 
 import typer
 
-from sfm_shapefit.base.display import Telling, row
-from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     catch_termination,
@@ -26,47 +25,13 @@ from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
-    from sfm_shapefit.facts.placed import NextStep
-    from sfm_shapefit.judgement.grade import ModelVerdict
+    from sfm_shapefit.facts.map_result import MapResult
+    from sfm_shapefit.facts.result import GraphResult, LocateResult
     from sfm_shapefit.pipeline.clock import Progress
 
 
 _NOTICED_S = 1.0
 """Seconds of compiling that are worth a word."""
-
-
-class Result(Protocol):
-    """What a command that makes OUT has found."""
-
-    @property
-    def timings_s(self) -> dict[str, float]:
-        """Seconds per stage."""
-
-    @property
-    def facts(self) -> Record:
-        """What is told of it, as it stands in JSON."""
-
-    @property
-    def told(self) -> Telling:
-        """What the terminal says of it."""
-
-    @property
-    def verdict(self) -> "ModelVerdict":
-        """Whether it can be used."""
-
-
-class Shown(NamedTuple):
-    """What a command shows of its result beside what the result tells."""
-
-    title: str
-    names: Iterable[str]
-    """Of the images."""
-    out: Path
-    next_step: "NextStep"
-    """What to do with the model in the folder `model`."""
-    written: str
-    """What stands in OUT."""
-    model: str = "."
 
 
 @dataclass(slots=True, kw_only=True)
@@ -91,29 +56,30 @@ class Run(Generic[Options]):
         how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
         return how | {"protect": self.protect}
 
-    def show(self, found: Result, shown: Shown) -> None:
+    def show(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
         """Print the facts as JSON, or what is told of them, or nothing, once the output is complete.
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
         """
         self.is_unusable = self.flags.strict and found.verdict.is_bad
         if self.flags.json:
-            self.shown = lambda: print_json(found.facts.summary())
+            self.shown = lambda: print_json(found.summary())
         elif not self.flags.quiet:
-            self.shown = lambda: self._tell(found, shown)
+            self.shown = lambda: self._tell(found, source, out)
 
-    def _tell(self, found: Result, shown: Shown) -> None:
+    def _tell(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
         """Print a table, with details if they are wanted, then the verdict and what to do next."""
-        told, page = found.told, ", report.html" * self.flags.report
+        told = found.told
+        page = ", report.html" if self.flags.report and told.folder == "." else ""
         rows = [
             *(told.details if self.flags.verbose else ()),
             *told.figures,
-            row("warning", self._missing_pictures(shown.names)),
+            row("warning", self._missing_pictures(found.image_names)),
             row("time", self._describe_time(found.timings_s)),
-            row("written to", f"{shown.out}: {shown.written}{page}"),
+            row("written to", f"{out}: {told.written}{page}"),
         ]
-        print_table(shown.title, rows, told.elsewhere)
-        print_ending(found.verdict, self._next_steps(shown.next_step.command, shown.out / shown.model))
+        print_table(f"{told.counted} of {source}", rows, told.elsewhere)
+        print_ending(found.verdict, self._next_steps(told.step.command, out / told.folder))
 
     def _missing_pictures(self, names: Iterable[str]) -> str:
         """Warn if pictures were asked for, and the folder has none of the images."""

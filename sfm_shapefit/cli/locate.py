@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.flags import (
     Database,
     ExecutorName,
@@ -16,7 +15,7 @@ from sfm_shapefit.cli.flags import (
     one_path,
     takes,
 )
-from sfm_shapefit.cli.frame import Shown, command_run
+from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import LocateOptions
 
@@ -52,6 +51,4 @@ def locate_command(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
         write_result(found, target, **run.writing)
-        title = f"{counted(len(found.model.names), 'image')} of {source}"
-        tables = "seeded model, locate.json, cameras.csv, pairs.csv"
-        run.show(found, Shown(title, found.model.names, target, found.facts.next_step, tables))
+        run.show(found, source, target)

@@ -1,11 +1,10 @@
 """`sfm-shapefit map DATABASE OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.flags import (
     ExecutorName,
     GroupedCommand,
@@ -16,12 +15,9 @@ from sfm_shapefit.cli.flags import (
     one_path,
     takes,
 )
-from sfm_shapefit.cli.frame import Shown, command_run
+from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import MapOptions
-
-if TYPE_CHECKING:
-    from sfm_shapefit.facts.map_result import MapResult
 
 
 @app.command(
@@ -54,13 +50,4 @@ def map_command(
         with open_executor(executor, run.options.num_threads()) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
         write_result(found, target, **run.writing)
-        title = f"{counted(found.num_images, 'image')} of {source}"
-        run.show(found, _shown(found, title, target))
-
-
-def _shown(found: "MapResult", title: str, out: Path) -> Shown:
-    """Return what is shown of models beside what they tell."""
-    names = [name for model in found.models for name in model.located.model.names]
-    folders = [*map(str, range(len(found.models))), *(one.folder for one in found.joined)]
-    written = f"{'models' if len(found.models) > 1 else 'a model'} in {', '.join(folders)}, map.json"
-    return Shown(title, names, out, found.models[0].located.facts.next_step, written, model="0")
+        run.show(found, source, target)

@@ -5,9 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
-from sfm_shapefit.cli.frame import Shown, command_run
+from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
 
@@ -77,6 +76,4 @@ def place_command(
         )
         files = export_files(found, g2o=g2o, onedsfm=onedsfm)
         write_result(found, target, further_files=files, **run.writing)
-        title = f"{counted(found.placement.graph.num_nodes, 'node')} of {source}"
-        tables = "locate.json, cameras.csv, pairs.csv"
-        run.show(found, Shown(title, (), target, found.facts.next_step, tables))
+        run.show(found, source, target)

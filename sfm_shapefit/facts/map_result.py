@@ -117,19 +117,32 @@ class MapResult(Displayed):
     @property
     def told(self) -> Telling:
         """What the terminal says: of each model, of joins, and of what was left out."""
-        figures: list[Row] = []
+        largest, figures = self.models[0].located.facts, list[Row]()
         details = [row("pairs", f"{counted(self.num_pairs, 'pair')} with a relative rotation")]
         for number, model in enumerate(self.models):
             title = row(f"model {number}", model.located.verdict.statement if len(self.models) > 1 else "")
-            centers = model.located.placement.refined.statement()
-            told = model.located.facts.told_among_models(model.averaging.statement, centers)
+            told = model.located.facts.told((), model.located.placement.refined.statement())
             figures += [title, *told.figures]
-            details += [title, *told.details]
+            details += [title, row("rotations", model.averaging.statement), *told.details]
         figures += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
         figures += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
-        left_out = [f"{name}: {reason}" for name, reason in self.left_out.items()]
-        warnings = [row("warning", warning) for warning in self.warnings]
-        return Telling([*figures, Row("in no model", left_out), *warnings], details, "see map.json")
+        figures += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
+        figures += [row("warning", warning) for warning in self.warnings]
+        folders = ", ".join([*map(str, range(len(self.models))), *(one.folder for one in self.joined)])
+        return Telling(
+            counted(self.num_images, "image"),
+            figures,
+            details,
+            elsewhere="see map.json",
+            written=f"{'models' if len(self.models) > 1 else 'a model'} in {folders}, map.json",
+            step=largest.next_step,
+            folder="0",
+        )
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of all images of the models."""
+        return tuple(name for model in self.models for name in model.located.image_names)
 
     def folder_of_join(self, join: Joined) -> str | None:
         """Return where the models of a join stand in one world; None if they were not joined."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.base.display import Row, Telling, row
+from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
@@ -25,7 +25,6 @@ from sfm_shapefit.facts.placed import (
     Facts,
     GraphFacts,
     InputFacts,
-    NextStep,
     Options,
     PlacedFacts,
     Timings,
@@ -280,36 +279,33 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             left_out: images that are not in the output, with the reason.
             centers: where the centers come from, in words.
         """
+        figures = [
+            *self.key_rows(),
+            row("points", self.points_statement),
+            Row("not placed", left_out),
+            *self.piece_rows(),
+            *self.scene_rows(),
+            *self.warning_rows(),
+        ]
         nodes = f"{counted(self.num_points_as_nodes, 'track')} helped to place cameras"
+        details = [
+            row("directions", self.inputs.directions),
+            row("rigid groups", self.rigid_groups.statement if self.rigid_groups else ""),
+            Row("pairs", self._pair_lines()),
+            row("points as nodes", nodes),
+            row("centers", centers),
+            row("adjustment", self.adjustment.statement if self.adjustment else ""),
+            row("scale", self.scale),
+            row("bundle adjustment", self.bundle_adjustment.statement if self.bundle_adjustment else ""),
+            row("certificate", self.delivered.statement),
+        ]
         return Telling(
-            [
-                *self.key_rows(),
-                Row("not placed", left_out),
-                *self.piece_rows(),
-                *self.scene_rows(),
-                *self.warning_rows(),
-            ],
-            [
-                row("directions", self.inputs.directions),
-                row("rigid groups", self.rigid_groups.statement if self.rigid_groups else ""),
-                Row("pairs", self._pair_lines()),
-                row("points as nodes", nodes),
-                row("centers", centers),
-                row("adjustment", self.adjustment.statement if self.adjustment else ""),
-                row("scale", self.scale),
-                row("points", self.points_statement),
-                row("bundle adjustment", self.bundle_adjustment.statement if self.bundle_adjustment else ""),
-                row("certificate", self.delivered.statement),
-            ],
+            counted(self.num_images, "image"),
+            figures,
+            details,
+            written="seeded model, locate.json, cameras.csv, pairs.csv",
+            step=self.next_step,
         )
-
-    def told_among_models(self, rotations: str, centers: str) -> Telling:
-        """Return what the terminal says of one of the models of `map`; arguments in words."""
-        points = row("points", self.points_statement)
-        told = self.told((), centers)
-        details = [one for one in told.details if one.label in _DETAILS_AMONG_MODELS]
-        figures = [*self.key_rows(), points, *self.scene_rows(), *self.warning_rows()]
-        return Telling(figures, [row("rotations", rotations), *details])
 
     def _pair_lines(self) -> list[str]:
         """Say what became of the pairs, in the words of `inspect`."""
@@ -317,9 +313,6 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         contradicting, usable = counts.pop("outlier"), counts.pop("usable")
         others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
         return [f"{usable} usable ({contradicting} contradict the solution)", *others]
-
-
-_DETAILS_AMONG_MODELS = {"centers", "scale", "bundle adjustment", "certificate"}
 
 
 def next_of_model(grade: Grade, source: str, *, is_adjusted: bool) -> NextStep:

@@ -10,13 +10,13 @@ Terminal and notebooks begin with three figures, which the report has as tiles:
 import math
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from sfm_shapefit import __version__
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.display import Row, Telling, row
+from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, rounded
@@ -60,16 +60,6 @@ Timings = Annotated[dict[str, float], "Wall-clock seconds per stage."]
 Versions = Annotated[dict[str, str], "Of the packages that the answer depends on."]
 Warnings = Annotated[list[str], "What the user should know, a sentence each."]
 Version = Annotated[Literal[1], "Keys are added, never renamed, within a version."]
-
-
-class NextStep(NamedTuple):
-    """What to do next, and the command that does it.
-
-    In the command, {out} stands for the folder of the result, and {out_further} for one beside it.
-    """
-
-    text: str
-    command: str
 
 
 class KeyFigures(Record):
@@ -492,7 +482,12 @@ class GraphFacts(PlacedFacts):
         quantiles = " / ".join(f"{self.residuals_deg[f'quantile_{q}']:.3g}" for q in _QUANTILES)
         beyond = ", ".join(f"{self.residuals_deg[f'share_beyond_{a}']:.1%} beyond {a}" for a in _ANGLES_DEG)
         within = f"{'/'.join(map(str, _QUANTILES))} % of the pairs within {quantiles} deg"
-        figures = [*self.key_rows("node"), Row("not placed", left_out), *self.piece_rows()]
+        figures = [
+            *self.key_rows("node"),
+            Row("not placed", left_out),
+            *self.piece_rows(),
+            *self.warning_rows(),
+        ]
         details = [
             row("directions", self.inputs.directions),
             row("dimension", str(self.dimension)),
@@ -501,4 +496,10 @@ class GraphFacts(PlacedFacts):
             row("locations", locations),
             row("certificate", self.delivered.statement),
         ]
-        return Telling([*figures, *self.warning_rows()], details)
+        return Telling(
+            counted(self.num_images, "node"),
+            figures,
+            details,
+            written="locate.json, cameras.csv, pairs.csv",
+            step=self.next_step,
+        )

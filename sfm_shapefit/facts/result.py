@@ -451,6 +451,11 @@ class GraphResult(Displayed):
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
         return table_of(self, name, self.placement.graph.dimension)
 
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """None: nodes have no images."""
+        return ()
+
     @cached_property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""

@@ -452,7 +452,7 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
     assert row["parameters"] == located.reconstruction.camera(1).params.tolist()
     errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
     assert errors.position.max < 1e-3 * errors.extent
-    (line,) = describe_intrinsics([row])
+    (line,) = describe_intrinsics(located.facts.intrinsics)
     assert line.startswith("camera 1: focal length 850.0 px (a guess) became 1,000.")
     assert "(+17.6%) by adjustment" in line
 
