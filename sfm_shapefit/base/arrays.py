@@ -25,3 +25,4 @@ def frozen(array: AnyArray) -> AnyArray:
 
 
 Int32Array = npt.NDArray[np.int32]
+UInt32Array = npt.NDArray[np.uint32]

@@ -5,7 +5,6 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
@@ -30,7 +29,6 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.matches import MatchBatch
 
 _SAID_OF_MATCHES = (
     "num_inliers",
@@ -99,7 +97,7 @@ def adjust_placed(
     similarity = located.gauge.similarity
     locations = (centers - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
+        source = source.at(with_frame_rotations(model, adjusted.reconstruction))
         corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
         directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
@@ -141,7 +139,7 @@ def _measure_again(
         return before
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
-    batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
+    batches = source.view.batches(without=others, advance=clock.advance)
     threads = options.num_threads()
     again = concatenate([estimate_directions(batch, options, threads) for batch in batches])
     rows = again.usable()
@@ -151,27 +149,6 @@ def _measure_again(
     for name, chosen in taken.items():
         merged[name][usable[chosen]] = getattr(again, name)[chosen]
     return replace(before, **merged)
-
-
-def _without_pairs(batches: Iterator[MatchBatch], pairs: IntArray) -> Iterator[MatchBatch]:
-    """Yield the batches without some pairs (k, 2); those that have no others are left out."""
-    unwanted = {(min(i, j), max(i, j)) for i, j in pairs.tolist()}
-    for batch in batches:
-        dropped: BoolArray = np.array(
-            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
-        )
-        if dropped.all():
-            continue
-        counts = np.diff(batch.offsets)
-        kept = np.repeat(~dropped, counts)
-        yield MatchBatch(
-            pairs=batch.pairs[~dropped],
-            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
-            keypoints=batch.keypoints[kept],
-            rays_i=batch.rays_i[kept],
-            rays_j=batch.rays_j[kept],
-            pixel_angles=batch.pixel_angles[~dropped],
-        )
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:

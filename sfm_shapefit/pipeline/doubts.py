@@ -66,7 +66,7 @@ def ask_pairs(
         return concatenate([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    for batch in source.batches():
+    for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         likely = None
@@ -162,7 +162,7 @@ def question_focal_lengths(
     chosen = _pairs_of_cameras(directions, lenses.camera_of)
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
-    for batch in source.batches():
+    for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         parts.append(_thin(model, batch, rows, _FOCAL_MATCHES[1]))
     found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, options.num_threads())

@@ -5,7 +5,7 @@ Each stage is one function from values to a new value; the input is never change
 
 from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import Executor
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +23,7 @@ from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import (
     ambiguity_warnings,
@@ -52,8 +52,9 @@ from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import (
     MatchSource,
     choose_inputs,
-    open_source,
+    open_matches,
     read_left_out,
+    see_matches,
     without_structure,
 )
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
@@ -122,26 +123,25 @@ def locate(
     """
     options = merge_options(options, LocateOptions, overrides)
     clock = Clock(progress) if progress else Clock()
-    with clock("read"):
-        model = read_model(reconstruction)
-        inputs = choose_inputs(reconstruction, database, options.directions)
-        inputs = read_left_out(inputs, model.names, options)
-        model, intrinsics = settle_intrinsics(model, inputs, options)
-        priors_known = read_priors(model, inputs, options, priors)
-        control = read_control(model, options)
-        rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
-        model, colors = without_structure(model, inputs)
-    with open_source(model, inputs, options) as opened:
-        known = Locating(
-            inputs, rigid, priors_known, executor, intrinsics=intrinsics, control=control, colors=colors
-        )
-        return locate_source(opened, known, options, clock)
+    with ExitStack() as stack:
+        with clock("read"):
+            model = read_model(reconstruction)
+            inputs = choose_inputs(reconstruction, database, options.directions)
+            inputs = read_left_out(inputs, model.names, options)
+            matches = stack.enter_context(closing(open_matches(model, inputs)))
+            model, intrinsics = settle_intrinsics(model, matches.file, options, inputs.left_out)
+            priors_known = read_priors(model, matches.file, options, priors)
+            control = read_control(model, options)
+            rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
+            model, colors = without_structure(model, matches)
+            source = see_matches(matches, model, inputs, options)
+        known = Locating(rigid, priors_known, executor, intrinsics=intrinsics, control=control, colors=colors)
+        return locate_source(source, known, options, clock)
 
 
 class Locating(NamedTuple):
     """What a run of `locate` knows beside its matches and options."""
 
-    inputs: Inputs
     rigid: Rigid
     priors: PositionPriors | None = None
     executor: Executor | None = None
@@ -217,7 +217,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
-        inputs=known.inputs,
+        inputs=source.inputs,
         options=options,
         model=source.model,
         directions=directions,
@@ -253,7 +253,7 @@ def _place(
     measured = rigid.apply(build_graph(opened, directions, options))
     work = count_work(opened, directions)
     economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
-    source = opened.with_economy(economy)
+    source = opened.at(model, economy)
     placement = place_cameras(add_evidence(measured, source, directions, options), options, clock)
     if known.centers is not None:
         placement = _at_known_centers(placement, known, model, options)
@@ -375,6 +375,5 @@ def _collect_warnings(
         yield f"to stay below max_memory_mb, {source.economy.statement}"
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
-    if source.database is not None and source.database.unmatched_names:
-        names = source.database.unmatched_names
+    if names := source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

@@ -10,6 +10,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -42,18 +43,18 @@ def measure_directions(
     source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
 ) -> PairDirections:
     """Return the direction of every pair that the source has; an executor shares them out, if it can."""
-    model = source.model
-    if source.database is not None and source.kind == "relative-poses":
-        poses = source.database.relative_poses()
+    model, view = source.model, source.view
+    if source.kind == "relative-poses":
+        poses = relative_poses(view)
         if len(poses.pairs) == 0:
             raise UnsolvableError("the database has no stored relative pose; use directions from matches")
         return from_relative_poses(poses, model.rotations, options)
-    if executor is not None and source.database is not None:
+    if executor is not None and source.kind != "tracks":
         work = PairWork(estimate=partial(estimate_directions, options=options))
-        parts = measure_with_workers(source.database, model, work, executor, clock.advance)
+        parts = measure_with_workers(view, work, executor, clock.advance)
     else:
         threads = options.num_threads()
-        batches = source.counted(source.batches(), clock.advance)
+        batches = view.batches(advance=clock.advance)
         parts = [estimate_directions(batch, options, threads) for batch in batches]
     if not parts:
         raise UnsolvableError(
@@ -83,11 +84,11 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
 
 def build_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> MeasuredGraph:
     """Return the measured graph, with 3D points as further nodes if the options want them."""
-    model = source.model
+    model, view = source.model, source.view
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
     if not (options.uses_points(model.num_images) and source.economy.points):
         return MeasuredGraph(graph, covariance=covariance)
-    tracks = build_tracks(source.batches(), directions, options.inlier_threshold_px, source.num_keypoints())
+    tracks = build_tracks(view.batches(), directions, options.inlier_threshold_px, view.num_keypoints)
     chosen = tracks.subset(covering_set(tracks, model.num_images))
     return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 
@@ -120,7 +121,7 @@ def sample_errors(
     place = np.full(len(directions.pairs), -1)
     place[usable] = np.arange(len(usable))
     errors = np.zeros((len(usable), NUM_SAMPLES, 2))
-    for batch in source.batches():
+    for batch in source.view.batches():
         rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
         found = sample_direction_errors(
             batch,

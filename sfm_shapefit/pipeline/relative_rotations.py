@@ -2,15 +2,17 @@
 
 from collections.abc import Callable
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from sfm_shapefit.facts.options import MapOptions, Relative
-from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
     concatenate,
     estimate_relative_rotations,
@@ -19,6 +21,7 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+from sfm_shapefit.scene.matches import View
 
 # About a second of work, be they many pairs of few matches or few of many.
 _MATCHES_PER_TASK = 100_000
@@ -77,28 +80,26 @@ def relative_rotations(
     options = MapOptions(relative_rotations=source, threads=threads)
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    path, clock = Path(database), Clock(progress) if progress else Clock()
-    with clock("relative rotations"):
-        model = read_model(read_images(path).reconstruction)
+    clock = Clock(progress) if progress else Clock()
+    with clock("relative rotations"), closing(DatabaseFile(database)) as file:
+        model = read_model(read_images(file).reconstruction)
+        view = DatabaseMatches(file, model.names).at(model)
         sharing = Sharing(options.num_threads(), executor, clock.advance)
-        with open_database(path, model) as matches:
-            found = measure_rotations(matches, model, min_matches, source, sharing)
+        found = measure_rotations(view, min_matches, source, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 
 
 def measure_rotations(
-    database: MatchDatabase,
-    model: PosedModel,
+    view: View[PosedModel],
     min_matches: int = LEAST_MATCHES,
     source: Relative = "matches",
     sharing: Sharing | None = None,
 ) -> RelativeRotations:
-    """Return the relative rotations of a database; pairs are indices into the model's images.
+    """Return the relative rotations of a database.
 
     Args:
-        database: open, of the model.
-        model: all its images, with the identity as their rotation (see `database_images`).
+        view: of images with the identity as their rotation (see `database_images`).
         min_matches: pairs with fewer inlier matches are left out.
         source: estimated from the matches, or as stored.
         sharing: one thread if None.
@@ -109,23 +110,23 @@ def measure_rotations(
     """
     sharing = sharing or Sharing()
     if source == "stored":
-        return stored_relative_rotations(database, model, min_matches)
+        return stored_relative_rotations(view, min_matches)
     if sharing.executor is None:
-        parts = _estimate_here(database, min_matches, sharing)
+        parts = _estimate_here(view, min_matches, sharing)
     else:
         work = PairWork(
-            estimate=partial(estimate_relative_rotations, num_pairs=database.num_pairs),
+            estimate=partial(estimate_relative_rotations, num_pairs=view.num_pairs),
             min_matches=min_matches,
             matches_per_task=_MATCHES_PER_TASK,
         )
-        parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
+        parts = measure_with_workers(view, work, sharing.executor, sharing.advance)
     return concatenate(parts)
 
 
-def _estimate_here(database: MatchDatabase, min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
+def _estimate_here(view: View[PosedModel], min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
     """Return the relative rotations of each batch."""
-    parts, before, total = [], 0, database.num_pairs
-    for batch in database.iter_matches(min_matches):
+    parts, before, total = [], 0, view.num_pairs
+    for batch in view.batches(min_matches):
 
         def advance(done: int, before: int = before) -> None:
             sharing.advance(before + done, total)

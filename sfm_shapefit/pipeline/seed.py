@@ -1,7 +1,7 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -19,7 +19,6 @@ from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import FurtherPiece
-from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
 from sfm_shapefit.files.colmap.seed import build_seed, transform_model, turn_model
@@ -35,7 +34,6 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
 from sfm_shapefit.placement.prior_refinement import PULLED
-from sfm_shapefit.scene.matches import KeypointMatches
 
 if TYPE_CHECKING:
     import pycolmap
@@ -133,8 +131,9 @@ def build_seeded_model(
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
-    if source.database is not None:  # points of the model's own tracks have their colors already
-        counts = count_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+    if source.kind != "tracks":  # points of the model's own tracks have their colors already
+        batches = source.view.batches()
+        counts = count_observations(seeded, source.model, batches, options.max_reprojection_error_px)
         unsupported = images_without_support(seeded, counts, frames)
         if options.min_trust > 0.0:
             poor |= unsupported
@@ -231,8 +230,7 @@ def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":
     is_placed[located.cameras] = True
     centers = np.full((model.num_images, 3), np.nan)
     centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
-    keypoints = None if source.database is None else source.database.keypoints
-    return build_seed(model, is_placed, centers, keypoints, located.fixed)
+    return build_seed(model, is_placed, centers, source.view.keypoints, located.fixed)
 
 
 def read_tracks(
@@ -241,25 +239,14 @@ def read_tracks(
     seed: "pycolmap.Reconstruction",
     advance: Callable[[int, int], None],
 ) -> TrackSource:
-    """Return the tracks to triangulate at the poses of a seed; all rays are forgotten.
+    """Return the tracks to triangulate at the poses of a seed; the matches are consumed.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
-    model, placement = source.model, located.placement
-    if source.database is None:
-        return model.reconstruction
-    source.database.forget_rays()
-    hand_back_memory()
+    model, placement, view = source.model, located.placement, source.view
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
-    counted = _clear_after(source.database, source.counted(matches, advance))
-    tracks = collect_matches(seed, model.image_ids, counted, source.database.num_matches)
-    source.database.forget_rays()  # of matches that are too many to be kept, and were read again
-    return tracks
-
-
-def _clear_after(database: MatchDatabase, matches: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
-    """Yield matches, and clear those that the database keeps as soon as all were yielded."""
-    yield from matches
-    database.clear_matches()
+    links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
+    if source.kind == "tracks":
+        return model.reconstruction
+    return collect_matches(seed, model.image_ids, links, view.num_matches)
