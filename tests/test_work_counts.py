@@ -34,10 +34,9 @@ from tests.scenes import BUNDLED, COURTYARD, RING, copied, edit_database
 
 POINTS = {
     "pairs": (
-        "sfm_shapefit.files.colmap.database:MatchDatabase.iter_matches",
-        "sfm_shapefit.files.colmap.database:MatchDatabase.iter_matches_between",
-        "sfm_shapefit.files.colmap.database:MatchDatabase.iter_keypoints",
-        "sfm_shapefit.files.colmap.model:track_matches",
+        "sfm_shapefit.scene.matches:View.batches",
+        "sfm_shapefit.scene.matches:View.between",
+        "sfm_shapefit.scene.matches:View.links",
     ),
     "solves": ("sfm_shapefit.solver.solve:run_choice",),
     "assessments": ("sfm_shapefit.judgement.verdicts:assess",),
