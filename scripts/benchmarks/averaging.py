@@ -104,6 +104,8 @@ def measure_made(family: str, n: int) -> Row:
 def _coverage(errors: FloatArray, sigmas_deg: FloatArray) -> float:
     """Return the root mean square of errors over standard deviations, per axis, of what is not wrong."""
     near = (errors < WRONG_DEG) & np.isfinite(sigmas_deg)
+    if not near.any():
+        return np.nan
     return float(np.sqrt(np.mean((errors[near] / sigmas_deg[near]) ** 2) / 3.0))
 
 

@@ -73,9 +73,9 @@ class Row:
 
 
 def verdict(checks: Sequence[Check]) -> str:
-    """Return "met", "no target" where there is nothing to reach, or "missed: ..." with every failed check."""
+    """Return "met", "-" where there is nothing to reach, or "missed: ..." with every failed check."""
     if not checks:
-        return "no target"
+        return "-"
     missed = [str(check) for check in checks if not check.met]
     return f"**missed**: {', '.join(missed)}" if missed else "met"
 

@@ -42,7 +42,6 @@ from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, tab
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
-from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model
@@ -54,6 +53,7 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
 
 if TYPE_CHECKING:

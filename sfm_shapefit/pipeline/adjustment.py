@@ -5,7 +5,6 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel, turned_model
@@ -31,7 +30,6 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.matches import MatchBatch
 
 _SAID_OF_MATCHES = (
     "num_inliers",
@@ -101,7 +99,7 @@ def adjust_placed(
     centers[posed.rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.turned(turned_model(model, adjusted.images))
+        source = source.at(turned_model(model, adjusted.images))
         corrected = posed.frames[adjusted.weight.singled_out(len(posed.frames))]
         is_corrected = np.isin(model.images.frame_of, corrected)
         directions = _measure_again(source, directions, is_corrected, options, clock)
@@ -138,7 +136,7 @@ def _measure_again(
     """
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
-    batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
+    batches = source.view.batches(without=others, advance=clock.advance)
     threads = options.num_threads()
     again = concatenate([estimate_directions(batch, options, threads) for batch in batches])
     rows = again.usable()
@@ -148,27 +146,6 @@ def _measure_again(
     for name, chosen in taken.items():
         merged[name][usable[chosen]] = getattr(again, name)[chosen]
     return replace(before, **merged)
-
-
-def _without_pairs(batches: Iterator[MatchBatch], pairs: IntArray) -> Iterator[MatchBatch]:
-    """Yield the batches without some pairs (k, 2); those that have no others are left out."""
-    unwanted = {(min(i, j), max(i, j)) for i, j in pairs.tolist()}
-    for batch in batches:
-        dropped: BoolArray = np.array(
-            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
-        )
-        if dropped.all():
-            continue
-        counts = np.diff(batch.offsets)
-        kept = np.repeat(~dropped, counts)
-        yield MatchBatch(
-            pairs=batch.pairs[~dropped],
-            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
-            keypoints=batch.keypoints[kept],
-            rays_i=batch.rays_i[kept],
-            rays_j=batch.rays_j[kept],
-            pixel_angles=batch.pixel_angles[~dropped],
-        )
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:

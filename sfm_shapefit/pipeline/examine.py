@@ -35,7 +35,6 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, norm
 from sfm_shapefit.facts.model import ExaminedFacts
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
@@ -85,7 +84,7 @@ def examine(
         model = read_model(folder)
         inputs = choose_inputs(folder, database, options.directions)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, inputs, options, clock)
+        found = examine_source(matches, options, clock)
     poses = poses_of(model, [row.name for row in found.cameras])
     # The input is what is shown; there is nothing to be compared with it.
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
@@ -98,12 +97,11 @@ def examine(
     return replace(drawing, further=further, points=points), found.facts
 
 
-def examine_source(matches: MatchSource, inputs: Inputs, options: LocateOptions, clock: Clock) -> Examined:
+def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -> Examined:
     """Return what can be said of a model whose matches are open.
 
     Args:
         matches: of the model, which is not changed.
-        inputs: where they come from.
         options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
@@ -120,7 +118,7 @@ def examine_source(matches: MatchSource, inputs: Inputs, options: LocateOptions,
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
     measures = (float(np.median(model.focal_lengths_px)), "of the model's units")
     facts = ExaminedFacts(
-        inputs=inputs.facts,
+        inputs=matches.inputs.facts,
         options={},
         verdict=_judge(cameras, pairs),
         num_images=len(cameras),

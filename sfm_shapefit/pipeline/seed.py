@@ -1,7 +1,7 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -15,7 +15,6 @@ from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PosedModel
@@ -37,7 +36,6 @@ from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.links import MatchedKeypoints
 
 if TYPE_CHECKING:
@@ -122,8 +120,9 @@ def build_seeded_model(
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
-    if source.database is not None:  # points of the model's own tracks have their colors already
-        counts = count_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+    if source.has_database:  # points of the model's own tracks have their colors already
+        batches = source.view.batches()
+        counts = count_observations(seeded, source.model, batches, options.max_reprojection_error_px)
         unsupported = images_without_support(seeded, counts, frames)
         if options.min_trust > 0.0:
             poor |= unsupported
@@ -148,13 +147,13 @@ def _make_points(
 ) -> "tuple[pycolmap.Reconstruction, Estimate | None]":
     """Return the seed with points, filtered, and how bundle adjustment went, if it was asked for."""
     model, adjusted, links = source.model, None, None
-    own = model.reconstruction if source.database is None else None
+    own = None if source.has_database else model.reconstruction
     rules = PointRules(
         options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
     )
     with clock("structure"):
         images = pose_images(model, located)
-        seed = build_seed(model, images, None if source.database is None else source.database.keypoints)
+        seed = build_seed(model, images, source.view.keypoints if source.has_database else None)
         posed = posed_part(images)
         if own is None or options.adjust == "full":
             links = read_links(source, located, posed, clock.advance)
@@ -251,26 +250,15 @@ def read_links(
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
-    model, placement, database = source.model, located.placement, source.database
-    if database is None:
+    model, placement, view = source.model, located.placement, source.view
+    if not source.has_database:
         pictures = ModelPictures(model.reconstruction, posed.images)
         return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
     rows = posed.rows.tolist()
-    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: database.keypoints(rows[k]))
-    database.forget_rays()
-    hand_back_memory()
+    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: view.keypoints(rows[k]))
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    matches = database.iter_keypoints(1, among, placement.rejected_pairs)
-    counted = _clear_after(database, source.counted(matches, advance))
+    links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
     place = np.full(model.num_images, -1)
     place[posed.rows] = np.arange(len(posed.rows))
-    links = collect_matches(posed.images, pictures, place, counted, database.num_matches)
-    database.forget_rays()  # of matches that are too many to be kept, and were read again
-    return links
-
-
-def _clear_after(database: MatchDatabase, matches: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
-    """Yield matches, and clear those that the database keeps as soon as all were yielded."""
-    yield from matches
-    database.clear_matches()
+    return collect_matches(posed.images, pictures, place, links, view.num_matches)

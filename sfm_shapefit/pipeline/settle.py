@@ -136,7 +136,7 @@ def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock
         graph = told.rigid.apply(build_graph(opened.model, measured))
         work = count_work(opened, directions)
         economy, graph, options = keep_within_memory(work, graph, options, opened.economy)
-        source = opened.with_economy(economy)
+        source = opened.at(opened.model, economy)
         graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
         near = None if told.near is None else told.near.stand
@@ -363,6 +363,5 @@ def _structure_warnings(source: MatchSource, num_points: int) -> Iterator[str]:
     """Yield what the user should know of points and of the database."""
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
-    if source.database is not None and source.database.unmatched_names:
-        names = source.database.unmatched_names
+    if names := source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

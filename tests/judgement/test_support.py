@@ -29,7 +29,7 @@ def judge(structure):
     model, options = read_model(RING / "sparse" / "0"), LocateOptions()
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs, options) as source:
-        batches = source.batches()
+        batches = source.view.batches()
         return count_observations(structure, model, batches, options.max_reprojection_error_px).shares()
 
 

@@ -30,7 +30,7 @@ from sfm_shapefit.synthetic import (
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run
-from tests.scenes import RING, copied, edit_database
+from tests.scenes import RING, copied, edit_database, read_from
 
 
 @pytest.fixture(scope="module")
@@ -518,7 +518,7 @@ def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_p
         copied(workspace, tmp_path) / "database.db",
         "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2",
     )
-    images = read_images(path)
+    images = read_from(path, read_images)
     assert images.rigs.incomplete == (1,)
     assert list(images.rigs.rigs) == [2]
     of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
@@ -539,4 +539,4 @@ def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_p
 def test_a_damaged_rig_of_a_database_is_named(workspace, tmp_path, statement, message):
     path = edit_database(copied(workspace, tmp_path) / "database.db", statement)
     with pytest.raises(InputError, match=message):
-        read_images(path)
+        read_from(path, read_images)

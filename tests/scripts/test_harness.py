@@ -41,7 +41,7 @@ def test_a_verdict_names_every_limit_that_is_missed_and_no_other():
     ]
     assert verdict(checks) == "**missed**: median 0.0300 > 0.0250, max - > 1.00"
     assert verdict(checks[1:2]) == "met"
-    assert verdict([]) == "no target"
+    assert verdict([]) == "-"
     assert Check("median", 1.0, 2.0).goal == "median up to 2.00"
 
 

@@ -19,7 +19,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
-from sfm_shapefit.files.colmap.sqlite_file import is_between, readonly_rows
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.scene.images import Images
 
 _CAMERA = 0
@@ -79,20 +79,21 @@ class DatabaseRigs:
         return pose
 
 
-def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
-    """Read the rigs of a database, which is not changed.
+def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRigs:
+    """Read the rigs of a database.
 
     Args:
-        path: the database.
+        file: the database.
         images: its cameras and images.
 
     Raises:
         InputError: if the database cannot be read, or a rig or a frame is damaged.
     """
-    sensors = _rows(path, "rig_sensors", ("rig_id", "sensor_id", "sensor_from_rig"), "sensor_type")
-    references = dict(_rows(path, "rigs", ("rig_id", "ref_sensor_id"), "ref_sensor_type"))
-    rig_of_frame = dict(_rows(path, "frames", ("frame_id", "rig_id")))
-    data = _rows(path, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
+    path = file.path
+    sensors = _rows(file, "rig_sensors", ("rig_id", "sensor_id", "sensor_from_rig"), "sensor_type")
+    references = dict(_rows(file, "rigs", ("rig_id", "ref_sensor_id"), "ref_sensor_type"))
+    rig_of_frame = dict(_rows(file, "frames", ("frame_id", "rig_id")))
+    data = _rows(file, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
     rigs: dict[int, pycolmap.Rig] = {}
     incomplete = {rig_id for rig_id, _, pose in sensors if pose is None}
     for rig_id, camera_id, pose in sensors:
@@ -118,11 +119,11 @@ def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
     )
 
 
-def _rows(path: Path, table: str, columns: tuple[str, ...], kind: str = "") -> list[tuple[Any, ...]]:
+def _rows(file: DatabaseFile, table: str, columns: tuple[str, ...], kind: str = "") -> list[tuple[Any, ...]]:
     """Return rows of a table, of cameras alone where a column says what kind of sensor it is of."""
     of_cameras = f" WHERE {kind} = {_CAMERA}" if kind else ""
     query = f"SELECT {', '.join(columns)} FROM {table}{of_cameras} ORDER BY 1, 2"
-    return readonly_rows(path, table, {(*columns, *([kind] if kind else [])): query})
+    return file.rows(table, {(*columns, *([kind] if kind else [])): query})
 
 
 def _sensor(camera_id: int) -> pycolmap.sensor_t:
