@@ -48,9 +48,15 @@ class Record:
                 object.__setattr__(self, item.name, None)
 
     @classmethod
+    def taken_from(cls, source: object, **others: Any) -> Self:
+        """Return the record of other values, and a source's attributes that bear the names of its fields."""
+        named = (item.name for item in fields(cls) if item.name not in others and hasattr(source, item.name))
+        return cls(**others, **{name: getattr(source, name) for name in named})
+
+    @classmethod
     def of(cls, source: object) -> Self | None:
-        """Return the record of the attributes that bear the names of its fields; None of None."""
-        return None if source is None else cls(**{f.name: getattr(source, f.name) for f in fields(cls)})
+        """Return the record of a source's attributes; None of None."""
+        return None if source is None else cls.taken_from(source)
 
     @classmethod
     def read(cls, values: Mapping[str, Any]) -> Self:

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -234,8 +234,9 @@ def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
     table.add_column(overflow="fold")
     for label, lines in rows:
         style = _WARNING_STYLE if label == "warning" else ""
-        shown = shorten(lines, elsewhere) if elsewhere else "\n".join(lines)
-        text = "\n".join(_encodable(line) for line in shown.split("\n"))
+        more = len(lines) - NAMES_SHOWN
+        shown = [*lines[:NAMES_SHOWN], f"and {more} more, {elsewhere}"] if elsewhere and more > 0 else lines
+        text = "\n".join(_encodable(line) for line in "\n".join(shown).split("\n"))
         if lines:
             table.add_row(Text(label, style), Text(text, style))
     Console().print(table)
@@ -278,9 +279,3 @@ def _encodable(text: str) -> str:
     """Return printable text with escapes for what stdout, perhaps an ASCII one, cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
     return make_printable(text).encode(encoding, "backslashreplace").decode(encoding)
-
-
-def shorten(lines: Sequence[str], elsewhere: str) -> str:
-    """Return the first lines, and how many there are more and where."""
-    more = [f"and {len(lines) - NAMES_SHOWN} more, {elsewhere}"] if len(lines) > NAMES_SHOWN else []
-    return "\n".join([*lines[:NAMES_SHOWN], *more])

@@ -91,13 +91,10 @@ class MapResult(Displayed):
     @property
     def facts(self) -> MapFacts:
         """What is told of the run: each figure of map.json."""
-        return MapFacts(
+        return MapFacts.taken_from(
+            self,
             inputs=DatabaseInputs(database=str(self.database)),
             options=asdict(self.options),
-            num_images=self.num_images,
-            num_placed=self.num_placed,
-            num_video_frames=self.num_video_frames,
-            num_pairs=self.num_pairs,
             models=[
                 Component(
                     folder=str(number),
@@ -109,9 +106,6 @@ class MapResult(Displayed):
                 for number, model in enumerate(self.models)
             ],
             joins=[join.facts(self.folder_of_join(join)) for join in self.joins],
-            left_out=self.left_out,
-            timings_s=self.timings_s,
-            warnings=list(self.warnings),
         )
 
     @property

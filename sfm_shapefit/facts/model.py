@@ -192,11 +192,6 @@ class FactsOfModel(Facts):
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
 
-    @property
-    def unit_statement(self) -> str:
-        """Scale, origin and axes, in words."""
-        return self.scale
-
 
 class ModelFacts(FactsOfModel, PlacedFacts):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
@@ -336,11 +331,6 @@ class ExaminedFacts(FactsOfModel):
 
     examined: Annotated[Literal[True], "Its positions were looked at as they stand."] = True
     median_track_length: Annotated[float | None, "Of the 3D points."]
-
-    @property
-    def is_examined(self) -> bool:
-        """Whether positions were only looked at as they stand."""
-        return True
 
     @property
     def next_step(self) -> NextStep:

@@ -262,7 +262,7 @@ class Finish(Record):
     reason: Annotated[str, "Why this start was kept."]
     disagreement: Annotated[float | None, "How far the two starts disagree about lengths, as a share."]
     costs: Annotated[dict[str, float], "Robust angular cost of each start after refinement."]
-    levels_deg: Annotated[list[float], "Level of the residuals, of pairs and of directions to points."]
+    levels_deg: Annotated[tuple[float, ...], "Level of the residuals, of pairs and of directions to points."]
     moved_median: Annotated[
         float,
         "Median move of cameras and points from the start that is kept, as a share of their median distance "
@@ -280,16 +280,11 @@ class Finish(Record):
     @classmethod
     def of_placement(cls, refined: RefinedPlacement) -> Self:
         """Return how the locations were found from the optimum."""
-        return cls(
-            start=refined.start,
+        return cls.taken_from(
+            refined,
             refined=refined.is_refined,
-            reason=refined.reason,
-            disagreement=refined.disagreement,
-            costs=refined.costs,
-            levels_deg=list(refined.levels_deg),
             moved_median=refined.moved[0],
             moved_max=refined.moved[1],
-            num_turned_pairs=refined.num_turned_pairs,
             num_put_back=len(refined.reset_nodes),
             lud=Lud.of(refined.lud),
         )
@@ -330,16 +325,6 @@ class Facts(Record):
     versions: Versions
 
     @property
-    def is_examined(self) -> bool:
-        """Whether positions were only looked at as they stand."""
-        return False
-
-    @property
-    def unit_statement(self) -> str:
-        """Scale, origin and axes, in words."""
-        return SOLVER_SCALE
-
-    @property
     def next_step(self) -> NextStep:
         """What to do next."""
         raise NotImplementedError
@@ -370,9 +355,6 @@ class Facts(Record):
         if level is None:
             return []
         return [f"Pairs that agree are off by a standard deviation of {level:.2g} degrees per axis."]
-
-
-SOLVER_SCALE = "solver: the solver's own units, the centroid at the origin"
 
 
 class PlacedFacts(Facts):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
@@ -171,13 +171,10 @@ class LocateResult(Displayed):
             "num_pairs": len(self.directions.pairs),
         }
         facts["num_pairs_rejected"] += len(self.directions.pairs) - placement.num_pairs
-        return ModelFacts(
+        return ModelFacts.taken_from(
+            self,
             **facts,
-            verdict=self.verdict,
             options=asdict(self.options),
-            delivered=self.delivered,
-            timings_s=self.timings_s,
-            warnings=list(self.warnings),
             inputs=self.inputs.facts,
             not_trusted=self._not_trusted(),
             few_points={self.model.names[camera]: count for camera, count in self.few_points.items()},
@@ -194,18 +191,14 @@ class LocateResult(Displayed):
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,
             known_distances=told_distances(self.options.known_distance, model),
-            control_points=self.control_points,
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(model)),
             refined_rigs=self.rigs,
-            line_sigma=self.line_sigma,
             num_doubtful_pairs=len(self.doubtful_pairs),
-            loops=self.loops,
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
             rotation_refinement=RotationRefinement.of_turns(self.turned_deg),
             bundle_adjustment=BundleAdjustment.of(self.adjusted),
-            join=self.join,
         )
 
     @property
@@ -233,9 +226,7 @@ class LocateResult(Displayed):
     @property
     def delivered(self) -> Delivered:
         """What is certified, what is delivered, and how far apart they are."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        return Delivered.compare(self.placement, centers, adjusted=self.adjusted is not None)
+        return Delivered.compare(self.placement, self._centers, adjusted=self.adjusted is not None)
 
     @cached_property
     def verdict(self) -> ModelVerdict:
@@ -263,14 +254,19 @@ class LocateResult(Displayed):
         return self.placement.pieces
 
     @cached_property
+    def _centers(self) -> FloatArray:
+        """Centers (k, 3) of the placement's cameras in the output, NaN for those that are not in it."""
+        ids = self.model.image_ids[self.placement.cameras]
+        centers = np.full((len(ids), 3), np.nan)
+        images = (self.reconstruction.image(image_id) for image_id in ids[self.kept].tolist())
+        centers[self.kept] = [image.projection_center() for image in images]
+        return centers
+
+    @cached_property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        solved_pieces = [piece.placement for piece in self.further]
-        rows = camera_rows(
-            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
-        )
+        scale, solved_pieces = self.gauge.similarity.scale, [piece.placement for piece in self.further]
+        rows = camera_rows(self.placement, self._centers, scale, solved_pieces, self.gauge.axes)
         for camera, reason in without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
         for camera, center in self._carried().items():
@@ -288,9 +284,7 @@ class LocateResult(Displayed):
     @cached_property
     def own_cameras(self) -> list[CameraRow]:
         """One row per camera of the piece that is placed."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+        return own_camera_rows(self.placement, self._centers, self.gauge.similarity.scale)
 
     @property
     def agreeing_pairs(self) -> float:
@@ -476,12 +470,3 @@ class GraphResult(Displayed):
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)
-
-
-def _centers_of(
-    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
-) -> FloatArray:
-    """Return the centers (k, 3) of images, NaN for those that are not kept."""
-    centers = np.full((len(kept), 3), np.nan)
-    centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
-    return centers

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -87,6 +87,7 @@ class PairRow:
 
 
 TableRow = TypeVar("TableRow", CameraRow, PairRow)
+_ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
 """Of the columns of a vector, one per axis, or per two axes."""
 _PARSERS: dict[Any, Callable[[str], Any]] = {
@@ -184,29 +185,15 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-class HasRows(Protocol):
-    """A result with a row per camera and a row per pair."""
-
-    @property
-    def cameras(self) -> list[CameraRow]:
-        """One row per camera."""
-
-    @property
-    def pairs(self) -> list[PairRow]:
-        """One row per pair."""
-
-
-def table_of(found: HasRows, name: TableName, dimension: int) -> dict[str, Column]:
-    """Return the cameras or the pairs of a result as columns.
+def table_of(found: object, name: TableName, dimension: int) -> dict[str, Column]:
+    """Return the cameras or the pairs of a result, which it has as rows, as columns.
 
     Raises:
         ValueError: if there is no table of this name.
     """
-    if name == "cameras":
-        return columns_of(found.cameras, CameraRow, dimension)
-    if name == "pairs":
-        return columns_of(found.pairs, PairRow, dimension)
-    raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
+    if name not in _ROW_TYPES:
+        raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
+    return columns_of(getattr(found, name), _ROW_TYPES[name], dimension)
 
 
 def columns_of(

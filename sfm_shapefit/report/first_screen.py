@@ -66,7 +66,7 @@ def _headline(drawing: Drawing, facts: Facts) -> str:
 
 
 def _sentence(drawing: Drawing, facts: Facts) -> str:
-    reasons = "; ".join(facts.verdict.reasons)
+    reasons, is_examined = "; ".join(facts.verdict.reasons), isinstance(facts, ExaminedFacts)
     reasons = shorten(reasons[:1].upper() + reasons[1:], 4 * MAX_TEXT)
     if facts.verdict.grade is Grade.GOOD:
         agree = int(np.sum(drawing.pairs.classes == PairClass.AGREES))
@@ -74,7 +74,11 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
         others = "none contradicts them"
         if against:
             verb = "contradicts" if against == 1 else "contradict"
-            set_aside = "" if facts.is_examined else f" and {'is' if against == 1 else 'are'} set aside"
+            set_aside = (
+                ""
+                if isinstance(facts, ExaminedFacts)
+                else f" and {'is' if against == 1 else 'are'} set aside"
+            )
             others = f"{against:,} {verb} them{set_aside}"
         return (
             f"{placed_sentence(drawing)[:-1]}; {agree:,} pairs agree with them, {others}, and no "
@@ -86,7 +90,7 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
     more = f" and {len(cameras) - _NAMED:,} more" if len(cameras) > _NAMED else ""
     named = f"{', '.join(cameras[:_NAMED])}{more}"
     verb = "is" if len(cameras) == 1 else "are"
-    if facts.is_examined:
+    if is_examined:
         return f"{named} {verb} weak; the others show no weakness."
     others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
     return f"{named} may be wrong or {verb} left out; {others}."

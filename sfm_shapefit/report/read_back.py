@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.model import read_facts
+from sfm_shapefit.facts.model import FactsOfModel, read_facts
 from sfm_shapefit.facts.placed import Facts, GraphFacts
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, read_rows
@@ -72,7 +72,7 @@ def read_output(folder: Path) -> tuple[Drawing, Facts]:
             poses = replace(poses_of(model, names), centers=poses_of(before, names).centers)
         drawing = replace(
             build_drawing(cameras, pairs, poses=poses, points=points),
-            input_is_aligned=facts.unit_statement.startswith("input:"),
+            input_is_aligned=isinstance(facts, FactsOfModel) and facts.scale.startswith("input:"),
             dimension=dimension,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
@@ -21,6 +22,7 @@ MAX_TEXT = 160
 _FAR_DEG = 1.0
 # Below this trust, reasons are given.
 _LOW_TRUST = 0.75
+_SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 # Of fewer pairs it says nothing that most are of one camera.
 _FEW_PAIRS = 4
 # So many items of a kind are among the first things to look at.
@@ -49,12 +51,13 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
 
 def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
     """Return what was placed, how certain it is, and what else is told of the scene, a sentence each."""
-    stated = facts.unit_statement  # it begins with the option's value
+    stated = facts.scale if isinstance(facts, FactsOfModel) else _SOLVER_SCALE
+    _, _, units = stated.partition(": ")  # after the option's value
     return [
         placed_sentence(drawing),
         _pairs(drawing),
         *_certainty(drawing, facts),
-        f"Units and axes: {shorten(stated.partition(': ')[2] or stated, 2 * MAX_TEXT)}.",
+        f"Units and axes: {shorten(units or stated, 2 * MAX_TEXT)}.",
         *(
             f"{label[:1].upper()}{label[1:]}: {shorten('; '.join(lines), 4 * MAX_TEXT)}."
             for label, lines in facts.scene_rows()

@@ -201,25 +201,20 @@ class Evaluation(Displayed):
     @property
     def facts(self) -> EvaluationFacts:
         """The figures, as they stand in JSON."""
-        return EvaluationFacts(
+        return EvaluationFacts.taken_from(
+            self,
             num_reference=len(self.names) + len(self.missing),
             num_model=len(self.names) + len(self.extra),
             num_common=len(self.names),
             num_missing=len(self.missing),
             num_extra=len(self.extra),
-            missing=self.missing,
-            extra=self.extra,
-            extent=self.extent,
             position_error=self.position,
             rotation_error_deg=self.rotation_deg,
             recall=self.recalls,
             relative_pose_auc=self.relative_pose_aucs,
-            trajectory=self.trajectory,
             worst=self.worst(),
             ref_from_model=self.ref_from_model.facts,
             rotation_ref_from_model=self.rotation_ref_from_model.tolist(),
-            degenerate=self.degenerate,
-            warnings=self.warnings,
         )
 
     def _headline(self) -> str:
