@@ -22,7 +22,7 @@ from harness.process import thread_environment
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.synthetic.graphs import Corruption, GraphProblem, random_graph_problem
+from sfm_shapefit.synthetic.graphs import CorruptionKind, GraphProblem, random_graph_problem
 
 NOT_RECOVERED = 1.0
 """The error of a problem that has no unique answer, as in the paper's black cells."""
@@ -39,7 +39,7 @@ class Cell:
     sigma: float = 0.0
     p: float = 0.5
     d: int = 3
-    corruption: Corruption = "uniform"
+    corruption: CorruptionKind = "uniform"
 
 
 class Trial(NamedTuple):

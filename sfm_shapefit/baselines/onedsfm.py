@@ -11,11 +11,11 @@ Source: Wilson and Snavely, "Robust global translations with 1DSfM", ECCV 2014, 
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.operators import Int32Array, adjacency
+from sfm_shapefit.laplacian.operators import adjacency
 
 _AXES = 48
 # This is the paper's threshold.

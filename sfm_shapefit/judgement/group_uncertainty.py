@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.judgement.uncertainty import Uncertainty, inform, scatter
+from sfm_shapefit.judgement.uncertainty import CameraUncertainty, inform, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
@@ -37,7 +37,7 @@ def propagate_groups(
     gauge: GroupGauge,
     errors: FloatArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-) -> Uncertainty | None:
+) -> CameraUncertainty | None:
     """Return the uncertainty of groups from the information of the directions between them.
 
     Args:
@@ -67,7 +67,7 @@ def propagate_groups(
     if errors is not None:
         forces = (known.across @ errors.transpose(0, 2, 1)) / known.lengths[:, None, None]
         covariances = scatter(_moved(factor, ends, forces, share))
-    return Uncertainty(
+    return CameraUncertainty(
         covariances=covariances[groups.group_of],
         leverages=known.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,

@@ -52,7 +52,7 @@ _SHORTEST = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Uncertainty:
+class CameraUncertainty:
     """Covariances of the locations and leverages of the directions of a rigid graph."""
 
     covariances: FloatArray
@@ -112,7 +112,7 @@ def propagate(
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-) -> Uncertainty | None:
+) -> CameraUncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
     Args:
@@ -142,7 +142,7 @@ def propagate(
     if errors is not None:
         pulls = known.across / known.lengths[:, None, None]
         covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
-    return Uncertainty(covariances=covariances, leverages=known.leverages(inverse, edges), gauge=gauge)
+    return CameraUncertainty(covariances=covariances, leverages=known.leverages(inverse, edges), gauge=gauge)
 
 
 def scatter(samples: FloatArray) -> FloatArray:

@@ -21,8 +21,8 @@ from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.placement.conditioning import LooseGroup, condition
-from sfm_shapefit.refinement.agreement import Agreement, find_agreement, own_covariances
+from sfm_shapefit.placement.conditioning import LooseCameras, condition
+from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Cameras; two have no shape, so nothing in it is uncertain.
@@ -70,7 +70,7 @@ class Assessment:
     """(k,) the factor of trust that says how well the pairs hold each camera."""
     loose_reasons: tuple[str, ...]
     """k sentences that say what the pairs leave open; empty where they hold the camera."""
-    loose_groups: tuple[LooseGroup, ...]
+    loose_groups: tuple[LooseCameras, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     covariances: FloatArray
     """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
@@ -98,7 +98,7 @@ def assess(
     *,
     undetermined_nodes: IntArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-    agreement: Agreement | None = None,
+    agreement: AngularAgreement | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 

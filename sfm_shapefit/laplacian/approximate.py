@@ -18,9 +18,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
-from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
+from sfm_shapefit.laplacian.operators import Adjacency
 
 # A residual so many times the least so far shows that rounding leads, and no longer the system.
 _DIVERGED = 1e6

@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import bsr_array
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
-
-Int32Array = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.laplacian.operators import Adjacency, Int32Array, group_by
+from sfm_shapefit.laplacian.operators import Adjacency, group_by
 
 DEFAULT_FACTOR_BYTES = 2_000_000_000
 """What one factor may take if the caller says nothing."""

@@ -96,7 +96,7 @@ def estimate_relative_rotations(
             parts.append(part)
             if advance is not None:
                 advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
-    return concatenate(parts)
+    return concatenate_rotations(parts)
 
 
 def stored_relative_rotations(
@@ -128,7 +128,7 @@ def stored_relative_rotations(
     return stored.subset(poses.num_inliers >= min_matches)
 
 
-def concatenate(parts: Sequence[RelativeRotations]) -> RelativeRotations:
+def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotations:
     """Return the pairs of all parts, in order; there may be no parts."""
     nothing = RelativeRotations(
         pairs=np.zeros((0, 2), dtype=np.int64),
@@ -158,7 +158,7 @@ def _estimate_slice(
     has_pose, rotations, translations = _start_by_trials(matches, num_pairs)
     found.append(_refine(matches, rotations, translations).subset(has_pose))
     places.append(pairs[has_pose])
-    return concatenate(found).subset(np.argsort(np.concatenate(places)))
+    return concatenate_rotations(found).subset(np.argsort(np.concatenate(places)))
 
 
 def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:

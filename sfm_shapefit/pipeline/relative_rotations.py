@@ -12,7 +12,7 @@ from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.pairs.essential import (
     RelativeSource,
-    concatenate,
+    concatenate_rotations,
     estimate_relative_rotations,
     stored_relative_rotations,
 )
@@ -121,7 +121,7 @@ def measure_rotations(
             matches_per_task=_MATCHES_PER_TASK,
         )
         parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
-    return concatenate(parts)
+    return concatenate_rotations(parts)
 
 
 def _estimate_here(database: MatchDatabase, min_matches: int, sharing: Sharing) -> list[RelativeRotations]:

@@ -46,7 +46,7 @@ class Looseness(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LooseGroup:
+class LooseCameras:
     """Cameras that are loose together."""
 
     cameras: IntArray
@@ -68,7 +68,7 @@ class Conditioning:
     their directions are from parallel; 0 without pairs."""
     causes: tuple[Looseness | None, ...]
     """k causes; None where a camera is not loose."""
-    groups: tuple[LooseGroup, ...]
+    groups: tuple[LooseCameras, ...]
     """The largest standard deviation first."""
 
 
@@ -113,7 +113,7 @@ def condition(
             elif is_straight:
                 causes[camera] = Looseness.ON_A_LINE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
-        groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
+        groups.append(LooseCameras(cameras=members, cause=cause, sigma=float(largest[members].max())))
     return Conditioning(
         num_pairs=num_pairs[:num_cameras].astype(np.int64),
         narrowness=narrowness[:num_cameras],

@@ -22,7 +22,7 @@ from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
-from sfm_shapefit.refinement.agreement import Agreement, find_agreement
+from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
@@ -62,7 +62,7 @@ class Placement(Displayed):
     `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
-    agreement: Agreement
+    agreement: AngularAgreement
     """Which of these edges agree with these locations."""
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""

@@ -41,7 +41,7 @@ _BISECTIONS = 50
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Agreement:
+class AngularAgreement:
     """Which directions of a graph agree with its locations."""
 
     angles_rad: FloatArray
@@ -54,7 +54,7 @@ class Agreement:
     """The part of it, per axis, that the directions' own covariances do not explain."""
 
 
-def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> Agreement:
+def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> AngularAgreement:
     """Return which directions agree with locations (n, d) of a measured graph."""
     graph, groups = measured.graph, measured.groups
     freedom, own = graph.dimension - 1, own_covariances(measured)
@@ -65,7 +65,7 @@ def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> Agreement:
     num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
     excess, agrees = _excess(residuals, own, behind, num_unknowns)
     angles = np.linalg.norm(residuals, axis=1)
-    return Agreement(
+    return AngularAgreement(
         angles_rad=angles, agrees=agrees, level_rad=_level(angles, num_unknowns, freedom), excess_rad=excess
     )
 

@@ -23,7 +23,7 @@ from sfm_shapefit.refinement.angular import (
     allocate_normal,
     information_at,
     plan_refinement,
-    take_step,
+    take_angular_step,
 )
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -69,7 +69,7 @@ def refine_anchored(
     terms = _AnchoredTerms(graph, information_at(graph, metric, levels), anchors)
     t, damping = start, DAMPING.first
     for _ in range(_MAX_STEPS):
-        moved, damping, before, after = take_step(terms, factor, t, damping)
+        moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         if before - after <= _CONVERGED * before:
             break
         t = moved

@@ -142,7 +142,7 @@ def refine_angles(
         levels = levels if settled else lower
         information = _information(graph, spread, levels[metric.classes])
         terms = AngularTerms(graph, information, steep=not settled)
-        moved, damping, before, after = take_step(terms, factor, t, damping)
+        moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
         t, steps = moved, steps + 1
         if settled and still:
@@ -209,7 +209,7 @@ def allocate_normal(plan: SymbolicFactor | LaplacianFactor, dimension: int) -> L
     return allocate_factor(plan, dimension) if isinstance(plan, SymbolicFactor) else plan
 
 
-def take_step(
+def take_angular_step(
     terms: AngularTerms, factor: LaplacianFactor, t: FloatArray, damping: float
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
@@ -230,7 +230,7 @@ def take_step(
     return moved, damping, before, after
 
 
-def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
+def fitting_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
     """Return which pairs fit locations (n, d), (m,): those of chi2 below k^2 at the level of each class."""
     information = information_at(graph, metric, levels)
     residuals = _residuals(graph, _unit(locations))

@@ -21,7 +21,7 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.angular import (
     AngularResult,
     Metric,
-    agreeing_pairs,
+    fitting_pairs,
     plan_refinement,
     refine_angles,
     residual_levels,
@@ -32,7 +32,7 @@ from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 
@@ -199,7 +199,7 @@ def _plan_normal_solver(
     if groups is None:
         return plan_refinement(graph, max_bytes)
     try:
-        return ReducedFactor(graph.edges, groups.normalize(), max_bytes=max_bytes)
+        return RigidReduction(graph.edges, groups.normalize(), max_bytes=max_bytes)
     except UnsolvableError:
         return None
 
@@ -273,7 +273,7 @@ def _reset_strays(
 ) -> tuple[AngularResult, IntArray]:
     """Return a refinement with lone strays reset, or all nodes where that fits better, and the strays."""
     graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
-    agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
+    agreeing = fitting_pairs(graph, refined.locations, metric, levels)
     nodes = find_strays(graph, fallback, refined.locations, agreeing, _noise(metric, levels))
     if problem.measured.groups is not None:
         group_of = problem.measured.groups.group_of
@@ -301,7 +301,7 @@ def _count_turned_pairs(problem: _Problem, kept: Start, levels: FloatArray) -> i
     if kept.refined is None:
         return 0
     before, after = (
-        agreeing_pairs(problem.graph, t, problem.metric, levels) for t in (kept.locations, kept.best)
+        fitting_pairs(problem.graph, t, problem.metric, levels) for t in (kept.locations, kept.best)
     )
     return int(np.sum(before != after))
 

@@ -30,9 +30,9 @@ from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,
     follow_tree,
     move_to_modes,
+    reweigh_pairs,
     turn_cameras,
     weigh_blocks,
-    weigh_pairs,
 )
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
@@ -140,7 +140,7 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
     found, gradient = np.empty(k), np.empty((given.num_cameras, 3))
     for step in range(_ROUNDS):
         tau = max(widest * _COOLING**step, float(_COLDEST))
-        weigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
+        reweigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
         turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), LONGEST_STEP)
         if tau <= _COLDEST and turned <= SETTLED:
             break

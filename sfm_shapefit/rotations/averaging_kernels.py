@@ -85,7 +85,7 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
 
 
 @kernel
-def weigh_pairs(
+def reweigh_pairs(
     pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, found: Any, gradient: Any
 ) -> None:
     """Fill the robust weights (k,) and the gradient D^T W x (n, 3).

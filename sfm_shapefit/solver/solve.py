@@ -31,7 +31,7 @@ _ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 _LARGEST_NEWTON_FLOPS = 4e9
 
 
-class Run(NamedTuple):
+class SolverRun(NamedTuple):
     """What a solver returns; the certificate decides what it is worth."""
 
     locations: FloatArray
@@ -46,7 +46,7 @@ class Choice(NamedTuple):
 
     method: str
     solve: Callable[[ViewGraph, float, int, OnIteration | None], tuple[Any, ...]]
-    """Takes the graph, the tolerance, the limit of iterations and a callback; returns what makes a `Run`."""
+    """From graph, tolerance, limit of iterations and callback to the fields of a `SolverRun`."""
     reason: str
 
 
@@ -107,7 +107,7 @@ def run_choice(
     """
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)
-    run = Run(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
+    run = SolverRun(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
     locations = normalize_locations(graph, run.locations)
     certificate = prove(locations, run.dual)
     status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
@@ -163,11 +163,11 @@ def _split(
     tol: float,
     limit: int,
     watch: OnIteration | None,
-) -> Run:
+) -> SolverRun:
     """Solve by splitting, and say how it ended."""
     found = solve_hybrid(graph, tol, limit, resources, prediction, watch)
     note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
-    return Run(found.locations, found.certificate.dual, found.iterations, note)
+    return SolverRun(found.locations, found.certificate.dual, found.iterations, note)
 
 
 def _refuse_undetermined(graph: ViewGraph) -> None:

@@ -38,7 +38,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 Seed = int | np.random.Generator
-Corruption = Literal["uniform", "self-consistent", "concentrated"]
+CorruptionKind = Literal["uniform", "self-consistent", "concentrated"]
 
 
 class Noise(TypedDict, total=False):
@@ -50,7 +50,7 @@ class Noise(TypedDict, total=False):
     """Probability that a direction is a wrong one."""
     seed: Seed
     """An integer, or a Generator to draw from."""
-    corruption: Corruption
+    corruption: CorruptionKind
     """What wrong directions are like."""
 
 
@@ -253,8 +253,10 @@ def _rng(noise: Noise) -> np.random.Generator:
 def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, noise: Noise) -> GraphProblem:
     """Return the directions of `edges` with noise and corruption."""
     sigma, q, corruption = noise.get("sigma", 0.0), noise.get("q", 0.0), noise.get("corruption", "uniform")
-    if corruption not in get_args(Corruption):
-        raise ValueError(f"corruption must be one of {', '.join(get_args(Corruption))}, got {corruption!r}")
+    if corruption not in get_args(CorruptionKind):
+        raise ValueError(
+            f"corruption must be one of {', '.join(get_args(CorruptionKind))}, got {corruption!r}"
+        )
     right = noisy_directions(locations, edges, sigma, rng)
     wrong = normalized(rng.standard_normal(right.shape))
     odds = np.full(len(edges), q) if corruption != "concentrated" else _odds_by_degree(edges, q)

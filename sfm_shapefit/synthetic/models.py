@@ -19,7 +19,7 @@ from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import ModelContent
 
 
-class Points(NamedTuple):
+class ModelPoints(NamedTuple):
     """The points of a model."""
 
     ids: IntArray
@@ -95,7 +95,7 @@ class ModelParts(NamedTuple):
     camera: pycolmap.Camera
     keypoints: Sequence[FloatArray]
     """Per image, (k, 2)."""
-    points: Points | None
+    points: ModelPoints | None
 
     def model(self, rotations: FloatArray) -> pycolmap.Reconstruction:
         """Return the model with the given rotations at the true centers."""

@@ -26,7 +26,7 @@ from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.synthetic.models import (
     ModelParts,
-    Points,
+    ModelPoints,
     image_name,
     new_camera,
     new_images,
@@ -191,7 +191,7 @@ def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
     return ModelParts(scene, camera, judged.keypoints, _true_points(judged))
 
 
-def _true_points(judged: JudgedMatches) -> Points:
+def _true_points(judged: JudgedMatches) -> ModelPoints:
     """Return the points along right matches, each at the mean of the surface points under its keypoints."""
     first = np.cumsum([0] + [len(xy) for xy in judged.keypoints])
     pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
@@ -206,7 +206,7 @@ def _true_points(judged: JudgedMatches) -> Points:
             points.append(surface[group[once]].mean(axis=0))
             tracks.append(np.stack([images, group[once] - first[images]], axis=1))
     colors = np.full((len(points), 3), _POINT_GRAY, dtype=np.uint8)
-    return Points(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
+    return ModelPoints(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
 
 
 def _camera(scene: RenderedScene) -> pycolmap.Camera:

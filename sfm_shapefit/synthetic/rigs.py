@@ -17,7 +17,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
 from sfm_shapefit.synthetic.mounts import Rigs, yawed
 from sfm_shapefit.synthetic.options import SceneOptions
-from sfm_shapefit.synthetic.scenes import Scene, scene_of
+from sfm_shapefit.synthetic.scenes import Scene, build_scene
 
 NUM_RIGS, NUM_SENSORS = 2, 3
 
@@ -74,7 +74,7 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
         centers=rigs.centers_of(rotations, centers),
         rotations=rigs.rotations_of(rotations),
     )
-    scene = scene_of(layout, rigs, options, rngs)
+    scene = build_scene(layout, rigs, options, rngs)
     return RigScene(scene=scene, **{item.name: getattr(rigs, item.name) for item in fields(Rigs)})
 
 

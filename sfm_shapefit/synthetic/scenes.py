@@ -27,8 +27,8 @@ from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic.layouts import (
     FARTHEST_M,
     ByteArray,
-    Layout,
     SceneCameras,
+    SceneLayout,
     lay_out_scene,
     state_rotations,
     turn_at_random,
@@ -107,10 +107,12 @@ def make_scene(options: SceneOptions) -> Scene:
             than asked for.
     """
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
-    return scene_of(*lay_out_scene(options, rngs[0]), options, rngs[1:])
+    return build_scene(*lay_out_scene(options, rngs[0]), options, rngs[1:])
 
 
-def scene_of(layout: Layout, rigs: Rigs, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
+def build_scene(
+    layout: SceneLayout, rigs: Rigs, options: SceneOptions, rngs: list[np.random.Generator]
+) -> Scene:
     """Photograph, pair and corrupt a layout with five streams of draws; raises what `make_scene` does."""
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
@@ -179,7 +181,7 @@ def project_points(
 # --- keypoints -------------------------------------------------------------------------------------------
 
 
-def _candidates(layout: Layout, options: SceneOptions) -> Iterator[IntArray]:
+def _candidates(layout: SceneLayout, options: SceneOptions) -> Iterator[IntArray]:
     """Yield for each image the points, ascending, near enough to be shown: those in a ball about its view.
 
     A view is a pyramid of height h = `FARTHEST_M` and half diagonal r at its end; the smallest ball about it
@@ -198,7 +200,7 @@ def _candidates(layout: Layout, options: SceneOptions) -> Iterator[IntArray]:
 
 
 def _photograph(
-    layout: Layout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
+    layout: SceneLayout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
 ) -> tuple[IntArray, FloatArray]:
     """Return which of the candidates an image shows, ascending, and their noisy pixels, all inside the image.
 
@@ -315,7 +317,7 @@ def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> t
 
 
 def _false_lists(
-    layout: Layout,
+    layout: SceneLayout,
     keypoint_points: list[IntArray],
     pairs: IntArray,
     options: SceneOptions,
@@ -339,7 +341,7 @@ def _false_lists(
 
 
 def _false_list(
-    layout: Layout,
+    layout: SceneLayout,
     keypoint_points: list[IntArray],
     pair: IntArray,
     options: SceneOptions,
@@ -386,7 +388,7 @@ def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.G
 
 
 def _relative_poses(
-    layout: Layout,
+    layout: SceneLayout,
     pairs: IntArray,
     false_lists: dict[int, _FalseList],
     ray_noise_rad: float,

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.graph.rigidity.growth import compact, incidence, roots, unite
+from sfm_shapefit.graph.rigidity.growth import compact, incidence, merge_sets, roots
 from sfm_shapefit.graph.viewgraph import connected_components
 
 # A game is contracted and restarted when so many times its nodes have been marked.
@@ -272,4 +272,4 @@ def _search_sets(board: _Board, owner: IntArray, done: BoolArray, parent: IntArr
                 w = board.ends[link, 0] + board.ends[link, 1] - x
                 if board.inside[w] == board.clock[1]:
                     done[owner[link]] = True
-                    unite(parent, owner[k], owner[link])
+                    merge_sets(parent, owner[k], owner[link])

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.rigidity.game import contract, play
 from sfm_shapefit.graph.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.operators import Int32Array, adjacency, check_edges
+from sfm_shapefit.laplacian.operators import adjacency, check_edges
 
 # A pebble game on so many nodes takes milliseconds.
 _FIRST_GAME_NODES = 500

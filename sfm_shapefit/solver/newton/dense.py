@@ -14,7 +14,7 @@ from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,
     STALL,
     STEPS_PER_FACTOR,
-    Progress,
+    NewtonProgress,
     Scalars,
     allocate,
     allowed_violation,
@@ -25,7 +25,7 @@ from sfm_shapefit.solver.newton.steps import (
     extend_step,
     is_cancelled,
     is_within,
-    linearize,
+    linearize_program,
     measure,
     pays,
     set_gradient,
@@ -51,7 +51,7 @@ _EDGE_WORK, _SOLVE_WORK = 1000.0, 10.0
 _OPERATIONS_PER_CALL = 4e9
 
 
-class DenseFactor(NamedTuple):
+class DenseNewtonFactor(NamedTuple):
     """Room for M and its Cholesky factor, and what LAPACK is called with."""
 
     matrix: Any
@@ -85,7 +85,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = Progress(*measure(problem, iterate))
+        progress = NewtonProgress(*measure(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -93,7 +93,7 @@ def solve_newton_dense(
             done, stalled, after = _newton(
                 problem, iterate, linearization, factor, step, progress, tol, limit, stalled
             )
-            progress = Progress(*after)
+            progress = NewtonProgress(*after)
             count += done
             if is_cancelled(on_iteration, count, progress):
                 break
@@ -102,10 +102,10 @@ def solve_newton_dense(
     return *answer(problem, iterate, progress, tol), count
 
 
-def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFactor:
+def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseNewtonFactor:
     """Return room for a factor of float32 or float64."""
     size = np.dtype(dtype).itemsize
-    return DenseFactor(
+    return DenseNewtonFactor(
         matrix=np.empty((n * d) ** 2, dtype),
         right=np.empty(n * d, dtype),
         diagonal=np.empty((n, d, d)),
@@ -138,7 +138,7 @@ def _newton(
         first, work = progress.gap, cycle_work
         mu = smoothing(progress, progress.mu)
         set_residuals(problem, iterate.t, iterate.r)
-        linearize(problem, iterate, mu, linearization)
+        linearize_program(problem, iterate, mu, linearization)
         if _factorize(problem, linearization, factor) == 0:
             for _ in range(STEPS_PER_FACTOR):
                 previous = progress.gap
@@ -146,12 +146,12 @@ def _newton(
                 target, exact = _propose(problem, iterate, linearization, factor, step, mu, previous)
                 if not exact:
                     break
-                progress = Progress(*take_step(problem, iterate, step, mu, progress, target))
+                progress = NewtonProgress(*take_step(problem, iterate, step, mu, progress, target))
                 work += step_work
                 if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
                     break
             mu = progress.mu
-        progress = Progress(*close_cycle(iterate, progress, mu, first))
+        progress = NewtonProgress(*close_cycle(iterate, progress, mu, first))
         count += 1
         stalled = 0 if progress.gap < 0.9 * first else stalled + 1
         if progress.gap == first and factor.right.itemsize == 4:

@@ -23,7 +23,7 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.solver.newton.steps import (
     LEAST_MU,
     MU_PER_GAP,
-    Progress,
+    NewtonProgress,
     combine,
     dot,
     measure,
@@ -59,7 +59,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0
-    floor = max(MU_PER_GAP * Progress(*measure(problem, iterate)).gap, LEAST_MU)
+    floor = max(MU_PER_GAP * NewtonProgress(*measure(problem, iterate)).gap, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):

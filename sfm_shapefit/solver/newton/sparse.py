@@ -21,7 +21,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_pinned
-from sfm_shapefit.solver.newton.steps import Iterate, Linearization, Problem, Progress, Work
+from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 
@@ -83,7 +83,7 @@ def solve_newton_reduced(
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     else:
         _begin_at(problem, *start, iterate)
-    progress, count, stalled = Progress(*steps.measure(problem, iterate)), 0, 0
+    progress, count, stalled = NewtonProgress(*steps.measure(problem, iterate)), 0, 0
     while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
         progress = _cycle(work, reduction, progress, tol)
@@ -102,18 +102,18 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
 
 
-def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> Progress:
+def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: float) -> NewtonProgress:
     """Factor once, then step with that factor while it pays."""
     problem, iterate, linearization, step = work
     first = progress.gap
     mu = steps.smoothing(progress, progress.mu)
     steps.set_residuals(problem, iterate.t, iterate.r)
-    steps.linearize(problem, iterate, mu, linearization)
+    steps.linearize_program(problem, iterate, mu, linearization)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorize(problem, linearization, reduction, longest)
     if system is None:
-        return Progress(*steps.close_cycle(iterate, progress, mu, first))
+        return NewtonProgress(*steps.close_cycle(iterate, progress, mu, first))
     factor, edge_work = reduction.factor, steps.EDGE_WORK * len(problem.w)
     step_work = edge_work + steps.SOLVE_WORK * factor.panels.size
     done = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
@@ -123,11 +123,11 @@ def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> 
         target, exact = _propose(work, system, mu, previous)
         if not exact:
             break
-        progress = Progress(*steps.take_step(problem, iterate, step, mu, progress, target))
+        progress = NewtonProgress(*steps.take_step(problem, iterate, step, mu, progress, target))
         done += step_work
         if progress.gap <= tol or not steps.pays(first, previous, progress.gap, done, step_work):
             break
-    return Progress(*steps.close_cycle(iterate, progress, progress.mu, first))
+    return NewtonProgress(*steps.close_cycle(iterate, progress, progress.mu, first))
 
 
 def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:

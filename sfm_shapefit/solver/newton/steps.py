@@ -6,7 +6,7 @@ dual of the program.
 
 What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while the
 kernel ran would be raised there, and end the process by a segmentation fault: kernels return the scalars of
-`Progress` as a plain tuple, of which `Progress(*...)` makes it again.
+`NewtonProgress` as a plain tuple, of which `NewtonProgress(*...)` makes it again.
 """
 
 from typing import Any, NamedTuple
@@ -110,7 +110,7 @@ class Step(NamedTuple):
     """(m,) at the point where the step begins."""
 
 
-class Progress(NamedTuple):
+class NewtonProgress(NamedTuple):
     """The scalars of the iteration."""
 
     mu: float
@@ -125,7 +125,7 @@ class Progress(NamedTuple):
 
 
 Scalars = tuple[float, float, float, float, bool]
-"""The fields of `Progress`."""
+"""The fields of `NewtonProgress`."""
 
 
 class Work(NamedTuple):
@@ -164,7 +164,7 @@ def allocate(graph: ViewGraph) -> Work:
     return Work(problem, Iterate(at_nodes(), at_edges(), at_edges(), at_edges()), linearization, step)
 
 
-def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
+def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: NewtonProgress) -> bool:
     """Tell the callback where the solver stands; return whether it asks to stop."""
     bound = progress.objective - progress.gap
     return asks_to_stop(on_iteration, IterationInfo(iteration, progress.objective, bound))
@@ -209,7 +209,7 @@ def start_from(problem: Any, a: Any, iterate: Any) -> bool:
 
 
 def answer(
-    problem: Problem, iterate: Iterate, progress: Progress, tol: float
+    problem: Problem, iterate: Iterate, progress: NewtonProgress, tol: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
     if progress.objective <= tol:
@@ -280,7 +280,7 @@ def allowed_violation(problem: Any, gap: float) -> float:
 
 
 @kernel
-def linearize(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
+def linearize_program(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
     """Take S at the iterate."""
     y, r = iterate.y, iterate.r
     floor = max(mu, LEAST_MU)
@@ -385,7 +385,7 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
             keep, gain, reached = 1.0 - beta, beta, multiplier + beta * (target - multiplier)
     if progress.clips and reached <= multiplier:
         keep, gain, reached = 1.0, 0.0, multiplier
-    objective, bound = move(problem, iterate, step, alpha, keep, gain)
+    objective, bound = move_along(problem, iterate, step, alpha, keep, gain)
     if not progress.clips:
         start_again(iterate)
     return mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa, progress.clips
@@ -466,7 +466,7 @@ def add_up(x: Any) -> float:
 
 
 @inner_kernel
-def move(
+def move_along(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
     """T += alpha dT, r += alpha dr, y = y+ clipped to its balls, feasible = keep feasible + gain y+.

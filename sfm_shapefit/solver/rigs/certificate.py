@@ -13,7 +13,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import REGULAR, REPAIRS, RESIDUAL_FLOOR, STRICT, Certificate
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
 # Locations may be off those of rigid groups by this share of their extent, which is rounding.
 _OFF_GROUPS = 1e-9
@@ -113,7 +113,7 @@ def _balance(
     blocks = stiffness[:, None, None] * (np.eye(d) - v[:, :, None] * v[:, None, :])
     longest = _longest(graph, locations)
     pin = Pin(longest, graph.edges[longest], v[longest], float(np.mean(stiffness)))
-    system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, pin)
+    system = factor_pinned(RigidReduction(graph.edges, groups), blocks, c, pin)
     if system is None:
         raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
     for _ in range(REPAIRS):
@@ -150,7 +150,7 @@ def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: 
     blocks = w[:, None, None] * conditions
     longest = _longest(graph, locations)
     blocks[longest] += w[longest] * np.outer(v[longest], v[longest])
-    factor = ReducedFactor(graph.edges, groups)
+    factor = RigidReduction(graph.edges, groups)
     try:
         factor.refactor(blocks)
     except UnsolvableError:

@@ -22,7 +22,7 @@ from sfm_shapefit.solver.newton.reduction import Reduction
 _LEAST_SCHUR = 1e-13
 
 
-class ReducedFactor(Reduction):
+class RigidReduction(Reduction):
     """Memory for the factor of A^T D^T S D A; `refactor` overwrites it, `solve` reads it.
 
     It answers in locations, A (A^T D^T S D A)^-1 A^T g, so that whatever works with a Laplacian of cameras

@@ -16,7 +16,7 @@ from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.solve import Choice, run_choice
 
 # A^T c counts as 0 below this size, relative to the sum of weights.
@@ -79,7 +79,7 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
-    factor = ReducedFactor(
+    factor = RigidReduction(
         graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_memory_mb * 1_000_000
     )
 

@@ -20,7 +20,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
 _EPSILON = 1e-10
 _STEPS = 4
@@ -91,7 +91,7 @@ def _null_motions(edges: IntArray, groups: RigidGroups, locations: FloatArray) -
     still = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(locations))
     u = normalized(differences(locations, edges))  # NaN where two nodes coincide, which says nothing
     blocks = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :])
-    factor = ReducedFactor(edges, still)
+    factor = RigidReduction(edges, still)
     try:
         factor.refactor(blocks + _EPSILON * np.eye(d))
     except UnsolvableError:  # regular but for rounding: nothing can be told apart
