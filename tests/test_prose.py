@@ -24,10 +24,28 @@ STILL_TO_DO = {
     "tracks",
 }
 # Public names that several modules still define. The list may only become shorter.
-STILL_ALIKE = set(
-    "Adjusted CameraPoses Group Images Int32Array Intrinsics Join KnownDistance OnIteration Options Points RigidGroups "
-    "Rows Told Tracks UInt64Array bundle_adjust columns_of normalize_locations shorten".split()
-)
+STILL_ALIKE = {
+    "Adjusted",
+    "CameraPoses",
+    "Group",
+    "Images",
+    "Int32Array",
+    "Intrinsics",
+    "Join",
+    "KnownDistance",
+    "OnIteration",
+    "Options",
+    "Points",
+    "RigidGroups",
+    "Rows",
+    "Told",
+    "Tracks",
+    "UInt64Array",
+    "bundle_adjust",
+    "columns_of",
+    "normalize_locations",
+    "shorten",
+}
 
 # The identifier would be the subject of such a sentence.
 OPENING = re.compile(r"(Of|Those|From so many|So many|By what|The latter)\b", flags=re.IGNORECASE)
