@@ -105,7 +105,7 @@ def atomic_folder(
                 partial.mkdir()
                 yield partial
                 _move_into_place(partial, folder, overwrite=overwrite)
-            except InputError as error:  # of a writer, which names the place where it writes
+            except InputError as error:  # raised by a writer, which names the place where it writes
                 raise InputError(str(error).replace(str(partial), str(out))) from error
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
@@ -113,8 +113,8 @@ def atomic_folder(
         raise InputError(f"{out} cannot be written ({error.strerror}); choose another place") from error
 
 
-_PRIVATE_MODE = 0o700
-_CLAIM_ATTEMPTS = 100  # each fails only if somebody removed the folder in the same instant
+_PRIVATE_MODE = 0o700  # permission bits; nobody else may look into a result that is half written
+_CLAIM_ATTEMPTS = 100  # attempts; each fails only if somebody removed the folder in the same instant
 _claimed: ContextVar[Path | None] = ContextVar("_claimed", default=None)
 """The private folder that `claimed_output` holds around the running code."""
 
@@ -156,7 +156,7 @@ def locked_folder(path: Path) -> Iterator[Path]:
     """Make a folder that only this user may enter, hold its lock, and remove it with all it holds.
 
     Raises:
-        FileExistsError: if somebody alive holds it, or its lock cannot tell.
+        FileExistsError: if somebody alive holds it, or if a lock cannot show that nobody does.
         OSError: if it cannot be made.
     """
     try:
@@ -261,7 +261,7 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
         )
 
 
-_AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # of Linux's renameat2
+_AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # arguments of renameat2; see Linux's fcntl.h and fs.h
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 

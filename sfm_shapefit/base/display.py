@@ -4,7 +4,7 @@ import html
 from abc import abstractmethod
 from typing import Any
 
-_MOST_TEXT = 300
+_MOST_TEXT = 300  # characters; a longer value of a table is counted instead
 
 
 class Displayed:

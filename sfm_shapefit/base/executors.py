@@ -10,8 +10,7 @@ from sfm_shapefit.base.errors import ShapeFitError
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
-# So many tasks are on their way at once, which bounds the memory that they take.
-_TASKS_AT_ONCE = 32
+_TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory that they take
 
 
 class WorkerError(ShapeFitError):

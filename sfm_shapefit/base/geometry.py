@@ -10,25 +10,22 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 
 SIGMA_PER_MEDIAN = 1.4826
-"""Standard deviation of a normal x over the median of |x|."""
+"""Standard deviation of a normal x over the median of |x|: 1 / Phi^-1(3 / 4)."""
 
 MEDIAN_NORMAL_LENGTH = 1.538
-"""Median length of a vector of three normal components of variance 1."""
+"""Median length of a vector of three normal components of variance 1: root of the median of chi2(3)."""
 
 METRIC_SIGMA = 0.1
-"""Relative standard deviation up to which a scale counts as known."""
+"""Relative standard deviation up to which a scale counts as known; a rough one is told with a warning."""
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
-"""From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
+"""Turn of camera axes about x, its own inverse: y up, looking along -z (OpenGL, NeRF), to COLMAP's."""
 
-# Where half of the points are good, so is 1 draw of 3 in 8: none in 256 has odds 1e-15.
-_NUM_SAMPLES = 256
-_NUM_REFINED_SAMPLES = 4
-# Reweighting stops earlier once nothing changes.
-_MAX_REWEIGHTINGS = 200
+_NUM_SAMPLES = 256  # draws of 3 points; if half are good so is 1 draw of 8, none in 256 has odds 1e-15
+_NUM_REFINED_SAMPLES = 4  # draws; only the best are refined, as each takes many reweightings
+_MAX_REWEIGHTINGS = 200  # steps, a bound: reweighting stops once nothing changes
 
-# Rounding of distances, as a share of the largest.
-_ROUNDING = 1e-14
+_ROUNDING = 1e-14  # share of the largest distance; a smaller distance is 0
 
 
 def normalized(vectors: FloatArray) -> FloatArray:
@@ -244,7 +241,7 @@ def mean_rotation_l1(rotations: FloatArray) -> FloatArray:
     Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011;
     the chordal instead of the geodesic distance.
     """
-    floor = 1e-9  # of the distances in the weights; chordal distances are at most 2 sqrt(2) for d = 3
+    floor = 1e-9  # in the weights; chordal distances are at most 2 sqrt(2) for d = 3
 
     def distances(rotation: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.norm(rotations - rotation, axis=(1, 2)))

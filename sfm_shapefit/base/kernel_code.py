@@ -20,7 +20,7 @@ from numba.core.environment import Environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-# Of strings in sets and dictionaries: numba defines these symbols when it is ready to compile.
+# Symbols of string hashes in sets and dictionaries: numba defines them when it is ready to compile.
 _NEEDS_COMPILER = b"_numba_hashsecret"
 
 

@@ -24,7 +24,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 
 S = TypeVar("S", bound="Settings")
 
-_HELP_WIDTH = 88
+_HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a terminal
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
