@@ -22,8 +22,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen, sum_by
 from sfm_shapefit.base.errors import InputError
 
-# An offset within its group smaller than this, relative to the largest offset, counts as none.
-_COINCIDENT = 1e-12
+_COINCIDENT = 1e-12  # share of the largest offset; a smaller offset within a group is rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

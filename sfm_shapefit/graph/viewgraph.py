@@ -15,10 +15,10 @@ from scipy.sparse import coo_array, csgraph
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 
-# A direction printed with 7 digits still passes; a wrong one does not.
-_UNIT_NORM_TOLERANCE = 1e-6
-# A norm that is off by no more is 1: dividing by it again would only change last bits.
-_ROUNDING = 8.0 * np.finfo(np.float64).eps
+_UNIT_NORM_TOLERANCE = 1e-6  # absolute; a direction printed with 7 digits passes, a wrong one does not
+_ROUNDING = (
+    8.0 * np.finfo(np.float64).eps
+)  # rounding of a norm; dividing by 1 to rounding only changes last bits
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)

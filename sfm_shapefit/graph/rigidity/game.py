@@ -14,8 +14,7 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.graph.rigidity.growth import compact, incidence, merge_sets, roots
 from sfm_shapefit.graph.viewgraph import connected_components
 
-# A game is contracted and restarted when so many times its nodes have been marked.
-_GAME_WORK = 20
+_GAME_WORK = 20  # nodes marked, per node; then contracting and restarting is cheaper than going on
 
 
 class Game(NamedTuple):

@@ -12,11 +12,9 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import group_by
 
-# A later round rarely unites anything; the pebble game is exact anyway.
-_GROWTH_ROUNDS = 4
+_GROWTH_ROUNDS = 4  # rounds; a later one rarely unites anything, and the pebble game is exact anyway
 
-# Limit of the nodes looked at while growing, as a multiple of all incidences of sets and nodes.
-_GROWTH_WORK = 30
+_GROWTH_WORK = 30  # nodes looked at, per incidence of a set and a node; a bound, the game is exact anyway
 
 
 def compact(label: IntArray) -> IntArray:

@@ -13,11 +13,9 @@ from sfm_shapefit.graph.rigidity.growth import compact, grow_sets, incidence, tr
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency, check_edges
 
-# A pebble game on so many nodes takes milliseconds.
-_FIRST_GAME_NODES = 500
+_FIRST_GAME_NODES = 500  # nodes; a pebble game on these takes milliseconds
 
-# So many pairs per node are twice what rigidity needs in space, and mostly enough where pairs abound.
-_FEW_LINKS = 6
+_FEW_LINKS = 6  # pairs per node; twice what rigidity needs in space, mostly enough where pairs abound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,16 +27,16 @@ class RigidPiece:
     edges: IntArray
     """Indices of its pairs in the graph's `edges`, ascending."""
     hinges: IntArray
-    """Those of its nodes that also belong to another piece of at least 3 nodes, ascending."""
+    """Nodes that also belong to another piece of at least 3 nodes, ascending."""
 
 
 def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return the rigid piece of each pair, for positions in general position.
 
-    The contraction is exact: a motion of the whole is one translation and scale per set, equal where
-    sets share a node. A frame on the b shared nodes w_0, w_1, ... of a set (d - 1 copies of
-    each w_0 w_k, one of each w_1 w_k, k > 1) admits the same motions there: it has d b - (d + 1)
-    copies, and it is independent, since each w_k adds d copies, at most d - 1 of them to one node.
+    The contraction is exact: a motion of the whole is one translation and scale per set, equal where sets
+    share a node. A set on the b shared nodes w_0, w_1, ... is replaced by a frame: d - 1 copies of each
+    w_0 w_k, one of each w_1 w_k, k > 1. It admits the same motions there, as it has d b - (d + 1) copies, and
+    it is independent, since each w_k adds d copies, at most d - 1 of them to one node.
 
     Args:
         num_nodes: n.
