@@ -17,14 +17,12 @@ from sfm_shapefit.base.geometry import angle_between, normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency
 
-_ITERATIONS = 10
-# A triangle's weight falls so fast, per radian, with the scores of its sides, at the end.
-_SHARPEST = 20.0
+_ITERATIONS = 10  # rounds of weights and scores; the weights sharpen from one to the next
+_SHARPEST = 20.0  # fall of a triangle's weight per radian of its sides' scores; reached in the last round
 # Two sides are opposite if one is so near to the other turned round; a noise of 0.05 then bends the
 # plane by 0.3.
 _OPPOSITE_RAD = 0.2
-# This score, in radians, lies between those of wrong pairs, around one, and those of noisy ones.
-_KEPT = 0.2
+_KEPT = 0.2  # radians of score; between those of wrong pairs, around one, and those of noisy ones
 
 
 def filter_triangles(
@@ -86,7 +84,7 @@ def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:
         e2 = normalized(b - np.sum(a * b, axis=1, keepdims=True) * a)
     e2 = np.nan_to_num(e2)
     along_a, along_e = np.sum(x * a, axis=1), np.sum(x * e2, axis=1)
-    reach = np.arctan2(np.sum(b * e2, axis=1), np.sum(a * b, axis=1))  # of the arc, from a to b
+    reach = np.arctan2(np.sum(b * e2, axis=1), np.sum(a * b, axis=1))  # length of the arc from a to b
     nearest = np.arctan2(along_e, along_a)
     on_arc = (nearest >= 0.0) & (nearest <= reach)
     off_plane = x - along_a[:, None] * a - along_e[:, None] * e2

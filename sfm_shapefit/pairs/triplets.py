@@ -18,11 +18,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
-# Of a rotation by no more than that angle.
-_LEAST_TRACE = 1.0 + 2.0 * float(np.cos(np.radians(AGREEMENT_DEG)))
-_ROUNDS = 5
-# Triangles of pairs of score 0 count so little, but they count where a pair has no others.
-_LEAST_WEIGHT = 1e-6
+_LEAST_TRACE = 1.0 + 2.0 * float(
+    np.cos(np.radians(AGREEMENT_DEG))
+)  # trace of a rotation by that angle; turns are less
+_ROUNDS = 5  # rounds of scores; later ones hardly change any
+_LEAST_WEIGHT = 1e-6  # weight of a triangle of pairs of score 0; it decides where a pair has no others
 # Between two slices Python can be interrupted: at most some 10 ms for 1,000 images, all matched.
 _PAIRS_PER_SLICE = 1000
 

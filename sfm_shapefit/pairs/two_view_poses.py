@@ -42,20 +42,17 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.matches import RayMatches
 
-_FIRST_WIDTH_PX = 4.0
+_FIRST_WIDTH_PX = 4.0  # pixels, s of the first step; a pose from few trials is off by as much
 LAST_WIDTH_PX = 1.5
 """s of the last steps. Measured: 1 to 1.5 px are alike, 3 px is a third worse."""
-# The width falls in equal ratios over so many steps.
-_NARROWING_STEPS = 3
-_STEPS = 12
-_LONGEST_STEP_RAD = 0.3
-_CONVERGED_RAD = 1e-7
-_UNKNOWNS = 5
-# Pivots below this share of the trace are rounding. In pixels: parallax of 3e-7 of the focal length.
-_LEAST_PIVOT = 1e-13
-# In rad^-2, and as a share of H_ww's trace, whose rounding the Schur complement has.
-_LEAST_INFORMATION = 1.0
-_ROUNDING = 1e-12
+_NARROWING_STEPS = 3  # steps over which the width falls; in equal ratios
+_STEPS = 12  # steps, a bound; most pairs converge in fewer
+_LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
+_CONVERGED_RAD = 1e-7  # radians; a shorter step is the last
+_UNKNOWNS = 5  # three of the rotation, two of the unit translation; its length is free
+_LEAST_PIVOT = 1e-13  # share of the trace; a smaller pivot is rounding, a parallax of 3e-7 focal lengths
+_LEAST_INFORMATION = 1.0  # rad^-2; a rotation is never known less
+_ROUNDING = 1e-12  # share of H_ww's trace; the rounding of the Schur complement
 
 
 class TwoViewPoses(NamedTuple):
