@@ -29,9 +29,8 @@ from sfm_shapefit.refinement.cg_normal_solver import GraphShape
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.program import adjoint
 
-_MAX_STEPS = 40
-# A step that lowers the cost by less than this share of it is the last one.
-_CONVERGED = 1e-9
+_MAX_STEPS = 40  # steps, a bound; a start near the answer needs few
+_CONVERGED = 1e-9  # relative decrease of the cost; a smaller one is the last
 
 
 def weighted_anchors(anchors: KnownPositions, t: FloatArray) -> KnownPositions:

@@ -48,27 +48,21 @@ KERNEL_WIDTH = 3.0
 """k: a residual of so many standard deviations counts half of what it can."""
 
 DAMPING = DampingRange()
-"""Of the steps, relative to the damping matrix of `AngularTerms`."""
+"""Damping of the steps, relative to the damping matrix of `AngularTerms`."""
 
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 # On exact data a smaller level would reject pairs for their rounding.
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH
-# With less than this share of a class inside the kernel most of it is not fitted yet, and its level stays.
-_LEAST_SHARE = 0.2
+_LEAST_SHARE = 0.2  # share of a class inside the kernel; with less most is not fitted yet, its level stays
 # The floor under |d|, relative to the median length: a shorter baseline has no direction.
 _SHORTEST = 1e-3
-# A smaller relative change of the levels, and a smaller relative decrease of the cost, counts as none.
-_SETTLED = 0.03
-_CONVERGED = 1e-9
-# A move of less than this share of the extent, by all but a tenth of the nodes, counts as none.
-_STILL = 1e-6
-# Costs that differ by less, relatively, are those of the same place.
-_ALIKE = 1e-6
-# A cost that is above the best one so far by more than so many of its last decreases does not catch up.
-_HOPELESS = 20.0
-_MAX_STEPS = 60
-# One factorization in blocks of so many operations takes about a second, and 15 to 40 are needed.
-_MAX_FLOPS = 3e10
+_SETTLED = 0.03  # relative change of a level; a smaller one counts as none
+_CONVERGED = 1e-9  # relative decrease of the cost; a smaller one counts as none
+_STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the nodes counts as none
+_ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
+_HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
+_MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
+_MAX_FLOPS = 3e10  # operations of one factorization in blocks; they take about a second per step
 
 
 class Metric(NamedTuple):
@@ -249,7 +243,7 @@ def residual_levels(
     equations = freedom * graph.num_edges
     unknowns = graph.dimension * (graph.num_nodes - 1) - 1
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
-    median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # of a residual of unit variance per axis
+    median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # with unit variance per axis
     chords = np.linalg.norm(_residuals(graph, _unit(locations)), axis=1)
     found = np.empty_like(levels)
     for c, level in enumerate(levels):

@@ -37,22 +37,16 @@ from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 
 COLLAPSED = 0.3
-"""Disagreement of the starts beyond which one of them has collapsed."""
+"""Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
 
-# Disagreement from which LUD is likely to be the better start.
-_UNEQUAL = 0.1
-# More change nothing after the refinement.
-_LUD_STEPS = 50
-# Up to so many pairs LUD's own bound is computed, which costs about 100 more iterations.
-_LUD_CERTIFIED_PAIRS = 50_000
-# Beyond so many pairs the second start takes as long as the first.
-_LUD_PAIRS = 1_000_000
-# Weight in LUD of a direction to a 3D point, since all have one loss there whatever their noise.
-_POINT_WEIGHT = 10.0
-# A relative difference of costs that says nothing where the starts disagree.
-_TIE = 1e-3
+_UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
+_LUD_STEPS = 50  # iterations; more change nothing after the refinement
+_LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
+_LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
+_POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
+_TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 OPENING_RAD = 0.1
-"""Largest width of the kernel at which unrefined starts are compared."""
+"""Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
