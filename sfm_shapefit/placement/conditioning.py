@@ -23,15 +23,13 @@ from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
 
 LOOSE_SHARE = 0.05
-"""Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
+"""Standard deviation from which a camera is loose; in median distances of the cameras from their median."""
 FEW_PAIRS = 2
-"""Pairs of a camera up to which they are too few to check one another."""
+"""Pairs of a camera up to which they are too few to check one another: each fits one of its d unknowns."""
 NEARLY_PARALLEL = 0.02
 """The `direction_spread` below which directions are nearly parallel: within about 8 degrees."""
-# Cameras that can lie on a line, or not.
-_SMALLEST_LINE = 3
-# Second over first singular value of positions on a line.
-_ON_A_LINE = 0.02
+_SMALLEST_LINE = 3  # cameras; two are on a line whatever they do
+_ON_A_LINE = 0.02  # second over first singular value of positions; smaller on a line, bends included
 
 
 class Looseness(enum.Enum):
@@ -52,7 +50,7 @@ class LooseCameras:
     cameras: IntArray
     """Ascending."""
     cause: Looseness
-    """Of most of them."""
+    """Cause that most of them have."""
     sigma: float
     """Largest standard deviation among them, in the locations' units; infinite if nothing holds them."""
 

@@ -1,15 +1,14 @@
 """Ground control points: points of known position that images show, which set scale, origin and axes.
 
 Their positions in the model are triangulated; a similarity maps these onto the known ones. It starts from
-the robust fit that position priors have. Then those that fit are told by the noise of all that fit: with n
-points of three coordinates and 7 parameters,
+the robust fit that position priors have. Then the noise of all that fit decides who fits: with n points of
+three coordinates and 7 parameters,
 
     sigma^2 = sum |residual|^2 / (3 n - 7),
 
 a point outside the fit is off by sigma sqrt(1 + h) per axis, with its leverage h = tr(J N^-1 J^T) / 3, and
-fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma that few points tell badly. On
-made points, this left out 0.03 to 0.17 good ones a fit of 4 to 7, and found one that is 25 sigma off per
-axis in 67 % of the fits of 4 points, and in 97 % or more of those of 5 to 7. Three points check nothing.
+fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma from few points. Measured:
+`scripts/results/notes.md#control-points`. Three points check nothing.
 """
 
 from typing import NamedTuple
@@ -38,13 +37,11 @@ from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
 
-# Marks are set by hand, in a model that may be bent: they miss by more than keypoints do.
-_MARK_ERRORS = 4.0
-_PARAMETERS = 7
-_FITTING_SIGMAS = 4.0
-_MOST_ROUNDS = 20
-# Nor do those within so many standard deviations.
-_FLAT = 5.0
+_MARK_ERRORS = 4.0  # keypoint errors; marks are set by hand, in a model that may be bent
+_PARAMETERS = 7  # parameters of a similarity: scale 1, turn 3, shift 3
+_FITTING_SIGMAS = 4.0  # standard deviations; chosen on scripts/results/notes.md#control-points
+_MOST_ROUNDS = 20  # rounds, a bound; who fits settles in fewer
+_FLAT = 5.0  # standard deviations; a smaller spread across a line leaves the turn about the line open
 
 
 class TriangulatedControl(NamedTuple):
@@ -67,9 +64,9 @@ class ControlFit(NamedTuple):
     fitting: BoolArray
     """(k,) those that set it."""
     sigma: float
-    """Standard deviation of their coordinates; 0 if they are too few to tell."""
+    """Standard deviation of their coordinates; 0 if they are too few to have one."""
     residuals: FloatArray
-    """(k, 3) the model's position minus the known one, in units of the latter; NaN where it has none."""
+    """(k, 3) the model's position minus the known one, in units of the known one; NaN where it has none."""
     scale_sigma: float
     """Relative standard deviation of the scale."""
 

@@ -44,10 +44,8 @@ WRONG_SCORE_RAD = 0.3
 MAX_THEORY_CAMERAS = 2000
 """The constants of the theorems take time with the cube of the cameras: minutes here."""
 
-# Beyond so many pairs, which take half a minute, nothing is said of corruption.
-_MAX_SCORED_PAIRS = 200_000
-# Share of a camera's pairs that contradict their triangles, from which its rotation may be wrong.
-_CONTRADICTED_SHARE = 0.5
+_MAX_SCORED_PAIRS = 200_000  # pairs; more take half a minute, and corruption is not estimated
+_CONTRADICTED_SHARE = 0.5  # share of a camera's pairs; if more contradict triangles its rotation may be wrong
 # Cameras of a piece: fewer have no triangle.
 _SMALLEST_CHECKED = 3
 
@@ -95,7 +93,7 @@ class PlannedPlacement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
-    """What there is to know of a view graph without solving."""
+    """Properties of a view graph that are known without solving."""
 
     dimension: Annotated[int, "Of the locations."]
     num_cameras: Annotated[int, "Nodes of the graph that are no points."]

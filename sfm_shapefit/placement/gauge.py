@@ -1,4 +1,4 @@
-"""Scale, origin and axes of the answer: what directions cannot tell, chosen by the user and stated.
+"""Scale, origin and axes of the answer: left open by directions, chosen by the user and stated.
 
 The program leaves scale and shift free (sum_i t_i = 0, L(T) = kappa); rotations are given, so the axes are
 the input's. A gauge is a scale and a shift of the centers and, with position priors alone, a turn of the
@@ -26,19 +26,14 @@ from sfm_shapefit.base.geometry import (
 from sfm_shapefit.refinement.options import Scale
 from sfm_shapefit.scene.given import Datum, PositionPriors
 
-# An input center that is farther off, of the spread of all, is lost and must not set the scale.
-_CAP_OF_SIZE = 0.5
-# The scale is rough if the median distance of the input's centers from the answer is more of their spread.
-_ROUGH = 0.1
-# A smaller spread of centers, relative to their distance from the origin, counts as none.
-_COINCIDENT = 1e-9
-FEWEST_PRIORS = 2
-_PRIORS_FOR_AXES = 3
-# A spread across a line of fewer residuals than this says nothing of the turn about the line.
-_FLAT = 5.0
-# The weight of a prior is half at so many standard deviations.
-_KERNEL_WIDTH = 3.0
-_REWEIGHTINGS = 20
+_CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
+_ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
+_COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
+FEWEST_PRIORS = 2  # positions; with fewer there is no scale
+_PRIORS_FOR_AXES = 3  # positions; two leave the turn about their line open
+_FLAT = 5.0  # residuals; a smaller spread across a line leaves the turn about the line open
+_KERNEL_WIDTH = 3.0  # standard deviations at which a prior has half of its weight; lost ones hardly count
+_REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
 
 
 class UselessPriorsError(InputError):
@@ -147,8 +142,8 @@ def distance_gauge(
 ) -> Gauge:
     """Return the gauge in which cameras are so far apart; origin: the centroid.
 
-    One distance becomes true. Of several the scale is the robust least-squares fit to all, weights
-    1 / (1 + (residual / 3 levels)^4), from the median of what each says alone.
+    One distance becomes true. For several, the scale is the robust least-squares fit to all, weights
+    1 / (1 + (residual / 3 levels)^4), from the median of the scales that single ones give.
 
     Args:
         locations: (n, 3) the solver's answer.

@@ -39,28 +39,22 @@ from sfm_shapefit.placement.gauge import fit_to_priors, prior_gauge
 from sfm_shapefit.scene.given import PositionPriors
 
 FEWEST_WITNESSES = 3
-"""Pairs of images, or known positions in each model, that a join needs."""
-_FEWEST_MATCHES = 24
-# From fewer points that both models have no start is drawn.
-_FEWEST_POINTS = 6
-# Pairs that agree on another join are a rival from this share of those that agree on the best.
-_LEAST_RIVAL_SHARE = 0.25
-# Pairs that contradict the best join, of those that agree on it, at most.
-_MOST_AGAINST = 3.0
+"""Pairs of images, or known positions in each model, that a join needs; two leave nothing to check it by."""
+_FEWEST_MATCHES = 24  # matches of a pair that can be a witness; fewer are chance
+_FEWEST_POINTS = 6  # points that both models have; from fewer no start is drawn
+_LEAST_RIVAL_SHARE = 0.25  # share of the best join's pairs; from here on another join is a rival
+_MOST_AGAINST = 3.0  # pairs that contradict the best join, per agreeing pair; beyond, it is refused
 # Turns that single pairs suggest agree up to here; so many groups of them are tried.
 _SAME_TURN_DEG = 5.0
-_MOST_TURNS = 8
-_LARGEST_SCALE_SIGMA = 0.05
-_LARGEST_TURN_SIGMA_DEG = 3.0
-# Of the median distance of the second model's cameras from their middle.
-_LARGEST_CENTER_SIGMA = 0.1
-_NUM_SAMPLES = 256
-_NUM_REFINED = 4
-_REWEIGHTINGS = 20
-# More matches than these make the fit no better.
-_MOST_MATCHES = 1_000
-# Witnesses are left out by so many groups at most.
-_MOST_FITS = 12
+_MOST_TURNS = 8  # groups of turns that are tried; bounds the time where single pairs scatter
+_LARGEST_SCALE_SIGMA = 0.05  # relative standard deviation of the scale; above, the join is refused
+_LARGEST_TURN_SIGMA_DEG = 3.0  # degrees, standard deviation of the turn; above, the join is refused
+_LARGEST_CENTER_SIGMA = 0.1  # standard deviation of the place in spreads of the second model; likewise
+_NUM_SAMPLES = 256  # draws of few points; if half are good, none of these is with odds 1e-15
+_NUM_REFINED = 4  # draws; only the best are refined
+_REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
+_MOST_MATCHES = 1_000  # matches; more make the fit no better
+_MOST_FITS = 12  # groups by which witnesses are left out; each is a fit of its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

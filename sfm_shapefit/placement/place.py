@@ -106,7 +106,7 @@ class Placement(Displayed):
 
     @property
     def pairs(self) -> IntArray:
-        """Those of `edges` that join two cameras, as rows of everything per edge."""
+        """Edges that join two cameras, as rows of everything per edge."""
         return np.flatnonzero(self.measured.is_pair[self.edges])
 
     @property

@@ -9,9 +9,8 @@ from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between, norm
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.scene.given import PositionPriors
 
-# A direction contradicts its baseline beyond so many standard deviations of it, and beyond so many degrees.
-_FAR = 4.0
-_LEAST_DEG = 5.0
+_FAR = 4.0  # standard deviations of the baseline; a direction beyond these and ...
+_LEAST_DEG = 5.0  # ... beyond this, in degrees, contradicts it; good rotations are not that far off
 
 
 class PriorAngles(NamedTuple):

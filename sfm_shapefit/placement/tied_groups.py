@@ -16,8 +16,7 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# The largest offset, of the median baseline, below which the scale of the offsets means nothing.
-_LEAST_UNIT = 1e-6
+_LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means nothing
 
 
 def refuse_options_of_groups(options: PlacementOptions) -> None:
