@@ -24,9 +24,8 @@ from sfm_shapefit.base.jit import cross, inner_kernel, kernel, mix_bits
 from sfm_shapefit.scene.matches import MatchBatch
 
 NUM_SAMPLES = 96
-"""Standard deviations from so many samples are right to 7 %."""
-# Two of the 64 bits of a hash make one sample.
-_SIGNS_PER_HASH = 32
+"""Samples of the directions' errors; standard deviations from them are right to 7 %."""
+_SIGNS_PER_HASH = 32  # samples per hash of 64 bits; each takes two of them
 
 
 def sample_direction_errors(

@@ -48,19 +48,18 @@ from sfm_shapefit.pairs.pair_directions import is_usable
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches
 
-_COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
-_FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)
-_WIDTH_PX = 1.5
-# Of all pairs on average, with rotations held and free: a rotation of its own lets each pair gain by chance.
+_COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)  # factors; one lies in the reach of any true one
+_FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)  # factors on the best coarse one; as close as a gain shows
+_WIDTH_PX = 1.5  # pixels; width of the robust weights
+# Mean gain over all pairs, with rotations held and free; a rotation of its own lets each pair gain by chance.
 _LEAST_GAINS = {True: 0.01, False: 0.03}
-_NOTICED, _LEAST_SIGMAS = 0.01, 3.0
-_LEAST_CHANGE = 0.05
-# With rotations held: images of a camera, and the share of them that gain.
+_NOTICED, _LEAST_SIGMAS = 0.01, 3.0  # gain of a pair, and deviations of a fair coin; see the header
+_LEAST_CHANGE = 0.05  # relative change of the focal length; a smaller one is not worth a name
+# Images of a camera, and the share of them that gain, with rotations held; see the header.
 _FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 2, 0.75
-# A rival gains nearly as much from this share on.
-_RIVAL = 0.8
-_FEWEST_PAIRS = 5
-_MOST_NAMED = 5
+_RIVAL = 0.8  # share of the largest gain; from here on a rival gains nearly as much
+_FEWEST_PAIRS = 5  # pairs of a camera; fewer are chance
+_MOST_NAMED = 5  # cameras named; each takes a round of trials
 
 
 class Lenses(NamedTuple):
@@ -83,7 +82,7 @@ class FocalDoubt(NamedTuple):
     factor: float
     """The preferred focal length over the given one."""
     gain: float
-    """By what the mean robust weight of its matches grows."""
+    """Growth of the mean robust weight of its matches."""
     num_pairs: int
     """Pairs that were asked."""
 

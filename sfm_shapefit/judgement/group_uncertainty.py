@@ -18,8 +18,7 @@ from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.program import adjoint
 
-# Share of each block's trace that is added.
-_RIDGE = 1e-12
+_RIDGE = 1e-12  # share of each block's trace that is added; keeps the inverse finite
 
 
 class GroupGauge(NamedTuple):

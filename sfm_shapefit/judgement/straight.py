@@ -4,9 +4,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 
-# All but a few directions lie within this angle of the line.
-_MOST_DEG, _SHARE = 1.0, 0.95
-_FEWEST_DIRECTIONS = 3
+_MOST_DEG, _SHARE = 1.0, 0.95  # degrees from the line, and share of directions within; a few may be wrong
+_FEWEST_DIRECTIONS = 3  # directions; fewer lie on a line by chance
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:

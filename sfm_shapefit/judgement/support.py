@@ -14,13 +14,10 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.joining import sampson_px
 
-# So many frames stay whatever they see.
-_FEWEST_FRAMES = 3
-# Matches in other images that make a keypoint part of a track that can be checked.
-_CHECKED_BY = 2
-# Of an image with this many such keypoints, the least share that sees points: less is chance. No right image
-# of data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed,
-# had none.
+_FEWEST_FRAMES = 3  # frames; so many stay whatever they see, as a model of fewer is none
+_CHECKED_BY = 2  # matches of a keypoint in other images; with as many its track can be checked
+# Keypoints that can be checked, and share of them that sees points; less is chance. No right image of
+# data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed, 0.
 _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 
 
@@ -54,7 +51,7 @@ def deregister_of_few_points(
 
 
 class ObservationShares(NamedTuple):
-    """Of the keypoints that are matched in two or more other registered images; NaN without any."""
+    """Shares of the keypoints that are matched in two or more other registered images; NaN without any."""
 
     agreeing: float
     """The share that sees a 3D point."""
@@ -64,7 +61,7 @@ class ObservationShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
-    """Of n registered images, the keypoints that are matched in two or more other ones."""
+    """Numbers of keypoints that are matched in two or more other images, of n registered images."""
 
     image_ids: IntArray
     """(n,)"""

@@ -26,9 +26,9 @@ Bodies are found by contraction (`bodies`) from pairs that agree and pairs that 
 relative: of all bodies the one whose turn mends most is turned first, the smallest of equals, and none that
 has more than half of all cameras; its pairs then agree, and bodies are found anew.
 
-Turns that are smaller than a pair can tell are looked for at last, in all pairs together (`small_turns`). Of
-a camera whose correction is larger than a degree, and than five of its standard deviations, `turned` are the
-pairs that fit better with it, `placed` those that fit only without.
+Turns too small for a single pair are looked for at last, in all pairs together (`small_turns`). For a camera
+whose correction is larger than a degree, and than five of its standard deviations, `turned` are the pairs
+that fit better with it, `placed` those that fit only without.
 
 How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
 and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
@@ -36,9 +36,9 @@ degrees are added for the given rotations, and where the quarter of pairs that a
 than that, all standard deviations are as much larger. Chosen on fourteen scenes of good rotations: 4 to 12 %
 of their sound pairs seem turned, and 98 % of those of cameras that were turned by 2 degrees.
 
-How well the matches of a pair fit the given rotations, with the best direction, against how well they fit the
-best rotation: the ratio of the mean robust weights, of which the former is estimated from share and median
-residual of the inliers. It is 1 or more for all but 5 % of the right pairs.
+Support of the given rotations is the ratio of the mean robust weights of a pair's matches with the best
+direction there and with the best rotation, the first estimated from share and median residual of the inliers.
+It is 1 or more for all but 5 % of the right pairs.
 """
 
 import enum
@@ -54,38 +54,25 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
 
-# Matches of a pair that count as independent, for its turn and for its vote.
-_INDEPENDENT_MATCHES = 20.0
-_MOST_WEIGHT = 200.0
-_FLOOR_RAD = np.radians(0.1)
-# Turns that are below both count as none; in standard deviations of the least certain axis.
-_LEAST_TURN_RAD = np.radians(1.0)
-_AGREEING_SIGMAS = 3.5
-# By so many standard deviations a pair has to fit one explanation better than the other, to prefer it.
-_PREFERENCE = 0.5
-# An agreement says nothing where the turn could as well be larger than this.
-_LARGEST_SIGMA_RAD = np.radians(3.0)
-# The level of errors is taken from pairs with smaller turns: the quantile, and what it is of normal errors.
-_NEAR_RAD = np.radians(10.0)
-_LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1
-# Ratio of robust weights from which matches do not fit the given rotations, and from which they fully do.
-_UNEXPLAINED, _EXPLAINED = 0.7, 0.95
-# Median residual of a robust fit over that of all of its matches.
-_MEAN_OF_MEDIAN = 0.8
-# Support of a pair whose direction agrees while its own rotation does not.
-_DIRECTION_ALONE = 0.5
+_INDEPENDENT_MATCHES = 20.0  # matches of a pair that count for its turn; their errors are in part the same
+_MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are no independent witnesses
+_FLOOR_RAD = np.radians(0.1)  # radians; added for the errors of the given rotations
+_LEAST_TURN_RAD = np.radians(1.0)  # radians; a turn below this and ...
+_AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
+_PREFERENCE = 0.5  # standard deviations; a pair that fits an explanation better by less prefers none
+_LARGEST_SIGMA_RAD = np.radians(3.0)  # radians; agreement says nothing where a turn could as well be larger
+_NEAR_RAD = np.radians(10.0)  # radians; the level of errors is that of pairs with smaller turns
+_LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
+_UNEXPLAINED, _EXPLAINED = 0.7, 0.95  # ratio of robust weights; given rotations fit not at all, and fully
+_MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
+_DIRECTION_ALONE = 0.5  # support of a pair whose direction agrees; its own rotation does not
 RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
-"""Shares s from which a camera is right, and below which it is turned."""
-# Turns of a body that are compared with one another; those of most weight.
-_MOST_VOTES = 300
-# Bodies that are turned, one after the other: each time all others are looked at again. What is left is
-# judged as it stands, and by all pairs together.
-_MOST_TURNED = 50
-_AVERAGING_STEPS = 4
-# Standard deviations from which a correction is no chance, however few and inexact the pairs are.
-_CERTAIN_SIGMAS = 5.0
-# For all pairs together, standard deviations are what the pairs that agree best show, and this at least.
-_LEAST_LEVEL = 0.2
+"""Shares s: from the first a camera is right, below the second it is turned."""
+_MOST_VOTES = 300  # turns of a body that are compared with one another; those of most weight decide
+_MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
+_AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
+_CERTAIN_SIGMAS = 5.0  # standard deviations; such a correction is no chance, however few its pairs are
+_LEAST_LEVEL = 0.2  # least level of errors for all pairs together; else that of those that agree best
 
 
 class Doubt(enum.Enum):

@@ -40,15 +40,15 @@ from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
 
-# Shares of each block's trace that are added: what nothing holds becomes large, not singular.
-_RIDGES = (1e-12, 1e-10, 1e-8)
-# A camera may not decide the gauge with a larger standard deviation, in spreads, ...
-_LOOSE = 0.2
-# ... nor if it stands farther from the cameras' median, in spreads.
-_FAR = 10.0
-_LOOSENING_ROUNDS = 20
-# Share of the longest baseline below which a baseline counts as that long.
-_SHORTEST = 1e-12
+_RIDGES = (
+    1e-12,
+    1e-10,
+    1e-8,
+)  # shares of each block's trace, added in turn; loose nodes become large, finite
+_LOOSE = 0.2  # spreads; a camera of larger standard deviation may not decide the gauge, ...
+_FAR = 10.0  # ... spreads from the cameras' median; nor may one that stands farther away
+_LOOSENING_ROUNDS = 20  # rounds in which cameras leave the gauge; a bound
+_SHORTEST = 1e-12  # share of the longest baseline; a shorter one counts as that long
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

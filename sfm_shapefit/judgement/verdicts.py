@@ -25,17 +25,13 @@ from sfm_shapefit.placement.conditioning import LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# Cameras; two have no shape, so nothing in it is uncertain.
-_SMALLEST_RIGID = 3
-# Directions whose error samples are worked on at a time.
-_PART = 2_000
-# Noise for which it is asked at least which nodes are loose: with none, none would be.
-_LOOSENING_RAD = 1e-4
-# Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
-# stands beyond the last does not say how large the scene is.
+_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
+_PART = 2_000  # directions whose error samples are worked on at a time; bounds the memory
+_LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nodes; with none, none would be
+# Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
+# not say how large the scene is.
 _REACHES = (np.inf, 1e3, 30.0)
-# Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size.
-_UNCHECKED_LEVERAGE = 0.99
+_UNCHECKED_LEVERAGE = 0.99  # leverage; from here on agreement means nothing, 1 % of an error shows
 
 
 class Verdict(enum.Enum):
