@@ -43,18 +43,15 @@ from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenv
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import DualCertificate, certify_rotations
 
-# Standard deviation that is added to that of a pair: calibration is not exact, and matches share errors.
-_FLOOR = np.radians(0.05)
-_WIDEST = np.radians([30.0, 60.0])
-# Where a camera was moved, annealing goes on from here.
-_REATTACHED = np.radians(10.0)
-_VERY_SOUND = 2.5
+_FLOOR = np.radians(0.05)  # radians added to a pair's deviation; calibration is inexact, matches share errors
+_WIDEST = np.radians([30.0, 60.0])  # radians; widths at which annealing begins, one answer each: see above
+_REATTACHED = np.radians(10.0)  # radians; annealing goes on from here once cameras were moved
+_VERY_SOUND = 2.5  # W ln n; fewer pairs than SOUND has, but hardly any wrong one
 # With more pairs, fewer answers are tried: two, and one.
 _MANY_PAIRS, _MOST_PAIRS = 5_000, 100_000
 # The kept answer of a small graph goes on until it stays: a round leaves about half of the way.
 _LAST_ROUNDS = 40
-# Entries of R R^T - I, and relative asymmetry of information, that are still rounding.
-_ROTATION_TOLERANCE = 1e-6
+_ROTATION_TOLERANCE = 1e-6  # entries of R R^T - I, relative asymmetry of information; smaller is rounding
 
 
 def average_rotations(

@@ -27,7 +27,7 @@ class AveragedRotations(Displayed):
     best_agreements: FloatArray
     """(n,) the largest such share in any answer that was tried."""
     share: float
-    """Of the weight of all pairs of registered images: what agrees within 5 deg."""
+    """Share of the weight of all pairs of registered images that agrees within 5 degrees."""
     num_pairs: int
     """Pairs whose residuals count in the answer."""
     num_tried: int = 1

@@ -38,21 +38,15 @@ from sfm_shapefit.rotations.averaging_uncertainty import MOST_LEVERAGE, estimate
 from sfm_shapefit.scene.given import Gravity
 
 DOWN = np.array([0.0, 0.0, -1.0])
-"""In axes of the world."""
+"""Direction of gravity in world axes: z points up."""
 
-# Gravities that are within so much of one another say the same of the world in the beginning.
-_VOTING = np.radians(10.0)
-# A gravity that is farther off has no part.
-_LIMIT = np.radians(45.0)
-# Rounds end when cameras have settled; each leaves about half of the way, so these are enough for rounding.
-_ROUNDS = 60
-# Share of the information about the axis of gravity, which it says nothing of, that keeps blocks definite.
-_ABOUT_DOWN = 1e-9
-# A gravity is wrong beyond so many of its standard deviations, or of the level of all.
-_WRONG_SIGMAS = 5.0
-# Median of the length of two normal components of variance 1.
-_MEDIAN_LENGTH = 1.1774
-FEWEST_GRAVITIES = 2
+_VOTING = np.radians(10.0)  # radians; gravities within this say the same of the world in the beginning
+_LIMIT = np.radians(45.0)  # radians; a gravity that is farther off has no part
+_ROUNDS = 60  # rounds, a bound; each leaves about half of the way to where cameras settle
+_ABOUT_DOWN = 1e-9  # share of the information; about the axis gravity has none, and blocks stay definite
+_WRONG_SIGMAS = 5.0  # own standard deviations, or levels of all; a gravity beyond is wrong
+_MEDIAN_LENGTH = 1.1774  # median length of two normal components; sqrt(2 ln 2)
+FEWEST_GRAVITIES = 2  # gravities; a single one has nothing to check it
 
 
 def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:
