@@ -22,7 +22,7 @@ Then ask for what you need, and compare with the truth:
         problem = random_graph(30, p=0.5, q=0.1)
         assert_locations_near(solve(problem.view_graph).locations, problem.locations, max_error=1e-6)
 
-What there is:
+The fixtures:
 
 | fixture | what it is |
 |---|---|

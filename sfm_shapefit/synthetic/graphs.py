@@ -213,7 +213,7 @@ def _next_ones(n: int, degree: float) -> IntArray:
 def community_graph_problem(n: int, degree: float = 30.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
-    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). 93 % of the edges join cameras of one
     cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
     (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
     that the mean degree stays somewhat below `degree`.

@@ -18,7 +18,7 @@ from sfm_shapefit.synthetic.options import SceneOptions, Shape
 ByteArray = npt.NDArray[np.uint8]
 
 FARTHEST_M = 40.0
-"""Surface texture is too small to be detected beyond."""
+"""Meters from a camera to a surface; beyond, its texture is too small to be detected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

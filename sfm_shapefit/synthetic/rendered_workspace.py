@@ -37,9 +37,8 @@ from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
 from sfm_shapefit.synthetic.workspace import compact_database
 
-# A right match is off by no more: this is COLMAP's own limit for inliers.
-_LARGEST_ERROR_PX = 4.0
-_POINT_GRAY = 160
+_LARGEST_ERROR_PX = 4.0  # pixels; COLMAP's own limit for inliers, a right match is off by no more
+_POINT_GRAY = 160  # gray value of a point; its color in the pictures is not looked up
 _NO_MATCHES = MatchBatch(
     pairs=np.empty((0, 2), dtype=np.int64),
     offsets=np.zeros(1, dtype=np.int64),

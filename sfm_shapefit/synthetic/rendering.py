@@ -33,12 +33,9 @@ from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras, lay_out_scen
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
-# A pixel has so many samples along either side.
-_SAMPLES = 2
-# This is far below the spacing of rays, and far above rounding.
-_RAY_SLACK = 1e-6
-# A triangle that comes nearer than this is drawn without bounds.
-_NEAREST_DEPTH_M = 0.05
+_SAMPLES = 2  # samples of a pixel along either side; smooths edges
+_RAY_SLACK = 1e-6  # share of a ray; far below the spacing of rays, far above rounding
+_NEAREST_DEPTH_M = 0.05  # meters; a triangle that comes nearer is drawn without bounds
 # These are the colors at the horizon and above: too smooth for features.
 _SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))
 _OF_POINTS_ONLY = (
@@ -198,8 +195,8 @@ def _facing_triangles(scene: RenderedScene, image: int) -> _Triangles:
 def _bounds(corners: FloatArray, rays: FloatArray) -> IntArray:
     """Return the samples (k, 4) first and last row, first and last column that each triangle can cover.
 
-    A triangle in front of the camera is bounded by its corners. Of one that passes behind it, it is only
-    known whether it lies wholly beyond one side of the image, where the bounds are empty.
+    A triangle in front of the camera is bounded by its corners. A triangle that passes behind it has no
+    bounds unless it lies wholly beyond one side of the image, where the bounds are empty.
     """
     depth = corners[:, :, 2]
     ahead = np.asarray((depth > _NEAREST_DEPTH_M).all(axis=1))

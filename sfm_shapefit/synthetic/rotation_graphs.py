@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
-_NOISE_OF_100_MATCHES_DEG = 0.3
+_NOISE_OF_100_MATCHES_DEG = 0.3  # degrees, of a relative rotation; falls with the root of the matches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

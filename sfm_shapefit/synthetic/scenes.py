@@ -36,16 +36,11 @@ from sfm_shapefit.synthetic.layouts import (
 from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import SceneOptions
 
-# Nothing is photographed closer than this.
-_NEAREST_DEPTH_M = 0.3
-# This angle between a surface's normal and the line of sight is also the occlusion rule.
-_LARGEST_VIEW_ANGLE_DEG = 80.0
-# A corrupted pair's direction is off by at least this.
-_SMALLEST_FALSE_ANGLE_DEG = 10.0
-# A corrupted pair has at most so many matches, which keeps the number of extra keypoints low.
-_MOST_FALSE_MATCHES = 200
-# This is roughly the direction error over the rotation error of a two-view estimate.
-_RELATIVE_POSE_DIRECTION_FACTOR = 3.0
+_NEAREST_DEPTH_M = 0.3  # meters; nothing is photographed closer
+_LARGEST_VIEW_ANGLE_DEG = 80.0  # degrees from a normal to the line of sight; also the occlusion rule
+_SMALLEST_FALSE_ANGLE_DEG = 10.0  # degrees; a corrupted pair's direction is off by at least this
+_MOST_FALSE_MATCHES = 200  # matches of a corrupted pair; keeps the number of extra keypoints low
+_RELATIVE_POSE_DIRECTION_FACTOR = 3.0  # direction error per rotation error; about that of a two-view estimate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

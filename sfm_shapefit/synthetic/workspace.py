@@ -22,8 +22,7 @@ from sfm_shapefit.synthetic.models import ModelParts, ModelPoints
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.scenes import Scene
 
-# This is a value of COLMAP's TwoViewGeometry::ConfigurationType.
-_CALIBRATED = 2
+_CALIBRATED = 2  # value of COLMAP's TwoViewGeometry::ConfigurationType; see its header
 
 
 def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:
