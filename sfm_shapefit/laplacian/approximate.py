@@ -22,8 +22,7 @@ from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency
 
-# A residual so many times the least so far shows that rounding leads, and no longer the system.
-_DIVERGED = 1e6
+_DIVERGED = 1e6  # residual over the least so far; such a one shows that rounding leads, no longer the system
 
 Operator = Callable[[FloatArray], FloatArray]
 

@@ -38,10 +38,12 @@ from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
 
 PIVOT_TOLERANCE = 64.0
-"""Pivots below this many rounding units of their diagonal entry count as zero."""
+"""Rounding units of the diagonal entry; smaller pivots count as zero."""
 
-# A front above the tasks of so many rows or more is factored by strips of so many columns.
-_LARGE_FRONT, _STRIP = 768, 256
+_LARGE_FRONT, _STRIP = (
+    768,
+    256,
+)  # rows of a front above the tasks, and columns of its strips; threads share it
 
 # What is done with a front, one after the other.
 _ASSEMBLE, _FACTOR, _PASS_ON = range(3)

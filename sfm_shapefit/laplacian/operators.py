@@ -155,10 +155,8 @@ class Workers:
             raise failures[min(failures)]
 
 
-_ROW_BLOCKS = 8
-
-# On fewer entries, handing work to a thread costs more than the work.
-_ENTRIES_WORTH_A_THREAD = 50_000
+_ROW_BLOCKS = 8  # blocks of rows, whatever the threads; sums have one order
+_ENTRIES_WORTH_A_THREAD = 50_000  # entries; on fewer, handing work to a thread costs more than the work
 
 
 class LaplacianOperator:
