@@ -64,39 +64,31 @@ _ROUND_REDUCTION = 0.1
 # misses what was asked for in any case.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
 RESIDUAL_FLOOR = 0.1
-"""The least residual, relative to the mean one, that the metric takes seriously."""
+"""Least residual that the metric takes seriously, relative to the mean one; exact pairs have none."""
 
-# The share of the metric across the surface of a ball that is taken away.
-_ALONG_SURFACE = 0.97
-# A pair counts as on the surface of its ball from this ||y_e|| / w_e on.
-_ON_SURFACE = 0.99
+_ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away; see above
+_ON_SURFACE = 0.99  # ||y_e|| / w_e; from here on a pair counts as on the surface of its ball
 REPAIRS = 4
-"""Each repair shrinks the equality residual to the rounding of the previous one."""
+"""Number of repairs: each shrinks the equality residual to the rounding of the previous one."""
 
-# Conjugate gradients need 10 to 60 steps on all but long chains.
-_CG_STEPS = 500
-# From so many pairs on, the passes over them run by so many blocks, on several threads.
-_LARGE, _EDGE_BLOCKS = 200_000, 4
-_SEED = 1
-# An equality residual of so much per gap needs no repair, for the bound moves by 100 times it; within limits.
-_EXACT_PER_GAP = 1e-5
-_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10
+_CG_STEPS = 500  # conjugate gradient steps; 10 to 60 are needed on all but long chains
+_LARGE, _EDGE_BLOCKS = 200_000, 4  # pairs, and blocks; passes over more pairs run in parallel blocks
+_SEED = 1  # seed of the preconditioner; same input, same answer
+_EXACT_PER_GAP = 1e-5  # equality residual per gap; it needs no repair, for the bound moves by 100 times it
+_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of that residual; rounding, and what a bound may rest on
 # The rounds end where the gap is expected below this share of the one asked for. The exact repair is expected
 # to multiply the present excess by the second number: by 4 on boxes, by 1 to 2 on communities.
 _ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
-# No bound may rest on a larger equality residual, relative to the largest degree.
-_UNREPAIRED = 1e-9
+_UNREPAIRED = 1e-9  # equality residual relative to the largest degree; no bound may rest on a larger one
 STRICT = 1e-3
-"""A pair counts as held by its fit if ||y_e|| < (1 - this) w_e."""
+"""Relative distance of ||y_e|| from w_e; a pair that is farther inside its ball counts as held by its fit."""
 
 REGULAR = 1e-9
-"""A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this."""
+"""Least pivot of a regular matrix, relative to its diagonal entry; far above rounding."""
 
-# In single precision it must be far above the rounding of the factor, n d eps.
-_REGULAR_SINGLE = 1e-3
-# From so many unknowns on a factor in single precision is tried first.
-_SINGLE_FROM = 450
-# Uniqueness is not examined beyond so many pairs, whose ordering alone takes seconds, or so many operations.
+_REGULAR_SINGLE = 1e-3  # likewise in single precision; far above the rounding of the factor, n d eps
+_SINGLE_FROM = 450  # unknowns; from here on a float32 factor is tried first, which is faster
+# Pairs and operations; beyond, uniqueness is not examined: the ordering of more pairs alone takes seconds.
 _UNIQUENESS_EDGES, _UNIQUENESS_FLOPS = 500_000, 1e11
 
 

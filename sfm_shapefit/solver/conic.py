@@ -27,12 +27,10 @@ from sfm_shapefit.solver.program import scale_functional
 if TYPE_CHECKING:  # rigs.solve calls this solver
     from sfm_shapefit.graph.groups import RigidGroups
 
-# The least tolerance that double precision can still serve.
-_LEAST_CONE_TOL = 1e-12
+_LEAST_CONE_TOL = 1e-12  # tolerance of the cone solver; double precision serves no smaller one
 # The cone solver's tolerance per tolerance of ours: its own gap is relative to an inexact dual.
 _CONE_TOL_PER_TOL = 1e-3
-# Factors on the cone solver's tolerance, tried in turn until it returns a point.
-_LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)
+_LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)  # on the tolerance; tried in turn until a point is returned
 
 
 def solve_conic(

@@ -22,13 +22,10 @@ from sfm_shapefit.solver.program import normalize_locations, scale_functional
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 
-# The scale constraint says nothing where c is smaller than this, relative to the sum of weights.
-_DIRECTIONS_CANCEL = 1e-9
-# The bound is not to be called rigorous where the dual violates its equality by more.
-_LARGEST_RESIDUAL = 1e-9
+_DIRECTIONS_CANCEL = 1e-9  # c relative to the sum of weights; smaller, the scale constraint says nothing
+_LARGEST_RESIDUAL = 1e-9  # violation of the dual's equality; with more a bound is not called rigorous
 _ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
-# From so many operations of one block factorization on, splitting is faster to the same gap.
-_LARGEST_NEWTON_FLOPS = 4e9
+_LARGEST_NEWTON_FLOPS = 4e9  # operations of one block factorization; from here on splitting is faster
 
 
 class SolverRun(NamedTuple):

@@ -41,11 +41,10 @@ _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
 """By bytes per number: in single precision each gains a digit or more, or M is too ill-conditioned."""
 _PATIENCE = {4: 3, 8: STALL}
-"""By bytes per number: factorizations without progress after which it is given up."""
-# From so many unknowns on a factor in single precision saves more than its refinements cost.
-_SINGLE_FROM = 450
-# A step passes over one edge, and over one entry of the matrix, in the time of so many operations of a dense
-# factorization.
+"""Factorizations without progress after which it is given up; by bytes per number."""
+_SINGLE_FROM = 450  # unknowns; from here on a factor in float32 saves more than its refinements cost
+# Operations of a dense factorization in the time of a step's pass over one edge, and over one matrix entry:
+# memory decides there, not arithmetic.
 _EDGE_WORK, _SOLVE_WORK = 1000.0, 10.0
 # One call takes about 0.1 s: so long an interrupt may have to wait.
 _OPERATIONS_PER_CALL = 4e9
@@ -197,7 +196,7 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
         column = factor.matrix[q * order + q : (q + 1) * order]
         rest = c[q:]
         slope = along_c * c[q]
-        for p in range(len(column)):  # of views that begin at 0: an index that may be negative is slow
+        for p in range(len(column)):  # over views that begin at 0: an index that may be negative is slow
             column[p] = slope * rest[p]
         for p in range(0, len(column), len(problem.axes)):
             column[p] += along_axis

@@ -31,12 +31,10 @@ from sfm_shapefit.solver.newton.steps import (
     set_residuals,
 )
 
-# Conjugate gradient steps for plain least squares, and for each reweighted problem.
-_FIRST_STEPS, _STEPS = 4, 2
+_FIRST_STEPS, _STEPS = 4, 2  # conjugate gradient steps: for plain least squares, and each reweighted problem
 # Rounds of reweighting: with half of them Newton needs a factorization more, and twice as many gain nothing.
 _ROUNDS = 7
-# The smoothing of the first weights, per mean residual, and its factor per round.
-_EPS, _SHRINK = 0.5, 0.7
+_EPS, _SHRINK = 0.5, 0.7  # smoothing of the first weights, per mean residual; its factor per round
 # The first steps may leave this share of the energy; dense random graphs leave 1e-3, real ones 5e-2.
 _LEFT = 3e-3
 

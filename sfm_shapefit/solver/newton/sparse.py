@@ -25,8 +25,7 @@ from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgr
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 
-# Added to the blocks in turn until the matrix is positive definite, per stiffness of the edge.
-_RIDGES = 0.0, 1e-12, 1e-10
+_RIDGES = 0.0, 1e-12, 1e-10  # added to the blocks, per stiffness of the edge; in turn until M is definite
 
 
 def solve_newton_sparse(

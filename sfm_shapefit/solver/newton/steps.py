@@ -23,27 +23,22 @@ from sfm_shapefit.solver.program import scale_functional
 
 # The smoothing relative to the gap; 0.05 to 0.3 need the same number of factorizations.
 MU_PER_GAP = 0.1
-# A cycle that leaves more of the gap than this is the last one with a clipped dual.
-_CLIPS_BELOW = 0.5
-STEPS_PER_FACTOR = 10
+_CLIPS_BELOW = 0.5  # share of the gap; a cycle that leaves more is the last one with a clipped dual
+STEPS_PER_FACTOR = 10  # steps, a bound; a cycle ends once a new factor gains more than another step
 # The least smoothing of S, not of the target: below it M is too ill-conditioned for refinement to converge.
 LEAST_MU = 1e-8
-REFINEMENTS = 3
-# After so many factorizations without progress more will not help.
-STALL = 6
+REFINEMENTS = 3  # refinements of a step; they converge unless M is too ill-conditioned
+STALL = 6  # factorizations without progress; more will not help
 # A step passes over one edge, and over one entry of the factor, in the time of so many operations of a
 # factorization: memory decides there, not arithmetic.
 EDGE_WORK, SOLVE_WORK = 500.0, 5.0
 
 # The allowed violation of D^T y = lambda c, per mean degree: per squared gap, and in any case.
 _EQUALITY, _LEAST_EQUALITY = 1e-3, 5e-13
-# A dual moves so far towards the surface of the ball.
-_TO_BOUNDARY = 0.99
-# A scaled dual stays inside the ball by this fraction of its excess.
-_MARGIN = 0.01
-_HALVINGS = 20
-# A c smaller than this, relative to the sum of weights, is rounding.
-_CANCEL = 1e-12
+_TO_BOUNDARY = 0.99  # share of the way to the surface of the ball; a dual moves so far at most
+_MARGIN = 0.01  # share of its excess by which a scaled dual stays inside the ball; see above
+_HALVINGS = 20  # halvings of a step; a shorter one does not move double precision
+_CANCEL = 1e-12  # c relative to the sum of weights; a smaller one is rounding
 
 
 class Problem(NamedTuple):

@@ -15,10 +15,8 @@ from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
-# Locations may be off those of rigid groups by this share of their extent, which is rounding.
-_OFF_GROUPS = 1e-9
-# An equality residual that needs no repair.
-_EXACT = 1e-12
+_OFF_GROUPS = 1e-9  # share of the extent; locations off their rigid groups by less are off by rounding
+_EXACT = 1e-12  # equality residual; a smaller one needs no repair
 
 
 def certify_groups(

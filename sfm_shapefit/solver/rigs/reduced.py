@@ -18,8 +18,7 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
 from sfm_shapefit.solver.newton.reduction import Reduction
 
-# What is left of s when all groups may move is rounding below this share of eta.
-_LEAST_SCHUR = 1e-13
+_LEAST_SCHUR = 1e-13  # share of eta; less of s, when all groups may move, is rounding
 
 
 class RigidReduction(Reduction):

@@ -19,8 +19,7 @@ from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.solve import Choice, run_choice
 
-# A^T c counts as 0 below this size, relative to the sum of weights.
-_DIRECTIONS_CANCEL = 1e-12
+_DIRECTIONS_CANCEL = 1e-12  # A^T c relative to the sum of weights; smaller counts as 0
 
 
 @one_blas_thread()  # more would split, and round, the sums of long vectors differently

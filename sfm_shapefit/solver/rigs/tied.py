@@ -22,12 +22,11 @@ from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
-_EPSILON = 1e-10
-_STEPS = 4
-_PROBES = 3
-# Two groups are tied if all null vectors, drawn with unit variance, move them equally to this.
-_ALIKE = 1e-3
-_SEED = 0
+_EPSILON = 1e-10  # shift of the matrix, relative; null vectors grow by its inverse per step
+_STEPS = 4  # steps of inverse iteration; after these nothing but null vectors is left
+_PROBES = 3  # null vectors drawn; groups that move alike in all by chance are improbable
+_ALIKE = 1e-3  # difference of motions; groups are tied if all null vectors, of unit variance, differ by less
+_SEED = 0  # seed of the probes; same input, same answer
 
 
 def largest_tied(
