@@ -24,12 +24,11 @@ def answers(
 
     Args:
         executor: submits tasks, a few ahead of the answers; it is not shut down. None: all is done here.
-        work: a function of a module, so that other processes find it.
+        work: a function of a module, so that other processes find it; what it raises is raised.
         tasks: its arguments, which are pickled on the way to other processes.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
-        ShapeFitError: as a worker raised it.
     """
     if executor is None:
         for task in tasks:

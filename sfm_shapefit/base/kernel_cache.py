@@ -255,11 +255,7 @@ def own_folders(source_folder: Path) -> list[Path]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step, and its folder if there is none.
-
-    Raises:
-        OSError: if that cannot be done; nothing stays behind.
-    """
+    """Write a file in one step, and its folder if there is none; after an OSError nothing stays behind."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, unfinished = tempfile.mkstemp(dir=path.parent)
     try:

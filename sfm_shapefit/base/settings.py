@@ -28,12 +28,9 @@ _HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a ter
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and the sentence that explains it.
+    """Return a field with its default and its sentence, `help`.
 
-    Args:
-        default: what holds where the user says nothing.
-        help: the sentence.
-        also: an earlier name of the field, which the command line still takes.
+    `also` is an earlier name of the field, which the command line still takes.
     """
     return field(default=default, metadata={"help": help, "also": also})
 
@@ -50,11 +47,7 @@ class Settings:
                 raise ValueError(f"{item.name} must be {_wanted(kind)}, got {value!r}")
 
     def check_range(self, name: str, low: float, high: float = float("inf")) -> None:
-        """Refuse a field whose value lies outside [low, high].
-
-        Raises:
-            ValueError: a sentence that names the field.
-        """
+        """Raise ValueError, which names the field, if its value lies outside [low, high]."""
         value = getattr(self, name)
         if not low <= value <= high:
             limits = f"be at least {low:g}" if high == float("inf") else f"lie in [{low:g}, {high:g}]"
@@ -97,9 +90,7 @@ def explained(settings: type[S]) -> type[S]:
 def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any]) -> S:
     """Return the settings of a call: those given, or the defaults, with single options set by keyword.
 
-    Raises:
-        TypeError: if what is given are no such settings, or a keyword is no option; the message says what is.
-        ValueError: if a value is refused.
+    TypeError for other settings, or a keyword that is no option; ValueError for a value that is refused.
     """
     if given is not None and not isinstance(given, settings):
         kind, wanted = type(given).__name__, settings.__name__

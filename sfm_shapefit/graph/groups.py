@@ -131,8 +131,7 @@ class RigidGroups:
 
         Args:
             fixed: (n,) the nodes that keep their centers relative to each other.
-            centers: (n, d) in the unit of the offsets; those of nodes that share no group with a fixed one
-                are not read.
+            centers: (n, d) in the unit of the offsets; read for nodes that share a group with a fixed one.
         """
         whole = np.zeros(self.num_groups, dtype=np.bool_)
         whole[self.group_of[fixed]] = True

@@ -101,10 +101,8 @@ class MeasuredGraph:
     def part(self, rows: IntArray) -> tuple["MeasuredGraph", IntArray]:
         """Return what was measured of the edges `rows` and of their nodes, renumbered.
 
-        A fixed group of which no node is left is fixed no more.
-
-        Returns:
-            The smaller value, and (n',) the index in this graph of each of its nodes, ascending.
+        The second value is (n',) the index in this graph of each of its nodes, ascending. A fixed group of
+        which no node is left is fixed no more.
         """
         if len(rows) == self.graph.num_edges and np.array_equal(rows, np.arange(len(rows))):
             graph, nodes = self.graph, np.unique(self.graph.edges)

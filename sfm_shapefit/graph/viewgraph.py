@@ -106,13 +106,9 @@ class ViewGraph:
         )
 
     def restricted_to(self, edge_indices: npt.NDArray[np.integer]) -> tuple["ViewGraph", IntArray]:
-        """Return the graph of the given edges and their cameras, renumbered.
+        """Return the graph of some edges, by index (k,), and their cameras, renumbered.
 
-        Args:
-            edge_indices: (k,) indices into `edges`.
-
-        Returns:
-            The smaller graph, and (n',) the index in this graph of each of its cameras, ascending.
+        The second value is (n',) the index in this graph of each of its cameras, ascending.
         """
         cameras, renumbered = np.unique(self.edges[edge_indices], return_inverse=True)
         names = None if self.names is None else [self.names[c] for c in cameras]

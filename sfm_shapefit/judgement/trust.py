@@ -15,7 +15,6 @@ hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, t
              distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
              leave 10 % open.
 
-So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. Where there is no
 So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. In a clean scene
 
     no evidence either way       2/3 (2/3 of the median share where pairs are wrong)
@@ -24,11 +23,9 @@ So 1 means that a camera's matches agree as is usual in the scene and nothing is
 
 Several cameras whose rotations are wrong in the same way, as the symmetry of an object makes them, agree with
 one another in thousands of matches, which say nothing of how they stand to the rest. So only the pairs with
-the consensus count. It is found by correlation clustering: two
-sets of cameras join while the agreeing matches between them outweigh the contradicting ones, the strongest
-first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of image and mesh graphs
-by lifted multicuts", section 4). So each set is judged by all its pairs with the rest together. Sets are
-about who agrees with whom, not about evidence: leverages do not count there.
+the consensus count, which correlation clustering finds (`bodies`): two sets of cameras join while the
+agreeing matches between them outweigh the contradicting ones, the strongest first, so that each set is judged
+by all its pairs with the rest together. Leverages do not count there: who agrees is no question of evidence.
 
 Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
 together they count at most half as much as all agreements.

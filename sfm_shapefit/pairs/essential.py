@@ -70,13 +70,13 @@ def estimate_relative_rotations(
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that has one, in the order of pairs.
 
-    Left out are pairs on whose matches no trial finds a pose: fewer than five different ones.
+    Pairs are left out on whose matches no trial finds a pose: fewer than five different ones.
 
     Args:
         batch: rays in camera axes, that is, of a model whose rotations are the identity.
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
-        num_pairs: all that there are, of which these are a part: of many, each is tried less often.
+        num_pairs: those of the whole database; if many, each is tried less often.
         likely: poses of the batch's pairs. Where most matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
@@ -167,9 +167,7 @@ def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray
 
 
 def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return which pairs, of so many in all, got a pose, (k,), their rotations (k, 3, 3) and unit
-    translations (k, 3).
-    """
+    """Return which pairs got a pose, (k,), their rotations (k, 3, 3) and unit translations (k, 3)."""
     k, counts = len(matches.pairs), np.diff(matches.offsets)
     rotations, translations = np.full((k, 3, 3), np.nan), np.full((k, 3), np.nan)
     tried = np.minimum(counts, _TRIAL_MATCHES)

@@ -17,13 +17,8 @@ def estimate_directions(
 ) -> PairDirections:
     """Return one direction per pair from its matches and the known rotations.
 
-    Each pair is estimated on its own and with the same draws, so neither batches nor threads change
-    a bit of the answer.
-
-    Args:
-        matches: those of k pairs.
-        options: what to believe; defaults if None.
-        threads: number of threads to share the pairs among.
+    Each pair is estimated on its own and with the same draws: neither batches nor `threads` change a bit of
+    the answer.
     """
     options = options or DirectionOptions()
     k = len(matches.pairs)

@@ -34,12 +34,7 @@ _DOUBTFUL_SHARE = 0.05  # share of the median score; a pair below it is doubtful
 
 
 def count_partners(num_keypoints: Sequence[int], batches: Iterable[KeypointMatches]) -> list[IntArray]:
-    """Return in how many pairs each keypoint of each image is matched.
-
-    Args:
-        num_keypoints: of each image.
-        batches: the matches of all pairs.
-    """
+    """Return in how many pairs each keypoint of each image is matched, from the matches of all pairs."""
     counts = [np.zeros(count, dtype=np.int64) for count in num_keypoints]
     for batch in batches:
         for k, ends in enumerate(batch.pairs.tolist()):
@@ -101,13 +96,10 @@ class _Image(NamedTuple):
 
 
 def _share(image: _Image, matched: IntArray, affine: FloatArray, size: FloatArray) -> float:
-    """Return the share of one image's overlap with another that is matched.
+    """Return the share of an image's overlap with another that is matched.
 
-    Args:
-        image: the one.
-        matched: (m,) which of its keypoints are matched with the other.
-        affine: (4, 2) see `_affine_maps`.
-        size: (2,) of the other image.
+    `matched` (m,) are the keypoints matched with the other, `size` is the other's, `affine` see
+    `_affine_maps`.
     """
     own = np.zeros(len(image.partners), dtype=np.bool_)
     own[image.place_of[matched]] = True
@@ -125,10 +117,7 @@ def _affine_maps(source: FloatArray, target: FloatArray, starts: IntArray) -> Fl
 
     The rows of a map are its linear part, two, the middle of the source, and that of the target: it takes x
     to (x - middle) @ linear + target's middle. Where the sources lie on one line, it has the least norm.
-
-    Args:
-        source, target: the matches of all pairs, one pair after the other.
-        starts: (b,) the first match of each pair; each has one or more.
+    `starts` (b,) has the first match of each pair, which has one or more.
     """
     counts = np.diff(np.append(starts, len(source)))
     both = np.concatenate([source, target], axis=1)

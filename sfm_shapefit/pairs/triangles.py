@@ -35,9 +35,7 @@ def filter_triangles(
 def triangle_scores(graph: ViewGraph, iterations: int = _ITERATIONS) -> FloatArray:
     """Return each pair's mean angle to what its triangles say, (m,) radians; 0 for pairs in no triangle.
 
-    Args:
-        graph: any view graph.
-        iterations: 0 weighs all triangles alike (AAB).
+    With 0 iterations all triangles weigh alike (AAB).
     """
     sides = _triangles(graph)
     if len(sides) == 0:

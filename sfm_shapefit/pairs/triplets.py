@@ -30,11 +30,8 @@ _PAIRS_PER_SLICE = 1000
 def score_triplets(num_images: int, relative: RelativeRotations) -> FloatArray:
     """Return the weighted share of each pair's triangles that close within 5 degrees, (k,), in [0, 1].
 
-    NaN for a pair in no triangle. Time and memory are linear in triangles and in pairs.
-
-    Args:
-        num_images: n.
-        relative: k pairs of the images 0..n-1, each once, i < j, in any order.
+    NaN for a pair in no triangle. Pairs of the images 0..n-1 stand once each, i < j, in any order. Time and
+    memory are linear in triangles and in pairs.
 
     Source: loops as evidence against pairs are those of Zach, Klopschitz, Pollefeys, "Disambiguating visual
     relations using loop constraints", CVPR 2010; weighted here instead of inferred.
@@ -76,10 +73,9 @@ def weigh_triangles(
         pairs: (p, 2) ascending.
         starts: (n + 1,) the pairs (i, .) are rows starts[i] to starts[i + 1].
         rotations: (p, 3, 3) cam_j_from_cam_i.
-        least_trace: of the rotation around a triangle, if it closes.
-        scores: (p,) of the pairs.
-        closing: (p,) added to, the weights of the triangles of each pair that close.
-        total: (p,) added to, the weights of all its triangles.
+        least_trace: least trace of the rotation around a triangle that closes.
+        scores: (p,) scores of the pairs.
+        closing, total: (p,) added to, the weights of each pair's triangles that close, and of all.
     """
     for ij in range(begin, end):
         i, j = pairs[ij, 0], pairs[ij, 1]

@@ -73,7 +73,7 @@ def refine_two_view_poses(
 ) -> TwoViewPoses:
     """Return the relative poses that fit all matches best, near a start.
 
-    Each pair is refined on its own: neither batches nor threads change a bit of the answer.
+    Each pair is refined on its own: neither batches nor `threads` change a bit of the answer.
 
     Args:
         matches: those of k pairs, any number each; rays are finite and in camera axes.
@@ -81,7 +81,7 @@ def refine_two_view_poses(
         translations: (k, 3) unit vectors to start from, in axes of camera j.
         threads: number of threads to share the pairs among.
 
-    Source: the error is Sampson's, as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
+    Source: Sampson's error as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
     """
     k = len(matches.pairs)
     poses = TwoViewPoses(

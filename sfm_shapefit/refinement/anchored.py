@@ -56,7 +56,7 @@ def refine_anchored(
         metric: covariance and class of each pair.
         levels: (number of classes,) in radians.
         anchors: measured positions of some nodes.
-        max_bytes: what a factor of the normal equations may take; UnsolvableError if it would take more.
+        max_bytes: limit of a factor of the normal equations; above, UnsolvableError.
     """
     plan = plan_refinement(_join(graph, anchors), max_bytes)
     if plan is None:

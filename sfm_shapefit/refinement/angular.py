@@ -112,18 +112,17 @@ def refine_angles(
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
+    The cost at the final levels is not above that of the start, which is returned if nothing better was
+    found.
+
     Args:
         graph: a connected view graph.
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
-        plan: what `plan_refinement` says; or memory for a factor, such as that over groups, in which case
+        plan: from `plan_refinement`; or memory for a factor, such as that over groups, in which case
             locations are and stay those of the groups.
         other: (n, d) refined locations of the other start; once the levels have settled, the refinement ends
             where it has come as low as these, and where it clearly cannot.
-
-    Returns:
-        Locations whose cost at the final levels is not above that of the start: these, if nothing better
-        was found.
     """
     factor, spread = allocate_normal(plan, graph.dimension), _spread(graph, metric)
     first = _unit(start)

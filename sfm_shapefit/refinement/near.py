@@ -26,7 +26,7 @@ def stay_near(
     Args:
         measured: a piece.
         solved: its certified solution.
-        centers: (k, 3) of its cameras by the adjustment, in any scale and from any origin, in the same axes.
+        centers: (k, 3) adjusted centers of its cameras, in any scale and from any origin, in the same axes.
         first: the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]

@@ -5,10 +5,9 @@ metric of its own for every edge, that restores D^T y = lambda c,
 
     y' = y - S D h,    (D^T S D) h = D^T y - lambda c,    lambda = <y, D T> / <c, T>,
 
-and divided by max(1, max_e ||y'_e|| / w_e), which keeps the equality since both constraints are
-homogeneous. Then no locations have an objective below lambda / max(...). The choice of lambda makes
-the right-hand side orthogonal to T, the one direction in which D^T S D is nearly singular when the
-data are nearly exact.
+and divided by max(1, max_e ||y'_e|| / w_e), which keeps the equality since both constraints are homogeneous.
+Then no locations have an objective below lambda / max(...). The choice of lambda makes the right-hand side
+orthogonal to T, the one direction in which D^T S D is nearly singular when the data are nearly exact.
 
 The division is what costs: one pair that is moved out of its ball by 1 % lowers the bound by 1 %. So
 

@@ -69,9 +69,8 @@ def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimen
 def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
     """Play a game and unite sets by what it shows: those that lie in the same rigid set.
 
-    Returns:
-        The rigid set that each set lies in, (number of sets,), compact; and whether these sets are
-        all that there are. If not, two sets at least were united, and the game has to be played again.
+    Returns the rigid set that each set lies in, (number of sets,), compact, and whether these are final. If
+    not, two sets at least were united, and the game has to be played again.
     """
     if len(game.ends) == 0:
         return np.arange(game.num_sets), True

@@ -40,16 +40,12 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
 
     Args:
         num_nodes: n.
-        edges: (m, 2) node indices in [0, n), no self-loops.
+        edges: (m, 2) node indices; InputError for a self-loop or an index outside [0, n).
         dimension: d >= 2.
 
     Returns:
-        (m,) labels. Piece 0 has the most nodes; then come more edges, then the smaller first
-        node, then the smaller second one, so labels do not depend on the order of `edges`. A pair
-        that belongs to nothing larger is a piece of its own.
-
-    Raises:
-        InputError: if an edge is a self-loop or out of range, or `dimension` is below 2.
+        (m,) labels. Piece 0 has the most nodes; then come more edges, then the smaller first node, then the
+        smaller second one, whatever the order of `edges`. A pair may be a piece of its own.
     """
     edges = _check_edges(num_nodes, edges, dimension)
     set_of = compact(triangle_sets(num_nodes, edges))
@@ -70,7 +66,7 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
 def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     """Return whether the pairs fix all n nodes up to one translation and one scale, generically.
 
-    A single node without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
+    A node without pairs is rigid; arguments and errors as of `parallel_rigid_pieces`.
     """
     checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
