@@ -35,9 +35,10 @@ def sample_direction_errors(
     noise_px: FloatArray,
     threshold_px: float,
 ) -> FloatArray:
-    """Return samples of the errors of directions whose pairs share keypoints.
+    """Return samples (k, NUM_SAMPLES, 2) of tangential errors of directions that share keypoints, radians.
 
     The samples of one keypoint are the same in every call, so batches of pairs may be sampled one by one.
+    Pairs without a direction have errors 0.
 
     Args:
         matches: those of k pairs.
@@ -45,9 +46,6 @@ def sample_direction_errors(
         covariances: (k, 2, 2) in `tangent_bases(directions)`, rad^2.
         noise_px: (k,) standard deviation of the Sampson errors behind the covariances.
         threshold_px: largest Sampson error of an inlier.
-
-    Returns:
-        (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
     scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
     known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))

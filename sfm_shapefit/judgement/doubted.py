@@ -36,12 +36,7 @@ _UNSUPPORTED = 0.1  # f; below any share of a camera with evidence for it
 
 
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
-    """Return an assessment whose trust, and the reasons for a low one, follow the doubts of its cameras.
-
-    Args:
-        assessment: of k cameras.
-        doubts: of the same cameras, in the same order.
-    """
+    """Return an assessment whose trust and reasons follow the doubts of the same cameras."""
     factors = _factors(doubts)
     known = np.isfinite(factors)
     trust = np.where(known, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)

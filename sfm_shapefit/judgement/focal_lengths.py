@@ -6,20 +6,17 @@ robust weight W of the matches says which factor fits best:
 
     gain(pair, factor) = W(factor) - W(1)
 
-Rotations held. The direction of each pair is estimated for its given relative rotation. Two views without
-their rotation hardly tell focal lengths where the optical axes meet, as on a ring about an object, or where
-the picture is flat: a rotation of its own makes up for most of a wrong focal length in each pair. One
-rotation for all pairs of an image does not.
+Rotations held. The direction of each pair is estimated for its given relative rotation. With a rotation of
+its own each pair would make up for most of a wrong focal length where the optical axes meet, as on a ring
+about an object, or where the picture is flat. One rotation for all pairs of an image does not.
 
 Rotations free. Where the given rotations are as wrong as the focal length, because they were found with it,
 that says nothing. If no camera is named with rotations held, the relative pose of each pair is refined for
 each factor (`rotations.two_view_poses`).
 
-Residuals are in pixels of each image, as it was taken,
+Residuals are in pixels of each image, as it was taken, lest a factor gain by making the noise of one smaller:
 
     r = e / sqrt(|de/dpixel_i|^2 + |de/dpixel_j|^2),    e = t . (R a x b)
-
-The pixels are what is observed, and a factor must not gain by making the noise of one image smaller.
 
 A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that
 gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs
@@ -27,13 +24,10 @@ of its own images do not lose as clearly, and if the factor differs from 1 by 5 
 held, it must have two images, and three quarters of its images must gain: the pairs of a single one gain by a
 factor if its rotation is wrong, too.
 
-One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what these
-gain: the camera that gains most in all is named first, gets that focal length, and those that were doubted
-with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
-which of the two is wrong, and neither is named.
-
-Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and
-`photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
+One wrong camera makes others seem wrong that have pairs with it, but their own pairs lose what these gain:
+the camera that gains most in all is named first, gets that focal length, and those that were doubted with it
+are examined again. If another one gains nearly as much, and is cleared by that correction, neither is named.
+Chosen on seven scenes: `scripts/results/notes.md#focal-lengths`.
 """
 
 from dataclasses import replace
@@ -95,7 +89,7 @@ def doubt_focal_lengths(
     Args:
         rays: matches of some pairs, in camera axes.
         rotations: (n, 3, 3) the given ones, cam_from_world, from which the poses are refined.
-        lenses: of the n images.
+        lenses: lenses of the n images.
         threads: number of threads to share the pairs among.
     """
     asked = _Asked(rays, rotations, lenses, threads)
@@ -176,12 +170,9 @@ def _best(gains: dict[float, FloatArray]) -> float:
 
 
 def _is_doubtful(gains: FloatArray, images: IntArray, *, hold: bool) -> bool:
-    """Return whether the gains (k,) of a camera's pairs speak against it.
+    """Return whether the gains (k,) of a camera's best factor speak against it, rotations held or not.
 
-    Args:
-        gains: of its best factor.
-        images: (k, 2) those of the pair that the camera took, -1 for others.
-        hold: whether with rotations held.
+    `images` (k, 2) are those of each pair that the camera took, -1 for others.
     """
     least, inner = _LEAST_GAINS[hold], (images >= 0).all(axis=1)
     if not _is_clear(gains, least) or _is_clear(-gains[inner], least):

@@ -37,19 +37,15 @@ def propagate_groups(
     errors: FloatArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> CameraUncertainty | None:
-    """Return the uncertainty of groups from the information of the directions between them.
+    """Return the uncertainty of groups from that of the directions; None if the factor is too large.
 
     Args:
         locations: (n, d) at the solution.
         edges: (m, 2) pairs that tie the groups, each between two of them.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
         gauge: the groups of the nodes, and what of them is held fixed.
-        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
-            information if None.
-        max_bytes: that the factor may take.
-
-    Returns:
-        None if the factor would take more.
+        errors: (m, s, d) samples of the errors of the directions in radians; independent ones if None.
+        max_bytes: limit of the factor.
 
     Raises:
         UnsolvableError: if the groups hang loose.

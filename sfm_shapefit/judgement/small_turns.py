@@ -65,8 +65,8 @@ def solve_corrections(
         turns: (k, 3) rotation vectors of the turns of pairs, in world axes, radians.
         sigmas_rad: (k,) their standard deviations, finite.
         count: the number of cameras, n.
-        level: what the standard deviations are to be multiplied by, at most 1.
-        larger_than_rad: standard deviations are returned of the corrections larger than that.
+        level: factor on the standard deviations, at most 1.
+        larger_than_rad: size of the corrections whose standard deviations are returned.
     """
     x, k = np.zeros((count, 3)), len(pairs)
     rows, signs = np.tile(np.arange(k), 2), np.repeat([1.0, -1.0], k)

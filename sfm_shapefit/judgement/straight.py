@@ -27,12 +27,9 @@ def find_line(directions: FloatArray) -> FloatArray | None:
 
 
 def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:
-    """Return the median standard deviation along a line, as a share of the cameras' extent along it.
+    """Return the median standard deviation along a unit line (d,), over the cameras' extent along it.
 
-    Args:
-        line: (d,) unit.
-        locations: (n, d)
-        covariances: (n, d, d) of the locations, NaN where not known.
+    The covariances (n, d, d) of the locations (n, d) are NaN where not known.
     """
     variances = np.einsum("a,kab,b->k", line, covariances, line)
     known = np.isfinite(variances) & (variances >= 0.0)

@@ -24,17 +24,10 @@ _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 def deregister_of_few_points(
     structure: pycolmap.Reconstruction, least: int, fixed_frames: Collection[int] = ()
 ) -> dict[int, int]:
-    """Deregister the frames each of whose images sees fewer than `least` points, with what they observe.
+    """Deregister the frames each of whose images sees fewer than `least` points, with their observations.
 
-    An image that goes takes observations along, which may leave others with too few; three frames stay.
-
-    Args:
-        structure: ours, which is changed.
-        least: points.
-        fixed_frames: ids of frames that stay whatever they see.
-
-    Returns:
-        By the id of each image that went, the number of points it saw then.
+    An image that goes takes observations along, which may leave others with too few; three frames, and the
+    `fixed_frames`, stay. Returns the number of points that each such image saw then, by its id.
     """
     gone: dict[int, int] = {}
     while True:
@@ -102,7 +95,7 @@ def count_observations(
 
     Args:
         structure: triangulated from these matches.
-        model: that has the given rotations, whose images the batches' pairs index.
+        model: model of the given rotations, whose images the batches' pairs index.
         batches: matches of all pairs, the rays in world axes by the given rotations.
         max_error_px: distance from the epipolar line (of both images together, to first order) from which a
             match contradicts.
@@ -148,15 +141,8 @@ def images_without_support(
     """Return the images of frames whose matches could make points with those of others, and hardly make any.
 
     Directions can agree with a wrong pose, of an image on a repeated structure for one: points, which need
-    three images, do not. If fewer than three frames have points, none is returned.
-
-    Args:
-        structure: the model.
-        counts: of it.
-        fixed_frames: ids of frames that are not asked.
-
-    Returns:
-        By the id of each such image, the number of points it sees.
+    three images, do not. The value is the number of points of each such image, by its id; `fixed_frames` are
+    left out, and all are if fewer than three frames have points.
     """
     could = counts.checked >= _FEWEST_CHECKED
     does = could & (counts.agreeing >= _LEAST_AGREEING * counts.checked)

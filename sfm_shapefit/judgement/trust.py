@@ -104,7 +104,7 @@ def judge_cameras(
     Args:
         measured: the solved graph.
         locations: (n, d) its solution.
-        fit: of its directions.
+        fit: agreement of its directions.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
         conditioning: how well the pairs hold its k cameras.
     """

@@ -150,10 +150,10 @@ def weigh_pairs(
     """Return what pairs say of rotations, from their directions and from their own relative rotations.
 
     Args:
-        directions: of k pairs.
-        agreements: (k,) 1 where the direction agrees with the solved baseline, 0 where it does not; NaN where
-            that is not known.
-        relative: of some of these pairs, in any order; a pair without is taken as its direction says.
+        directions: directions of k pairs.
+        agreements: (k,) 1 where the direction agrees with the solved baseline, 0 where not; NaN where
+            unknown.
+        relative: relative rotations of some of these pairs, in any order; a pair without counts by direction.
         rotations: (n, 3, 3) the given ones, cam_from_world.
     """
     k, n = len(directions.pairs), len(rotations)
@@ -195,11 +195,9 @@ def weigh_pairs(
 
 
 def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
-    """Return what the pairs say of the rotation of each camera.
+    """Return what the pairs between cameras say of the rotation of each.
 
-    Args:
-        pairs: between cameras.
-        labels: (n,) the rigid group, such as the frame, of each camera; cameras of a group turn as one.
+    Cameras of a rigid group, such as a frame, turn as one: `labels` (n,) has the group of each.
     """
     count = int(labels.max(initial=-1)) + 1
     ends = labels[pairs.pairs]
@@ -452,11 +450,8 @@ def _common_turn(
 ) -> FloatArray | None:
     """Return the turn that votes of most weight agree on, averaged over those; None without candidates.
 
-    Args:
-        votes: (k, 3, 3) turns.
-        sigmas: (k,) their standard deviations, radians.
-        weights: (k,) what they count.
-        candidates: (k,) the votes that may be the turn.
+    The votes (k, 3, 3) have standard deviations (k,) in radians; `candidates` (k,) are those that may be the
+    turn.
     """
     voting = np.flatnonzero(np.isfinite(sigmas))
     voting = voting[np.argsort(-weights[voting], kind="stable")][:_MOST_VOTES]

@@ -115,6 +115,9 @@ def propagate(
 ) -> CameraUncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
+    None if the factor would take more than `max_bytes`; 2 GB from about a hundred thousand cameras in space
+    on.
+
     Args:
         locations: (n, d) at the solution; nodes beyond `num_cameras` are points.
         edges: (m, 2) pairs that make the nodes rigid, none of length 0.
@@ -122,10 +125,7 @@ def propagate(
         num_cameras: the first so many nodes may decide the gauge; all if None.
         errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
             only one is held at a time; independent errors of that information if None.
-        max_bytes: of the factor.
-
-    Returns:
-        None if the factor would take more: than 2 GB from about a hundred thousand cameras in space on.
+        max_bytes: limit of the factor.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.

@@ -99,13 +99,13 @@ def assess(
     """Judge pairs and cameras by a solution.
 
     Args:
-        measured: the solved graph, with what is known of it; with rigid groups each pair joins two of them.
-            What it has fixed stays where it is; else the mean of the cameras does.
+        measured: the solved graph; with rigid groups each pair joins two of them. What it has fixed stays
+            where it is; else the mean of the cameras does.
         locations: (n, d) its locations.
         undetermined_nodes: nodes whose position is a placeholder, such as those that the refinement reset:
             their standard deviations are infinite, and they hold no others; none if None.
-        max_bytes: that the factor for standard deviations may take.
-        agreement: of the same graph with the same locations; found anew if None.
+        max_bytes: limit of the factor for standard deviations.
+        agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     graph, groups, k = measured.graph, measured.groups, measured.num_cameras
     freedom, own = graph.dimension - 1, own_covariances(measured)

@@ -75,12 +75,9 @@ class ApproximateCholesky:
 
 
 def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> ApproximateCholesky:
-    """Return a sampled Cholesky factor of the graph Laplacian.
+    """Return a sampled Cholesky factor of a graph Laplacian; `seed`, any integer, fixes its draws.
 
-    Args:
-        graph: the neighbors of each node.
-        weights: (m,) non-negative edge weights; edges of weight 0 do not count.
-        seed: of the draws; any integer.
+    The weights (m,) are non-negative; edges of weight 0 do not count.
     """
     w = np.ascontiguousarray(weights, dtype=np.float64)
     if not (np.isfinite(w).all() and (w >= 0.0).all()):

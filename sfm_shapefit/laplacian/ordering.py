@@ -33,10 +33,8 @@ _METIS_REFINEMENTS = 1
 def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
     """Return the elimination tree of the order with the least work.
 
-    Args:
-        graph: the neighbors of each node.
-        method: one method, or "auto": METIS, and minimum degree as well on graphs of up to 400,000 edges
-            where it can be better; the one whose factorization takes fewer operations is kept.
+    The method "auto" tries METIS, and minimum degree as well on graphs of up to 400,000 edges where it can be
+    better; the one whose factorization takes fewer operations is kept.
     """
     trees = [] if method == "minimum-degree" else [elimination_tree(graph, metis_order(graph))]
     edges = len(graph.neighbors) // 2

@@ -136,14 +136,9 @@ class SymbolicFactor:
 
 
 def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> EliminationTree:
-    """Return the elimination tree and the column counts of L for a fill-reducing order.
+    """Return the elimination tree and the column counts of L for a fill-reducing order (n,).
 
-    Args:
-        graph: the neighbors of each node.
-        order: (n,) a permutation of the nodes, the first eliminated first.
-
-    Returns:
-        The tree for an equivalent order (same L up to renumbering) in which subtrees are contiguous.
+    The tree is for an equivalent order (same L up to renumbering) in which subtrees are contiguous.
     """
     permutation = np.ascontiguousarray(order, dtype=np.int64)
     inverse = _inverse(permutation)
@@ -161,10 +156,7 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
 def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
     """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
 
-    Args:
-        graph: the neighbors of each node.
-        edges: (m, 2) int64, the edges of `graph`.
-        tree: from `elimination_tree` on the same graph.
+    The edges (m, 2) are those of `graph`; `tree` is from `elimination_tree` on the same graph.
     """
     order, first, parent, below = _supernodes(tree.parent, tree.counts)
     permutation = tree.permutation[order]

@@ -1,9 +1,9 @@
 """What is rigid by its graph and yet loose by its geometry.
 
-The test of rigidity takes positions to be general. At the solution they need not be: cameras on
-a line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly
-parallel, the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees
-all of these. Here its loose cameras are put into groups that move together, with what makes them loose:
+The test of rigidity takes positions to be general. At the solution they need not be: cameras on a line see
+each other along it, the pairs of a far camera are nearly parallel, the triangles of a distant group are
+skinny. The covariance of the locations (`uncertainty`) sees all of these. Here its loose cameras are put into
+groups that move together, with what makes them loose:
 
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
@@ -81,13 +81,12 @@ def condition(
     """Find the cameras that the pairs leave loose at the solution, and why.
 
     Args:
-        locations: (n, d).
+        locations: (n, d); the first `num_cameras` are cameras, the others points.
         edges: (m, 2).
         inliers: (m,) pairs that agree with the solution.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
-        num_cameras: k; nodes beyond are points.
-        undetermined_nodes: nodes whose distance is known to be open, with infinite standard deviations; none
-            if None.
+        num_cameras: k.
+        undetermined_nodes: nodes whose distance is open, with infinite standard deviations; none if None.
     """
     n = len(locations)
     is_undetermined = np.isin(np.arange(n), [] if undetermined_nodes is None else undetermined_nodes)
@@ -121,15 +120,10 @@ def condition(
 
 
 def direction_spread(num_nodes: int, edges: IntArray, directions: FloatArray) -> FloatArray:
-    """Return how far the directions at each node are from parallel, (n,) in [0, 1]; 0 without any.
+    """Return how far the directions (m, d) at each node are from parallel, (n,) in [0, 1]; 0 without any.
 
     The least over the greatest eigenvalue of the sum of I - u u^T: the squared ratio of the singular values
-    of the stacked projectors.
-
-    Args:
-        num_nodes: n.
-        edges: (m, 2) node indices.
-        directions: (m, d) unit vectors u; those that are not finite count as none.
+    of the stacked projectors. Directions that are not finite count as none.
     """
     d = directions.shape[1]
     projectors = np.nan_to_num(np.eye(d) - directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)

@@ -76,10 +76,7 @@ def triangulate_control_points(
 ) -> TriangulatedControl:
     """Return where the placed images of a model have control points; marks may be wrong.
 
-    Args:
-        known: the points and their marks.
-        seen: the placed images, and their views of the marks.
-        options: of 3D points; a mark may miss by four times what a keypoint may.
+    `seen` has the views of the marks; a mark may miss by four times what `options` allow a keypoint.
     """
     counts = np.bincount(known.points[seen.rows], minlength=len(known.names))
     tracks = ObservedTracks(

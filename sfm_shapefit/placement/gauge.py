@@ -69,11 +69,8 @@ class Gauge:
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
     """Return the gauge of the input's centers: a robust similarity (L1) that keeps the axes.
 
-    Without usable input centers it becomes "unit", and says so.
-
-    Args:
-        locations: (n, 3) the solver's answer.
-        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
+    It maps `locations` (n, 3) onto `input_centers` (n, 3) of the same cameras in the same axes. Without
+    usable input centers it becomes "unit", and says so.
     """
     if coincide(input_centers):
         return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
@@ -143,16 +140,14 @@ def distance_gauge(
     """Return the gauge in which cameras are so far apart; origin: the centroid.
 
     One distance becomes true. For several, the scale is the robust least-squares fit to all, weights
-    1 / (1 + (residual / 3 levels)^4), from the median of the scales that single ones give.
+    1 / (1 + (residual / 3 levels)^4), from the median of the scales that single ones give. InputError if the
+    cameras of a pair coincide in the answer.
 
     Args:
         locations: (n, 3) the solver's answer.
         pairs: (k, 2) cameras, k >= 1.
         distances: (k,) of each pair in the output's units, positive.
         names: (k,) the cameras of each pair, for the statement.
-
-    Raises:
-        InputError: if the cameras of a pair coincide in the answer.
     """
     apart = np.linalg.norm(locations[pairs[:, 0]] - locations[pairs[:, 1]], axis=1)
     near = apart <= _COINCIDENT * median_spread(locations)
@@ -196,18 +191,15 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
     """Return the gauge of position priors: a robust similarity, with a turn if they determine one.
 
     From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
-    where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong
-    priors has no part in it.
+    where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong priors
+    has no part in it. UselessPriorsError if fewer than two cameras have one, or the priors coincide or
+    contradict the answer.
 
     Args:
         locations: (n, 3) the solver's answer.
-        priors: of these cameras.
+        priors: priors of these cameras.
         axes_known: whether the locations' axes mean anything. If not, and the priors lie on a line, the model
             is turned onto that line, and about it by any angle.
-
-    Raises:
-        UselessPriorsError: if fewer than two cameras have one, or the priors coincide or contradict the
-            answer.
     """
     if len(priors) < FEWEST_PRIORS:
         raise UselessPriorsError(
@@ -270,11 +262,8 @@ def fit_to_priors(
 ) -> tuple[Similarity, FloatArray, float]:
     """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals.
 
-    Args:
-        source: (k, 3) the locations of the cameras that have a prior.
-        priors: theirs.
-        size: the spread of the priors.
-        rotate: whether the axes are to be found too.
+    `source` (k, 3) are the locations of the cameras with priors, `size` is the priors' spread; with `rotate`
+    the axes are fitted too.
     """
     target = priors.known.positions
     found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)

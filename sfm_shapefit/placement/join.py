@@ -1,7 +1,7 @@
-"""Two models joined: the similarity between their worlds, how well it is known, and when it is refused.
+"""Two models joined: the similarity between their worlds, its uncertainty, and when it is refused.
 
-Directions end at the border of a model, and so does its scale. What still ties two models are matches between
-their images, too few to be pairs of one model, or positions that are known of cameras of both. From either
+Directions end at the border of a model, and so does its scale. Two models are still tied by matches between
+their images, too few to be pairs of one model, or by positions that are known of cameras of both. From either
 comes the similarity first_from_second, y = s R x + t, by a robust fit to more than it needs; its standard
 deviations are those of a jackknife, which leaves out one witness (a pair of images, a position) after the
 other, so that errors which the matches of a pair share count once:
@@ -10,8 +10,7 @@ other, so that errors which the matches of a pair share count once:
 
 A join is refused where it is not over-determined; where pairs that contradict it agree among themselves on
 another one, as those of a thing that stands there twice do; or where scale, turn or place stay too uncertain.
-Two models whose scales are known, as those of rigs, are joined by a rigid motion; how well the scale between
-them is known is then what is known of these.
+Two models whose scales are known, as those of rigs, are joined by a rigid motion.
 """
 
 from collections.abc import Iterator, Sequence
@@ -114,17 +113,15 @@ def join_by_matches(
     """Return the join of two models by matches between their images, which are too few to be pairs alone.
 
     A match whose keypoint in one model observes a point says where that is seen from the other; where neither
-    observes one, both rays and the two centers lie in a plane.
+    observes one, both rays and the two centers lie in a plane. UnsolvableError, whose message is the reason,
+    a clause, if it is not safe.
 
     Args:
         ties: the matches.
         turns: (h, 3, 3) rotations first_from_second that single pairs of images suggest.
         centers: (n, 3) of the second model's cameras.
-        metric_sigma: relative standard deviation of what the scales of both models make of the one between
-            them, if both are known: it is 1 then.
-
-    Raises:
-        UnsolvableError: if it is not safe; the message is the reason, a clause.
+        metric_sigma: relative standard deviation of the scale between the models, which is 1, if both are
+            metric.
     """
     metric = metric_sigma is not None
     num_matches, num_pairs = len(ties.pairs), len(np.unique(ties.pairs))
@@ -173,14 +170,9 @@ class PlacedByPriors(NamedTuple):
 
 
 def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPriors:
-    """Return a model on its position priors, for `join_by_priors`.
+    """Return a model, cameras at `centers` (n, 3), on their position priors, for `join_by_priors`.
 
-    Args:
-        centers: (n, 3) of its cameras, in its world.
-        priors: of these cameras.
-
-    Raises:
-        UnsolvableError: if they are few, lie on a line, or do not fit; the message is the reason, a clause.
+    UnsolvableError, whose message is the reason, a clause, if they are few, lie on a line, or do not fit.
     """
     best, parts = _fit_priors(centers, priors)
     return PlacedByPriors(centers, best, tuple(parts), len(priors))
@@ -189,8 +181,7 @@ def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPrio
 def join_by_priors(first: PlacedByPriors, second: PlacedByPriors) -> ModelJoin:
     """Return the join of two models by position priors of cameras of each.
 
-    Raises:
-        UnsolvableError: if it is not safe; the message is the reason, a clause.
+    UnsolvableError, whose message is the reason, a clause, if it is not safe.
     """
     one, other = first.priors_from_model, second.priors_from_model
     errors = [[_chain(part, other) for part in first.parts], [_chain(one, part) for part in second.parts]]
@@ -220,8 +211,7 @@ def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Sim
 def _fit_priors(centers: FloatArray, priors: PositionPriors) -> tuple[Similarity, list[Similarity]]:
     """Return the map of a model onto its priors, and the maps that leave out some of them in turn.
 
-    Raises:
-        UnsolvableError: if they are few, lie on a line, or do not fit.
+    UnsolvableError if they are few, lie on a line, or do not fit.
     """
     if len(priors) <= FEWEST_WITNESSES:
         raise UnsolvableError(

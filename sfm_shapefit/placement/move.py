@@ -11,11 +11,9 @@ from sfm_shapefit.refinement.near import follow_cameras
 
 
 def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
-    """Return the placement with its cameras moved, and its points after them.
+    """Return the placement with its k cameras at `locations` (k, 3), in the solver's units.
 
-    Args:
-        placement: of k cameras.
-        locations: (k, 3) of these, in the solver's units; a camera whose row is NaN stays where it is.
+    Points follow their cameras. A camera whose row is NaN stays where it is.
     """
     refined, before = placement.refined, placement.locations
     known = np.isfinite(locations).all(axis=1)

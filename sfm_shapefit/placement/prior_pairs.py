@@ -33,8 +33,8 @@ def compare_with_priors(
     Args:
         pairs: (m, 2) cameras (i, j).
         directions: (m, 3) unit vectors of t_i - t_j in the input's axes; NaN where there is none.
-        priors: of the cameras.
-        gauge: with axes of the priors.
+        priors: priors of the cameras.
+        gauge: gauge with axes of the priors.
         centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
     """
     known, n = priors.known, len(centers)

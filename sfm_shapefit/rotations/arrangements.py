@@ -78,11 +78,9 @@ class Chosen(NamedTuple):
 
 
 def evidence_of(relative: RelativeRotations, shares: FloatArray) -> FloatArray:
-    """Return how much speaks for each pair being right, (k,), from -1 to 1; 0 where no share is known.
+    """Return how much speaks for each of k pairs being right, (k,), from -1 to 1; 0 where no share is known.
 
-    Args:
-        relative: k pairs.
-        shares: (k,) see `missing_matches.matched_shares`; NaN where unknown.
+    Shares (k,) are those of `missing_matches.matched_shares`; NaN where unknown.
     """
     found, known = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
     if len(known) == 0:

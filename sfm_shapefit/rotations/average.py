@@ -63,10 +63,11 @@ def average_rotations(
     weights: npt.ArrayLike | None = None,
     threads: int = 1,
 ) -> AveragedRotations:
-    """Return the rotations of images from relative rotations of pairs, of which many may be wrong.
+    """Return the rotations of images from relative rotations of pairs, many of which may be wrong.
 
-    Images outside the largest component of the pairs get none. The answer does not depend on `threads` nor on
-    the order of the pairs.
+    Images outside the largest component of the pairs get none. The answer, with standard deviations,
+    agreement of the pairs and a certificate, does not depend on `threads` nor on the order of the pairs.
+    InputError if there is no pair, one is given twice, or an array is not as described.
 
     Args:
         pairs: (k, 2) images (i, j), i != j, each pair once.
@@ -76,13 +77,7 @@ def average_rotations(
             None, all pairs are alike.
         num_images: n; one more than the largest index if None.
         weights: (k,) how many matches stand behind each pair; all alike if None.
-        threads: of factorizations.
-
-    Returns:
-        The rotations with standard deviations, the agreement of the pairs, and whether they are certified.
-
-    Raises:
-        InputError: if there is no pair, one is given twice, or an array is not as described.
+        threads: threads of factorizations.
 
     Source: see `rotations.annealing`, `rotations.averaging_uncertainty` and `rotations.dual_certificate`.
     """
@@ -95,11 +90,7 @@ def average_rotations(
 def average_relative_rotations(
     num_images: int, relative: RelativeRotations, threads: int = 1
 ) -> AveragedRotations:
-    """Return the rotations of images from what their matches say; unsound pairs do not count, unless all are.
-
-    Raises:
-        InputError: as of `average_rotations`.
-    """
+    """Return `average_rotations` of sound pairs; unsound ones do not count, unless all are."""
     supports = relative.weight_shares * relative.num_matches
     sound, very_sound = relative.are_sound(), relative.are_sound(_VERY_SOUND)
     used = sound if sound.any() else np.ones(len(sound), dtype=np.bool_)

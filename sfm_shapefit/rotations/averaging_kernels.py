@@ -191,8 +191,7 @@ def follow_tree(order: Any, parents: Any, links: Any, pairs: Any, measured: Any,
         order: (t,) cameras, parents before children; a root has parent -1, and its rotation is given.
         parents: (n,) parent of each camera.
         links: (n,) the pair that joins a camera with its parent.
-        pairs: (k, 2)
-        measured: (k, 4)
+        pairs, measured: (k, 2), (k, 4)
         turns: (n, 4) in place.
     """
     for k in range(len(order)):

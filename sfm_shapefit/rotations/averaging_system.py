@@ -113,11 +113,7 @@ class AveragingSystem:
         return self._factors[block]
 
     def _refactor(self, blocks: FloatArray) -> None:
-        """Factor the matrix of blocks (k, b, b).
-
-        Raises:
-            UnsolvableError: if it is not positive definite to working precision.
-        """
+        """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
         factor = self._factor_of(b)
         diagonal = np.zeros((self.num_nodes, b, b))

@@ -59,9 +59,9 @@ def estimate_sigmas(
 
     Args:
         given: the pairs of n cameras.
-        system: of these.
-        last: at the answer.
-        references: (n,) whose mean turn counts as exact; all if None.
+        system: solver of these.
+        last: system at the answer.
+        references: (n,) cameras whose mean turn counts as exact; all if None.
     """
     references = np.ones(given.num_cameras, dtype=np.bool_) if references is None else references
     n, inside = given.num_cameras, _ties(given.num_cameras, last)

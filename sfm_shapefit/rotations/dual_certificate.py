@@ -71,13 +71,10 @@ class DualCertificate:
 def certify_rotations(
     system: AveragingSystem, measured: FloatArray, weights: FloatArray, turns: FloatArray
 ) -> DualCertificate | None:
-    """Check the answer of a connected graph; None where that would take too long.
+    """Check the answer of a connected graph of k pairs; None where that would take too long.
 
-    Args:
-        system: of its k pairs.
-        measured: (k, 4) cam_j_from_cam_i.
-        weights: (k,) positive, the final ones.
-        turns: (n, 4) cam_from_world.
+    The weights (k,) are the final, positive ones of `measured` (k, 4), cam_j_from_cam_i; `turns` (n, 4) are
+    cam_from_world.
     """
     affordable = system.plan is not None and 27.0 * system.plan.flops <= _MOST_FLOPS
     if not (affordable or system.is_expander):

@@ -87,9 +87,9 @@ def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gr
     """Return averaged rotations refined on pairs and gravities together, in a world whose z points up.
 
     Args:
-        averaged: of n images, by the pairs alone.
+        averaged: rotations of n images, by the pairs alone.
         given: the pairs, among these images.
-        gravity: of images that have a rotation; two at least, or the rotations are returned as they are.
+        gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
     own = gravity.among(members)

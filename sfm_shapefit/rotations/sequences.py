@@ -129,13 +129,7 @@ def confirm_videos(videos: Videos, relative: RelativeRotations) -> Videos:
 
 
 def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -> Loops:
-    """Return which loops agree with the chain of neighbors; pairs of other images are not judged.
-
-    Args:
-        videos: among n images.
-        relative: pairs of these.
-        threads: of the averaging.
-    """
+    """Return which loops of videos agree with the chain of neighbors; other pairs are not judged."""
     is_loop = loop_pairs(videos, relative)
     visits: list[Visit] = []
     refused = [np.zeros(0, dtype=np.int64)]

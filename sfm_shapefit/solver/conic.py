@@ -36,19 +36,15 @@ _LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)  # on the tolerance; tried in turn 
 def solve_conic(
     graph: ViewGraph, tol: float, max_iterations: int, groups: "RigidGroups | None" = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with cvxpy and Clarabel.
+    """Solve the program with cvxpy and Clarabel; return locations (n, d), approximate dual (m, d), and steps.
+
+    UnsolvableError if the cone solver returns no point at all.
 
     Args:
         graph: a connected, parallel-rigid view graph.
         tol: the certified gap wanted.
         max_iterations: limit of interior-point steps.
-        groups: of its nodes, where the program is that over groups; no pair may lie inside one.
-
-    Returns:
-        locations (n, d), the approximate dual (m, d), and the number of interior-point steps.
-
-    Raises:
-        UnsolvableError: if the cone solver returns no point at all.
+        groups: groups of its nodes, where the program is that over groups; no pair may lie inside one.
     """
     import cvxpy as cp
 

@@ -1,7 +1,4 @@
-"""What the solver is told and what it answers: `SolverOptions`, `Status`, `SolverResult`.
-
-Pure data, no numerics, so that the command line, the tests and the benchmark can import it cheaply.
-"""
+"""What the solver is told and what it answers: data alone, cheap to import."""
 
 import enum
 import os

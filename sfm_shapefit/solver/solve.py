@@ -95,12 +95,10 @@ def run_choice(
     prove: Callable[[FloatArray, FloatArray], Certificate],
     start: float,
 ) -> SolverResult:
-    """Run the chosen solver and return what it found; the solve began at `start`, by `time.perf_counter()`.
+    """Run the chosen solver and return its answer; the solve began at `start`, by `time.perf_counter()`.
 
     `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
-
-    Raises:
-        UnsolvableError: if the locations found are not finite or point against the directions.
+    UnsolvableError if the locations are not finite or point against the directions.
     """
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)

@@ -5,10 +5,10 @@
     OUT/sparse/0       the model: what `sfm-shapefit locate` is given
     OUT/truth          the exact model, where sparse/0 is not it
 
-Nothing about keypoints and matches is made up: they err, miss and mistake one house for another as they do
-for photographs. What is known is the truth: the surface point under every keypoint, and so of every match
-whether it is right (`judge_matches`). The points of the exact model are those surface points, joined along
-right matches. On the CPU and with a seed, all of it is the same on every run, byte by byte.
+Keypoints and matches err, miss and mistake one house for another as they do for photographs. The truth is
+known: the surface point under every keypoint, and so whether a match is right (`judge_matches`). The points
+of the exact model are those surface points, joined along right matches. On the CPU and with a seed, all of it
+is the same on every run, byte by byte.
 """
 
 from pathlib import Path
@@ -71,12 +71,10 @@ def write_rendered_workspace(
 
     Args:
         scene: what to photograph.
-        out: a folder that does not exist yet; its parents are made.
+        out: a folder that does not exist yet; its parents are made. InputError if it exists or cannot be
+            written.
         options: what stands in it; the defaults if None. Without `database` nothing is matched, and the model
             has poses but no points.
-
-    Raises:
-        InputError: if `out` exists or cannot be written.
     """
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
@@ -94,15 +92,12 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     """Tell right from wrong among the inlier matches of a database of the scene's images.
 
     A match is right if the surface point under its keypoint in either image projects to within 4 pixels of
-    its keypoint in the other.
+    its keypoint in the other. InputError if the database cannot be read or has none of the images.
 
     Args:
         scene: what the images show.
         database: made from its images, by whatever detector and matcher; image k is named as by this module.
         min_matches: pairs with fewer are left out.
-
-    Raises:
-        InputError: if the database cannot be read or has none of the scene's images.
     """
     with open_database(database, read_model(_parts(scene, None).model(scene.rotations))) as opened:
         keypoints = [opened.keypoints(k) for k in range(scene.num_images)]

@@ -41,15 +41,10 @@ class RigScene(Rigs):
 
 
 def make_rig_drive(options: SceneOptions) -> RigScene:
-    """Return the drive of two rigs of three cameras.
+    """Return the drive of two rigs of three cameras, with exact rotations.
 
-    Args:
-        options: `num_images` is rounded down to whole frames; `shape` and `rig` are not read. Rotations are
-            exact.
-
-    Raises:
-        ValueError: if there is not a frame for each rig, or rotations are to be wrong.
-        InputError: as `make_scene`.
+    `options.num_images` is rounded down to whole frames; `shape` and `rig` are not read. ValueError if there
+    is not a frame for each rig, or rotations are to be wrong; InputError as `make_scene`.
     """
     num_frames = options.num_images // NUM_SENSORS
     if num_frames < NUM_RIGS:

@@ -97,9 +97,7 @@ class _FalseList:
 def make_scene(options: SceneOptions) -> Scene:
     """Lay out, photograph, pair and corrupt a scene.
 
-    Raises:
-        InputError: if no two images share `min_matches` points, or if fewer pairs can be corrupted
-            than asked for.
+    InputError if no two images share `min_matches` points, or fewer pairs can be corrupted than asked for.
     """
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
     return build_scene(*lay_out_scene(options, rngs[0]), options, rngs[1:])
@@ -149,16 +147,10 @@ def build_scene(
 def project_points(
     points: FloatArray, cam_from_world: FloatArray, center: FloatArray, calibration: FloatArray
 ) -> FloatArray:
-    """Return the (k, 2) pixels of (k, 3) points in a camera without distortion, by OpenCV.
+    """Return the (k, 2) pixels of (k, 3) points in world axes in a camera without distortion, by OpenCV.
 
-    Args:
-        points: (k, 3) in world axes.
-        cam_from_world: (3, 3) rotation.
-        center: (3,) camera center in world axes.
-        calibration: (3, 3) K.
-
-    Raises:
-        ValueError: if a point is not in front of the camera; OpenCV would project it without a word.
+    The camera has the rotation cam_from_world, its center in world axes, and the (3, 3) calibration K.
+    ValueError if a point is not in front of it; OpenCV would project it without a word.
     """
     import cv2
 

@@ -26,15 +26,10 @@ _CALIBRATED = 2  # value of COLMAP's TwoViewGeometry::ConfigurationType; see its
 
 
 def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:
-    """Write a scene as a COLMAP workspace, whole or not at all.
+    """Write a scene as a COLMAP workspace, whole or not at all; the default options if None.
 
-    Args:
-        scene: what to write.
-        out: a folder that does not exist yet; its parents are made.
-        options: what stands in it; the defaults if None.
-
-    Raises:
-        InputError: if `out` exists or cannot be written.
+    `out` is a folder that does not exist yet; its parents are made. InputError if it exists or cannot be
+    written.
     """
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:

@@ -73,9 +73,9 @@ class DenseNewtonFactor(NamedTuple):
 def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a dense Cholesky factor of nd x nd; as `solve_newton_sparse` otherwise.
+    """Solve the program with a dense Cholesky factor of nd x nd, n up to about a thousand.
 
-    For n up to about a thousand.
+    All else is as in `solve_newton_sparse`.
     """
     problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
@@ -242,8 +242,7 @@ def _propose(
 ) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
 
-    Returns:
-        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    Returns lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
     c, a, nodes, addend = problem.c, linearization.a, step.nodes, step.addend
     allowed, scale = allowed_violation(problem, gap), dot(c, a)

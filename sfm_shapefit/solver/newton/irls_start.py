@@ -72,10 +72,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
 def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degrees: Any) -> float:
     """Write s_e = w_e / sqrt(||r_e||^2 + floor^2), their sums at the cameras, and D^T S r at T.
 
-    An infinite floor stands for s_e = w_e.
-
-    Returns:
-        The mean residual.
+    An infinite floor stands for s_e = w_e. Returns the mean residual.
     """
     edges, v = problem.edges, problem.v
     gradient[:] = 0.0
@@ -106,8 +103,8 @@ def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degre
 def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhill: Any, steps: int) -> float:
     """Move t by conjugate gradients of the weighted least squares, <c, T> unchanged.
 
-    Returns:
-        About what is left of its energy <T, gradient>, where the preconditioned matrix is about the identity.
+    Returns about what is left of its energy <T, gradient>, where the preconditioned matrix is about the
+    identity.
     """
     direction, product = step.t, step.nodes
     direction[:] = 0.0

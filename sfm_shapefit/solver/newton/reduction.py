@@ -95,7 +95,7 @@ def factor_pinned(reduction: Reduction, blocks: FloatArray, c: FloatArray, pin: 
     """Factor the matrix of the blocks with one pair pinned; None if it is not positive definite.
 
     Args:
-        reduction: whose factor is overwritten.
+        reduction: its factor is overwritten.
         blocks: (m, d, d) S_e; tau v v^T is added to the pinned pair's.
         c: A^T D^T (w v), in the shape of x.
         pin: which pair.

@@ -39,6 +39,9 @@ def solve_newton_sparse(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks.
 
+    Returns locations (n, d), the dual (m, d), and the number of factorizations. UnsolvableError if the
+    directions do not determine any locations.
+
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
         tol: the gap wanted, in units of the objective.
@@ -46,13 +49,8 @@ def solve_newton_sparse(
         on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
-        plan: of the factorization of the graph's Laplacian, or its order of elimination, if there already.
-
-    Returns:
-        locations (n, d), the dual (m, d), and the number of factorizations.
-
-    Raises:
-        UnsolvableError: if the directions do not determine any locations.
+        plan: plan of the factorization of the graph's Laplacian, or its order of elimination, if there
+            already.
     """
     if not isinstance(plan, SymbolicFactor):
         neighbors = adjacency(graph.num_nodes, graph.edges)
@@ -69,10 +67,7 @@ def solve_newton_reduced(
     on_iteration: OnIteration | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program over the unknowns of a reduction, which the pairs determine.
-
-    All else is as in `solve_newton_sparse`.
-    """
+    """Solve the program over the unknowns of a reduction; all else is as in `solve_newton_sparse`."""
     work = steps.allocate(graph)
     problem, iterate = work.problem, work.iterate
     if start is None:
@@ -132,8 +127,7 @@ def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: floa
 def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
 
-    Returns:
-        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    Returns lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
     problem, iterate, linearization, step = work
     reduction = system.reduction

@@ -133,11 +133,7 @@ class Work(NamedTuple):
 
 
 def allocate(graph: ViewGraph) -> Work:
-    """Return the problem as arrays, and room for the iteration.
-
-    Raises:
-        UnsolvableError: if c is 0 up to rounding.
-    """
+    """Return the problem as arrays, and room for the iteration; UnsolvableError if c is 0 up to rounding."""
     n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
 
     def at_nodes() -> FloatArray:
@@ -466,8 +462,7 @@ def move_along(
 ) -> tuple[float, float]:
     """T += alpha dT, r += alpha dr, y = y+ clipped to its balls, feasible = keep feasible + gain y+.
 
-    Returns:
-        sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
+    Returns sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
     """
     combine(1.0, iterate.t, alpha, step.t, iterate.t)
     for e in range(len(problem.w)):

@@ -29,16 +29,15 @@ def certify_groups(
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
+    `equality_residual` is the largest violation at a group, or in the equation for the scale with offsets of
+    root mean square 1, relative to the largest weighted degree of a group.
+
     Args:
         graph: a view graph whose pairs connect the groups; those inside a group take no part.
-        groups: of its nodes.
+        groups: groups of its nodes.
         locations: (n, d) in any scale, with L(T) > 0 and the groups' offsets in one common scale.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         uniqueness: also examine whether the optimum is unique.
-
-    Returns:
-        The certificate; its `equality_residual` is the largest violation at a group, or in the equation
-        for the scale with offsets of root mean square 1, relative to the largest weighted degree of a group.
 
     Raises:
         InputError: if an array has the wrong shape or is not finite, the locations have L(T) <= 0, or they

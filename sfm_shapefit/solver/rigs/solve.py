@@ -31,18 +31,16 @@ def solve_groups(
 ) -> SolverResult:
     """Solve ShapeFit over groups, with a certificate.
 
+    Returns locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
+    `equality_residual` is as in `certify_groups`.
+
     Args:
         graph: a view graph; pairs inside a group take no part.
-        groups: of its nodes, tied to one another by the pairs between them (`largest_tied`).
-        options: solver settings; the methods are "newton", which "auto" means, and "conic".
+        groups: groups of its nodes, tied to one another by the pairs between them (`largest_tied`).
+        options: solver settings; the methods are "newton", which "auto" means, and "conic", else InputError.
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
 
-    Returns:
-        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
-        `equality_residual` is as in `certify_groups`.
-
     Raises:
-        InputError: if a method is asked for that does not exist over groups.
         UnsolvableError: if no pair joins two groups, the pairs do not determine the groups, or a factor over
             the groups would take more than `options.factor_memory_mb`.
     """

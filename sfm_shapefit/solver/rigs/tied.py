@@ -36,17 +36,14 @@ def largest_tied(
     locations: FloatArray | None = None,
     around: int | None = None,
 ) -> IntArray:
-    """Return the largest set of groups, ascending, that the pairs tie to one another if s is known.
+    """Return the largest set of groups (k,), ascending, that the pairs tie to one another if s is known.
 
     Args:
         edges: (m, 2) pairs of nodes; those inside a group are ignored.
-        groups: of the nodes.
-        sizes: (B,) what counts of each group, such as its number of cameras; sets are compared by their sum.
-        locations: (n, d) where they are asked about; random positions with the groups' offsets if None.
+        groups: groups of the nodes.
+        sizes: (B,) what each group counts, such as its number of cameras; sets are compared by their sum.
+        locations: (n, d) positions; random ones with the groups' offsets if None.
         around: a group; then the set that holds it, whatever its size.
-
-    Returns:
-        (k,) groups; a single one if no pair ties any two.
     """
     used = edges[groups.joins(edges)]
     if locations is None:

@@ -105,8 +105,7 @@ class EdgePasses:
     ) -> tuple[FloatArray, FloatArray]:
         """Take one proximal step: x_next = relaxation D t + (1 - relaxation) y + u, written; may be x itself.
 
-        Returns:
-            D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
+        Returns D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
         """
 
         def chunk(k: int, first: int, last: int) -> None:

@@ -134,14 +134,10 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 def laplacian_factor(
     graph: ViewGraph, resources: Resources = ONE_THREAD, prediction: Prediction | None = None
 ) -> LaplacianFactor:
-    """Return the factor of the resources; if None, a Cholesky factor of the graph's Laplacian.
+    """Return the factor of the resources; if None, a Cholesky factor of the connected graph's Laplacian.
 
-    Or an iterative solver where that factor would not fit, or would take longer than it saves.
-
-    Args:
-        graph: a connected view graph.
-        resources: threads and memory of the factor.
-        prediction: from `predict_factor` on the same graph, if it is there already.
+    Or an iterative solver where that factor would not fit, or would take longer than it saves. `prediction`
+    is that of `predict_factor` on the same graph, if it is there already.
     """
     if resources.factor is not None:
         return resources.factor
