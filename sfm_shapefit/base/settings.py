@@ -67,13 +67,13 @@ def groups_of(settings: type[Settings]) -> Iterator[Group]:
     The title of a group is the first sentence of that class. A field that is stated again, with another
     default, belongs to the class that states it last.
     """
-    known, seen = {item.name: item for item in fields(settings)}, set[str]()
+    by_name, seen = {item.name: item for item in fields(settings)}, set[str]()
     for base in settings.__mro__:
-        names = [name for name in inspect.get_annotations(base) if name in known.keys() - seen]
+        names = [name for name in inspect.get_annotations(base) if name in by_name.keys() - seen]
         seen |= set(names)
         if names:
             title = (base.__doc__ or base.__name__).split("\n")[0].rstrip(".")
-            yield Group(title, tuple(known[name] for name in names))
+            yield Group(title, tuple(by_name[name] for name in names))
 
 
 def explained(settings: type[S]) -> type[S]:
@@ -95,11 +95,11 @@ def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any])
     if given is not None and not isinstance(given, settings):
         kind, wanted = type(given).__name__, settings.__name__
         raise TypeError(f"options must be {wanted}(...), got a {kind}; or give single options by keyword")
-    known = [item.name for item in fields(settings)]
+    names = [item.name for item in fields(settings)]
     for name in overrides:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(names)}"
             raise TypeError(f"{name!r} is no option of {settings.__name__}; {hint}")
     if given is None:
         return settings(**overrides)

@@ -48,12 +48,12 @@ def sample_direction_errors(
         threshold_px: largest Sampson error of an inlier.
     """
     scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
-    known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
-    v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
+    has_direction: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
+    v = np.where(has_direction[:, None], directions, [1.0, 0.0, 0.0])
     keypoints = np.ascontiguousarray(matches.keypoints)
     rays_i, rays_j = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
-    given = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
-    _add_scores(*given, known, v, threshold_px, scores)
+    arrays = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
+    _add_scores(*arrays, has_direction, v, threshold_px, scores)
     bases = tangent_bases(v)
     gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
     return np.asarray(scores @ gain.transpose(0, 2, 1))
@@ -67,7 +67,7 @@ def _add_scores(
     rays_i: Any,
     rays_j: Any,
     pixel_angles: Any,
-    known: Any,
+    has_direction: Any,
     directions: Any,
     threshold_px: float,
     scores: Any,
@@ -77,7 +77,7 @@ def _add_scores(
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
     terms = np.empty((16, 3))
     for p in range(len(pairs)):
-        if not known[p]:
+        if not has_direction[p]:
             continue
         v = directions[p]
         for k in range(offsets[p], offsets[p + 1]):

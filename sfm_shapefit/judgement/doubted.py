@@ -38,10 +38,10 @@ _UNSUPPORTED = 0.1  # f; below any share of a camera with evidence for it
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
     """Return an assessment whose trust and reasons follow the doubts of the same cameras."""
     factors = _factors(doubts)
-    known = np.isfinite(factors)
-    trust = np.where(known, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
+    finite = np.isfinite(factors)
+    trust = np.where(finite, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
     reasons = list(assessment.reasons)
-    for camera in np.flatnonzero(known).tolist():
+    for camera in np.flatnonzero(finite).tolist():
         found = [_reason(doubts, camera), assessment.loose_reasons[camera]]
         if trust[camera] < LOW_TRUST:
             reasons[camera] = "; ".join(filter(None, found)) or SOMEWHAT_LOOSE

@@ -145,8 +145,8 @@ def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -
         return _weight_shares(asked._replace(rays=_subset(asked.rays, rows[chosen])), tried, hold=hold)
 
     everyone = np.arange(len(rows))
-    given = fit(everyone, 1.0)
-    coarse = {factor: fit(everyone, factor) - given for factor in _COARSE}
+    held = fit(everyone, 1.0)
+    coarse = {factor: fit(everyone, factor) - held for factor in _COARSE}
     doubts = []
     for camera in cameras[enough].tolist():
         chosen = np.flatnonzero(asking == camera)
@@ -157,7 +157,7 @@ def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -
         if not _is_doubtful(gains[best], images, hold=hold):
             continue
         for step in _FINE_STEPS:
-            gains[best * step] = fit(chosen, best * step) - given[chosen]
+            gains[best * step] = fit(chosen, best * step) - held[chosen]
         best = _best(gains)
         if abs(best - 1.0) >= _LEAST_CHANGE and _is_doubtful(gains[best], images, hold=hold):
             doubts.append(FocalDoubt(camera, best, float(gains[best].mean()), len(chosen)))

@@ -51,20 +51,20 @@ def propagate_groups(
         UnsolvableError: if the groups hang loose.
     """
     groups, share = gauge
-    known = inform(locations, edges, information)
+    tied = inform(locations, edges, information)
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyze(groups.num_groups, ends)
     if plan.num_bytes(locations.shape[1]) > max_bytes:
         return None
-    factor = factorize(plan, known.ridged(_RIDGE))
+    factor = factorize(plan, tied.ridged(_RIDGE))
     inverse = selected_inverse(factor, ends)
     covariances = _with_fixed_mean(factor, inverse.nodes, share)
     if errors is not None:
-        forces = (known.across @ errors.transpose(0, 2, 1)) / known.lengths[:, None, None]
+        forces = (tied.across @ errors.transpose(0, 2, 1)) / tied.lengths[:, None, None]
         covariances = scatter(_moved(factor, ends, forces, share))
     return CameraUncertainty(
         covariances=covariances[groups.group_of],
-        leverages=known.leverages(inverse, ends),
+        leverages=tied.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,
     )
 

@@ -32,8 +32,8 @@ def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray
     The covariances (n, d, d) of the locations (n, d) are NaN where not known.
     """
     variances = np.einsum("a,kab,b->k", line, covariances, line)
-    known = np.isfinite(variances) & (variances >= 0.0)
+    valid = np.isfinite(variances) & (variances >= 0.0)
     extent = float(np.ptp(locations @ line)) if len(locations) else 0.0
-    if not known.any() or extent == 0.0:
+    if not valid.any() or extent == 0.0:
         return float("nan")
-    return float(np.median(np.sqrt(variances[known]))) / extent
+    return float(np.median(np.sqrt(variances[valid]))) / extent

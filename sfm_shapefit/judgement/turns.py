@@ -159,10 +159,14 @@ def weigh_pairs(
     k, n = len(directions.pairs), len(rotations)
     codes = directions.pairs[:, 0] * n + directions.pairs[:, 1]
     order = np.argsort(codes, kind="stable")
-    own = relative.pairs[:, 0] * n + relative.pairs[:, 1]
-    row = order[np.minimum(np.searchsorted(codes[order], own), k - 1)] if k else np.zeros(0, dtype=np.int64)
-    found = codes[row] == own if k else np.zeros(0, dtype=np.bool_)
-    relative, row = relative.subset(found), row[found]
+    codes_of_relative = relative.pairs[:, 0] * n + relative.pairs[:, 1]
+    row = (
+        order[np.minimum(np.searchsorted(codes[order], codes_of_relative), k - 1)]
+        if k
+        else np.zeros(0, dtype=np.int64)
+    )
+    has_rotation = codes[row] == codes_of_relative if k else np.zeros(0, dtype=np.bool_)
+    relative, row = relative.subset(has_rotation), row[has_rotation]
 
     i, j = relative.pairs.T
     turns, sigmas = np.tile(np.eye(3), (k, 1, 1)), np.full(k, np.inf)
@@ -180,15 +184,15 @@ def weigh_pairs(
     )
     usable = is_usable(directions.status)
     small = _angles(turns) <= np.maximum(_AGREEING_SIGMAS * sigmas, _LEAST_TURN_RAD)
-    known = np.isfinite(sigmas)
+    finite = np.isfinite(sigmas)
     judged = usable & np.isfinite(agreements)
     support = np.where(judged, np.nan_to_num(agreements) * explained, 0.0)
     asked = np.zeros(k, dtype=np.bool_)
     asked[row] = True
-    support = np.where(asked & ~(known & small), _DIRECTION_ALONE * support, support)
+    support = np.where(asked & ~(finite & small), _DIRECTION_ALONE * support, support)
     # A pair without a direction that could be compared speaks for the rotation all the same.
-    support = np.where(~judged & known & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
-    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (known & small))
+    support = np.where(~judged & finite & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
+    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (finite & small))
     weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)
     weights[row] = np.minimum(counts, _MOST_WEIGHT)
     return PairTurns(directions.pairs, turns, sigmas, weights, support, astray.astype(np.float64))
@@ -201,8 +205,8 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     """
     count = int(labels.max(initial=-1)) + 1
     ends = labels[pairs.pairs]
-    kept = ends[:, 0] != ends[:, 1]
-    case = pairs.subset(kept)._replace(pairs=ends[kept])
+    between = ends[:, 0] != ends[:, 1]
+    case = pairs.subset(between)._replace(pairs=ends[between])
     level = _level(case)
     inflation = max(1.0, level)
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
@@ -308,9 +312,9 @@ def _level(pairs: PairTurns) -> float:
 
 def _contradicts(pairs: PairTurns) -> BoolArray:
     """Return which pairs say that one of their cameras is turned, (k,)."""
-    known = np.isfinite(pairs.sigmas_rad)
-    limits = np.maximum(_AGREEING_SIGMAS * np.where(known, pairs.sigmas_rad, 0.0), _LEAST_TURN_RAD)
-    return np.asarray(known & (_angles(pairs.turns) > limits))
+    finite = np.isfinite(pairs.sigmas_rad)
+    limits = np.maximum(_AGREEING_SIGMAS * np.where(finite, pairs.sigmas_rad, 0.0), _LEAST_TURN_RAD)
+    return np.asarray(finite & (_angles(pairs.turns) > limits))
 
 
 def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
@@ -357,7 +361,7 @@ def _worst_body(
     pairs: PairTurns, touching: _Touching, bodies: IntArray, done: BoolArray, least_rad: float
 ) -> tuple[BoolArray, _Judged] | None:
     """Return the body whose turn mends most, the smallest of equals, and what is said of it."""
-    found = []
+    candidates = []
     for label in range(int(bodies.max(initial=-1)) + 1):
         body = (bodies == label) & ~done
         if not body.any() or 2 * body.sum() > len(body):
@@ -365,11 +369,11 @@ def _worst_body(
         own = pairs.subset(touching.rows_of(np.flatnonzero(body)))
         judged = _judge(own, body, ~body, least_rad)
         if judged.kind is Doubt.TURNED:
-            found.append((body, judged))
-    if not found:
+            candidates.append((body, judged))
+    if not candidates:
         return None
-    most = max(judged.turned - judged.placed for _, judged in found)
-    equal = [one for one in found if one[1].turned - one[1].placed >= 0.9 * most]
+    most = max(judged.turned - judged.placed for _, judged in candidates)
+    equal = [one for one in candidates if one[1].turned - one[1].placed >= 0.9 * most]
     return min(equal, key=lambda one: int(one[0].sum()))
 
 
@@ -392,10 +396,10 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
     turn = _common_turn(votes, sigmas, weights * (1.0 - support), contradict)
     if turn is None or _angles(turn[None])[0] <= least_rad:
         return judged
-    known = np.isfinite(sigmas)
-    scale = np.where(known, sigmas, 1.0)
-    off_turned = np.where(known, _angles(votes @ turn.T) / scale, np.inf)
-    off_placed = np.where(known, _angles(votes) / scale, np.inf)
+    finite = np.isfinite(sigmas)
+    scale = np.where(finite, sigmas, 1.0)
+    off_turned = np.where(finite, _angles(votes @ turn.T) / scale, np.inf)
+    off_placed = np.where(finite, _angles(votes) / scale, np.inf)
     turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned + _PREFERENCE < off_placed)
     # What fits as placed, within the accuracy of its own rotation, is no evidence for the turn.
     fit_both = np.where(off_placed <= _AGREEING_SIGMAS, support, 0.0)

@@ -131,18 +131,18 @@ def propagate(
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
     """
     n, d = locations.shape
-    known = inform(locations, edges, information)
+    terms = inform(locations, edges, information)
     plan = analyze(n, edges)
     if plan.num_bytes(d) > max_bytes:
         return None
-    factor = _grounded_factor(plan, known)
+    factor = _grounded_factor(plan, terms)
     inverse = selected_inverse(factor, edges)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
-        pulls = known.across / known.lengths[:, None, None]
+        pulls = terms.across / terms.lengths[:, None, None]
         covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
-    return CameraUncertainty(covariances=covariances, leverages=known.leverages(inverse, edges), gauge=gauge)
+    return CameraUncertainty(covariances=covariances, leverages=terms.leverages(inverse, edges), gauge=gauge)
 
 
 def scatter(samples: FloatArray) -> FloatArray:
@@ -178,12 +178,12 @@ def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gau
     return moved
 
 
-def _grounded_factor(plan: SymbolicFactor, known: Information) -> CholeskyFactor:
+def _grounded_factor(plan: SymbolicFactor, terms: Information) -> CholeskyFactor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
-    longest = int(np.argmax(known.lengths))
-    held = np.trace(known.blocks[longest]) * np.outer(known.units[longest], known.units[longest])
+    longest = int(np.argmax(terms.lengths))
+    held = np.trace(terms.blocks[longest]) * np.outer(terms.units[longest], terms.units[longest])
     for ridge in _RIDGES:
-        regular = known.ridged(ridge)
+        regular = terms.ridged(ridge)
         regular[longest] += held
         try:
             return factorize(plan, regular)

@@ -162,8 +162,8 @@ class CholeskyFactor:
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
 
-        `rhs` is (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be orthogonal to the
-        constants (of each of the b components).
+        `rhs` is (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be orthogonal
+        to the constants (of each of the b components).
         """
         plan, b = self.symbolic, self.block
         n = plan.num_nodes

@@ -140,18 +140,20 @@ def _estimate_slice(
 ) -> RelativeRotations:
     """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
     pairs = np.arange(first, min(first + _PAIRS_PER_SLICE, len(batch.pairs)))
-    found, places = [], []
+    estimates, places = [], []
     if likely is not None:
-        known = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
-        near = _refine(batch.rays_of(known), likely.rotations[known], likely.translations[known])
+        likely_pairs = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
+        near = _refine(
+            batch.rays_of(likely_pairs), likely.rotations[likely_pairs], likely.translations[likely_pairs]
+        )
         fits = near.weight_shares >= _LIKELY_SHARE
-        found, places = [near.subset(fits)], [known[fits]]
-        pairs = np.setdiff1d(pairs, known[fits])
+        estimates, places = [near.subset(fits)], [likely_pairs[fits]]
+        pairs = np.setdiff1d(pairs, likely_pairs[fits])
     matches = batch.rays_of(pairs)
     has_pose, rotations, translations = _start_by_trials(matches, num_pairs)
-    found.append(_refine(matches, rotations, translations).subset(has_pose))
+    estimates.append(_refine(matches, rotations, translations).subset(has_pose))
     places.append(pairs[has_pose])
-    return concatenate_rotations(found).subset(np.argsort(np.concatenate(places)))
+    return concatenate_rotations(estimates).subset(np.argsort(np.concatenate(places)))
 
 
 def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:
@@ -191,6 +193,6 @@ def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, Fl
         pose = estimate["cam2_from_cam1"]
         rotations[p], translations[p] = pose.rotation.matrix(), pose.translation
     translations = normalized(translations)
-    found = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
-    rotations[~found], translations[~found] = np.eye(3), [1.0, 0.0, 0.0]
-    return found, rotations, translations
+    has_pose = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
+    rotations[~has_pose], translations[~has_pose] = np.eye(3), [1.0, 0.0, 0.0]
+    return has_pose, rotations, translations

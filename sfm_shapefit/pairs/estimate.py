@@ -24,11 +24,11 @@ def estimate_directions(
     k = len(matches.pairs)
     directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
-    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
+    arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
     settings = (options.inlier_threshold_px, options.num_hypotheses)
 
     def run(begin: int, end: int) -> None:
-        estimate_pairs(begin, end, *given, *settings, directions, measures, moments)
+        estimate_pairs(begin, end, *arrays, *settings, directions, measures, moments)
 
     if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.

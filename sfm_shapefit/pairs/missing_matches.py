@@ -71,9 +71,9 @@ def matched_shares(
         for k, (part, ends, affine) in enumerate(zip(rows, pairs, maps, strict=True)):
             image, there = images[ends[side]], images[ends[other]]
             sides[side, k] = _share(image, batch.keypoints[part, side], affine, there.size)
-    known = np.isfinite(sides)  # a side that says nothing leaves it to the other
+    finite = np.isfinite(sides)  # a side that says nothing leaves it to the other
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(known, sides, 0.0).sum(axis=0) / known.sum(axis=0))
+        return np.asarray(np.where(finite, sides, 0.0).sum(axis=0) / finite.sum(axis=0))
 
 
 class _Image(NamedTuple):
@@ -135,5 +135,5 @@ def score_pairs(triplet_scores: FloatArray, shares: FloatArray) -> FloatArray:
 
 def doubtful_pairs(scores: FloatArray) -> BoolArray:
     """Return which pairs have a far smaller score than is usual among all of them, (k,)."""
-    known = scores[np.isfinite(scores)]
-    return np.asarray(scores < _DOUBTFUL_SHARE * float(np.median(known)) if len(known) else scores < 0.0)
+    finite = scores[np.isfinite(scores)]
+    return np.asarray(scores < _DOUBTFUL_SHARE * float(np.median(finite)) if len(finite) else scores < 0.0)

@@ -59,7 +59,7 @@ def _weighted_means(side: IntArray, angles: FloatArray, weights: FloatArray, num
 def _triangles(graph: ViewGraph) -> IntArray:
     """Return the triangles of each pair, (k, 3) edge indices: the pair (i, j), the pair of i, that of j."""
     around = adjacency(graph.num_nodes, graph.edges)
-    found = [np.empty((0, 3), dtype=np.int64)]
+    blocks = [np.empty((0, 3), dtype=np.int64)]
     for e, (i, j) in enumerate(graph.edges.tolist()):
         rows = [slice(around.pointers[c], around.pointers[c + 1]) for c in (i, j)]
         around_i, around_j = (around.neighbors[row] for row in rows)
@@ -67,8 +67,8 @@ def _triangles(graph: ViewGraph) -> IntArray:
         sides = np.full((len(of_i), 3), e, dtype=np.int64)
         sides[:, 1] = around.edge_of[rows[0]][of_i]
         sides[:, 2] = around.edge_of[rows[1]][of_j]
-        found.append(sides)
-    return np.concatenate(found)
+        blocks.append(sides)
+    return np.concatenate(blocks)
 
 
 def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:

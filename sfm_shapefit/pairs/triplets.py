@@ -49,9 +49,9 @@ def score_triplets(num_images: int, relative: RelativeRotations) -> FloatArray:
             weigh_triangles(begin, end, pairs, starts, rotations, _LEAST_TRACE, scores, closing, total)
         with np.errstate(invalid="ignore"):
             scores = np.where(total > 0.0, closing / total, 1.0)
-    found = np.empty(k)
-    found[order] = np.where(total > 0.0, scores, np.nan)
-    return found
+    shares = np.empty(k)
+    shares[order] = np.where(total > 0.0, scores, np.nan)
+    return shares
 
 
 @kernel

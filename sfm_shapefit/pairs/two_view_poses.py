@@ -91,10 +91,10 @@ def refine_two_view_poses(
         np.zeros(k),
     )
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
-    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
+    arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
 
     def run(begin: int, end: int) -> None:
-        refine_pairs(begin, end, *given, *poses)
+        refine_pairs(begin, end, *arrays, *poses)
 
     if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.

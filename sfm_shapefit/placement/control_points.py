@@ -72,20 +72,20 @@ class ControlFit(NamedTuple):
 
 
 def triangulate_control_points(
-    known: ControlPoints, seen: MarkedViews, options: StructureOptions
+    control: ControlPoints, seen: MarkedViews, options: StructureOptions
 ) -> TriangulatedControl:
     """Return where the placed images of a model have control points; marks may be wrong.
 
     `seen` has the views of the marks; a mark may miss by four times what `options` allow a keypoint.
     """
-    counts = np.bincount(known.points[seen.rows], minlength=len(known.names))
+    counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         cameras=seen.views,
         keypoints=seen.rows,
-        pixels=known.pixels[seen.rows],
+        pixels=control.pixels[seen.rows],
         on_plane=seen.on_plane,
-        ids=np.arange(len(known.names)),
+        ids=np.arange(len(control.names)),
         may_split=False,
     )
     limits = PointLimits(
@@ -99,12 +99,12 @@ def triangulate_control_points(
         focal_lengths_px=seen.focal_lengths_px,
         images=np.arange(len(seen.rotations)),
     )
-    found = triangulate_tracks(tracks, stand, limits)
-    positions = np.full((len(known.names), 3), np.nan)
-    positions[found.tracks] = found.points
-    agreeing, errors = np.zeros(len(known.points), dtype=np.bool_), np.full(len(known.points), np.nan)
-    agreeing[seen.rows] = found.points_seen >= 0
-    to_point = positions[known.points[seen.rows]] - seen.centers[seen.views]
+    triangulated = triangulate_tracks(tracks, stand, limits)
+    positions = np.full((len(control.names), 3), np.nan)
+    positions[triangulated.tracks] = triangulated.points
+    agreeing, errors = np.zeros(len(control.points), dtype=np.bool_), np.full(len(control.points), np.nan)
+    agreeing[seen.rows] = triangulated.points_seen >= 0
+    to_point = positions[control.points[seen.rows]] - seen.centers[seen.views]
     inside = np.einsum("kab,kb->ka", seen.rotations[seen.views], to_point)
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
@@ -112,11 +112,11 @@ def triangulate_control_points(
     return TriangulatedControl(positions, errors, agreeing)
 
 
-def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | str:
+def fit_control_points(control: ControlPoints, positions: FloatArray) -> ControlFit | str:
     """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none."""
-    there: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
-    rows = np.flatnonzero(there & ~known.is_check)
-    source, target = found[rows], known.positions[rows]
+    there: BoolArray = np.asarray(np.isfinite(positions).all(axis=1))
+    rows = np.flatnonzero(there & ~control.is_check)
+    source, target = positions[rows], control.positions[rows]
     reason = why_too_few(target, "can be triangulated")
     if reason:
         return reason
@@ -143,12 +143,12 @@ def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | 
         )
     fitting = np.zeros(len(there), dtype=np.bool_)
     fitting[rows[fits]] = True
-    residuals = np.where(there[:, None], motion.apply(found) - known.positions, np.nan)
+    residuals = np.where(there[:, None], motion.apply(positions) - control.positions, np.nan)
     size = float(np.linalg.norm(target[fits] - target[fits].mean(axis=0)))
     return ControlFit(motion, fitting, sigma, residuals, sigma / size)
 
 
-def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge:
+def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit) -> Gauge:
     """Return the gauge of control points, for a model that stands in another one.
 
     y = A (s x + b) becomes c R y + t = R A (c s x + c b + (R A)^T t).
@@ -157,7 +157,7 @@ def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge
     axes = motion.rotation if before.axes is None else motion.rotation @ before.axes
     shift = axes.T @ motion.translation
     total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
-    used = int(np.sum(~known.is_check & np.isfinite(fit.residuals[:, 0])))
+    used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
     told = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
     warning = ""
     if fit.scale_sigma > METRIC_SIGMA:
@@ -167,12 +167,12 @@ def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge
         scale="control points",
         axes=axes,
         statement=(
-            f"control points: {known.statement}; {int(fit.fitting.sum())} of {used} agree, to "
+            f"control points: {control.statement}; {int(fit.fitting.sum())} of {used} agree, to "
             f"{fit.sigma:.3g} per axis; origin and axes: theirs; {told}"
         ),
         warning=warning,
         scale_sigma=fit.scale_sigma,
-        datum=known.datum,
+        datum=control.datum,
     )
 
 

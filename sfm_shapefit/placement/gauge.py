@@ -211,22 +211,22 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise UselessPriorsError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
-    found, weights, level = fit_to_priors(source, priors, size, rotate=turns)
+    similarity, weights, level = fit_to_priors(source, priors, size, rotate=turns)
     across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
-        found, weights, level = fit_to_priors(source, priors, size, rotate=False)
+        similarity, weights, level = fit_to_priors(source, priors, size, rotate=False)
     if not turns and not axes_known:
-        found, weights, level = fit_to_priors(source, priors, size, rotate=True)
-    if found.scale <= 0.0:
+        similarity, weights, level = fit_to_priors(source, priors, size, rotate=True)
+    if similarity.scale <= 0.0:
         raise UselessPriorsError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
     return Gauge(
-        similarity=_keep_axes(found.scale, found.rotation.T @ found.translation),
+        similarity=_keep_axes(similarity.scale, similarity.rotation.T @ similarity.translation),
         scale="prior",
-        axes=found.rotation if turns or not axes_known else None,
-        statement=_prior_statement(priors, found, weights, level, turns=turns or not axes_known),
+        axes=similarity.rotation if turns or not axes_known else None,
+        statement=_prior_statement(priors, similarity, weights, level, turns=turns or not axes_known),
         warning=_prior_warning(level, size, turns=turns, axes_known=axes_known),
         datum=priors.datum if turns else None,
     )
@@ -266,17 +266,17 @@ def fit_to_priors(
     the axes are fitted too.
     """
     target = priors.known.positions
-    found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
+    similarity = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
     sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)
     weights = np.ones(len(source))
     level = 0.0
     for _ in range(_REWEIGHTINGS):
-        residuals = np.linalg.norm(found.apply(source) - target, axis=1)
+        residuals = np.linalg.norm(similarity.apply(source) - target, axis=1)
         level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
         spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size)
         weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
-        found = fit_similarity(source, target, weights / spread**2, rotate=rotate)
-    return found, weights, level
+        similarity = fit_similarity(source, target, weights / spread**2, rotate=rotate)
+    return similarity, weights, level
 
 
 def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -286,12 +286,12 @@ def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _prior_statement(
-    priors: PositionPriors, found: Similarity, weights: FloatArray, level: float, *, turns: bool
+    priors: PositionPriors, similarity: Similarity, weights: FloatArray, level: float, *, turns: bool
 ) -> str:
     agreeing = int(np.sum(weights >= 0.5))
     axes = "axes: the input's"
     if turns:
-        axes = f"turned by {float(rotation_angles_deg(found.rotation)):.1f} deg onto theirs"
+        axes = f"turned by {float(rotation_angles_deg(similarity.rotation)):.1f} deg onto theirs"
     return (
         f"prior: {priors.statement}; {agreeing} of {len(weights)} agree, to {level:.3g} per axis; "
         f"origin: theirs, {axes}"

@@ -338,11 +338,11 @@ def _solve_scale_and_shift(ties: Ties, turn: FloatArray) -> FloatArray:
     matrix, target = np.concatenate(matrices), np.concatenate(targets)
     floor = 1e-6 * (float(np.abs(target).max()) or 1.0)
     weights = np.ones(len(target))
-    found = np.zeros(4)
+    solution = np.zeros(4)
     for _ in range(_REWEIGHTINGS):
-        found = np.linalg.lstsq(weights[:, None] * matrix, weights * target)[0]
-        weights = np.maximum(np.abs(matrix @ found - target), floor) ** -0.5
-    return found
+        solution = np.linalg.lstsq(weights[:, None] * matrix, weights * target)[0]
+        weights = np.maximum(np.abs(matrix @ solution - target), floor) ** -0.5
+    return solution
 
 
 def _off(fit: Similarity, ties: Ties) -> tuple[FloatArray, FloatArray]:

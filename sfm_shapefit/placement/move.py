@@ -16,14 +16,14 @@ def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
     Points follow their cameras. A camera whose row is NaN stays where it is.
     """
     refined, before = placement.refined, placement.locations
-    known = np.isfinite(locations).all(axis=1)
+    has_location = np.isfinite(locations).all(axis=1)
     moved = refined.locations.copy()
-    moved[: len(before)][known] = locations[known]
+    moved[: len(before)][has_location] = locations[has_location]
     by = float(np.median(np.linalg.norm(moved[: len(before)] - before, axis=1))) / median_spread(before)
     adjusted = replace(
         refined,
         locations=follow_cameras(placement.measured_part(), moved),
         reason=f"{refined.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)",
-        reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(known)),
+        reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(has_location)),
     )
     return replace_locations(placement, adjusted)

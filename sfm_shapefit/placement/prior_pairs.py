@@ -37,11 +37,11 @@ def compare_with_priors(
         gauge: gauge with axes of the priors.
         centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
     """
-    known, n = priors.known, len(centers)
+    has_prior, n = priors.known, len(centers)
     positions, sigmas = np.full((n, 3), np.nan), np.full(n, np.nan)
-    positions[known.indices] = known.positions
-    level = float(np.nanmedian(np.linalg.norm(known.off(centers), axis=1))) / MEDIAN_NORMAL_LENGTH
-    sigmas[known.indices] = np.fmax(known.sigmas(), level)
+    positions[has_prior.indices] = has_prior.positions
+    level = float(np.nanmedian(np.linalg.norm(has_prior.off(centers), axis=1))) / MEDIAN_NORMAL_LENGTH
+    sigmas[has_prior.indices] = np.fmax(has_prior.sigmas(), level)
     baselines = positions[pairs[:, 0]] - positions[pairs[:, 1]]
     axes = np.eye(3) if gauge.axes is None else gauge.axes
     angles = angle_between(normalized(baselines), directions @ axes.T)

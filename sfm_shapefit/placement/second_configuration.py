@@ -73,8 +73,8 @@ def find_second_configuration(
     fitted = (graph.dimension * (rigid.num_nodes - 1) - 1) / (graph.dimension - 1)
     if rigid.num_edges - fitted < _FEWEST_SPARE:
         return None
-    found = solve_lud(rigid, _STEPS, certified=False).locations
-    angles = angle_between_deg(rigid.directions, normalized(differences(found, rigid.edges)))
+    second = solve_lud(rigid, _STEPS, certified=False).locations
+    angles = angle_between_deg(rigid.directions, normalized(differences(second, rigid.edges)))
     alike = int(np.sum(angles <= np.clip(_LEVELS * level_deg, *_ANGLE_DEG)))
     if alike - fitted < _LEAST_SHARE * (rigid.num_edges - fitted) or alike < _LEAST_OF_AGREEING * agreeing:
         return None

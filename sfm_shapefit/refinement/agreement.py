@@ -51,13 +51,13 @@ class AngularAgreement:
 def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> AngularAgreement:
     """Return which directions agree with locations (n, d) of a measured graph."""
     graph, groups = measured.graph, measured.groups
-    freedom, own = graph.dimension - 1, own_covariances(measured)
+    freedom, covariances = graph.dimension - 1, own_covariances(measured)
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
     num_groups = graph.num_nodes if groups is None else groups.num_groups
     num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
-    excess, agrees = _excess(residuals, own, behind, num_unknowns)
+    excess, agrees = _excess(residuals, covariances, behind, num_unknowns)
     angles = np.linalg.norm(residuals, axis=1)
     return AngularAgreement(
         angles_rad=angles, agrees=agrees, level_rad=_level(angles, num_unknowns, freedom), excess_rad=excess
@@ -104,12 +104,12 @@ def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
 
 
 def _excess(
-    residuals: FloatArray, own: FloatArray, behind: BoolArray, num_unknowns: int
+    residuals: FloatArray, covariances: FloatArray, behind: BoolArray, num_unknowns: int
 ) -> tuple[float, BoolArray]:
     """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
     freedom = residuals.shape[1]
     angles = np.linalg.norm(residuals, axis=1)
-    values, vectors = np.linalg.eigh(own)
+    values, vectors = np.linalg.eigh(covariances)
     squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
     limit = chdtri(freedom, _OUTLIER_PROBABILITY)
     used: BoolArray = np.ones(len(angles), dtype=np.bool_)

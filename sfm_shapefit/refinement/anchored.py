@@ -97,10 +97,10 @@ class _AnchoredTerms(AngularTerms):
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
         blocks, damped, gradient = self.linearize(t)
-        own = weighted_anchors(self._anchors, t).information
-        pull = np.einsum("kab,kb->ka", own, self._anchors.off(t))
+        anchor_blocks = weighted_anchors(self._anchors, t).information
+        pull = np.einsum("kab,kb->ka", anchor_blocks, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
-        return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right
+        return np.concatenate([blocks, anchor_blocks]), np.append(damped, np.zeros(len(anchor_blocks))), right
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step (n + 1, d), with the origin where it is."""

@@ -218,8 +218,8 @@ def take_angular_step(
         after = terms.cost(proposed)
         return (proposed, after) if after < before else None
 
-    found, damping = take_damped_step(propose, damping, DAMPING)
-    moved, after = (t, before) if found is None else found
+    proposal, damping = take_damped_step(propose, damping, DAMPING)
+    moved, after = (t, before) if proposal is None else proposal
     return moved, damping, before, after
 
 
@@ -244,13 +244,13 @@ def residual_levels(
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
     median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # with unit variance per axis
     chords = np.linalg.norm(_residuals(graph, _unit(locations)), axis=1)
-    found = np.empty_like(levels)
+    new_levels = np.empty_like(levels)
     for c, level in enumerate(levels):
-        own = chords[metric.classes == c]
-        inside = own[own < KERNEL_WIDTH * level]
-        few = len(inside) < _LEAST_SHARE * len(own) or len(own) == 0
-        found[c] = level if few else np.median(inside) / median_length
-    return np.maximum(found, _LEAST_LEVEL_RAD)
+        class_chords = chords[metric.classes == c]
+        inside = class_chords[class_chords < KERNEL_WIDTH * level]
+        few = len(inside) < _LEAST_SHARE * len(class_chords) or len(class_chords) == 0
+        new_levels[c] = level if few else np.median(inside) / median_length
+    return np.maximum(new_levels, _LEAST_LEVEL_RAD)
 
 
 def information_at(graph: ViewGraph, metric: Metric, levels: FloatArray) -> FloatArray:
@@ -265,8 +265,8 @@ def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] |
     """
     if metric.covariance is None:
         return None
-    known = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
-    variances, axes = np.linalg.eigh(np.where(known.reshape(-1, 1, 1), metric.covariance, 0.0))
+    finite = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(finite.reshape(-1, 1, 1), metric.covariance, 0.0))
     return np.asarray(tangent_bases(graph.directions) @ axes), np.maximum(variances, 0.0)
 
 

@@ -48,12 +48,12 @@ def find_strays(
         agreeing: (m,) pairs that fit the refined locations.
         noise_rad: (m,) standard deviation of each direction, per axis.
     """
-    found: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
+    strays: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
     reach = _REACH
     while (far := left_scene(start, refined, reach)).any():
-        found |= _find_drifting(graph, refined, far, agreeing, noise_rad)
+        strays |= _find_drifting(graph, refined, far, agreeing, noise_rad)
         reach *= _FARTHER
-    return np.flatnonzero(found).astype(np.int64)
+    return np.flatnonzero(strays).astype(np.int64)
 
 
 def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) -> BoolArray:

@@ -162,25 +162,25 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = starts[0], "the baseline's own answer, as asked"
+    chosen, reason = starts[0], "the baseline's own answer, as asked"
     if not is_baseline:
-        kept, reason = _choose(starts, costs, apart, options)
+        chosen, reason = _choose(starts, costs, apart, options)
     if problem.normal_solver is None and refines:
         reason += "; not refined, since the factor for that would be too large"
-    moved = _measure_moves(kept)
+    moved = _measure_moves(chosen)
     # To the bit: the certificate is that of these very locations.
-    is_as_solved = kept.locations is solved.locations and moved[1] == 0.0
+    is_as_solved = chosen.locations is solved.locations and moved[1] == 0.0
     return RefinedPlacement(
-        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.best),
-        start=kept.name,
+        locations=solved.locations if is_as_solved else normalize_locations(graph, chosen.best),
+        start=chosen.name,
         is_refined=moved[1] > 0.0,
         reason=reason,
         disagreement=apart,
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=moved,
-        num_turned_pairs=_count_turned_pairs(problem, kept, levels),
-        reset_nodes=kept.reset_nodes,
+        num_turned_pairs=_count_turned_pairs(problem, chosen, levels),
+        reset_nodes=chosen.reset_nodes,
         lud=lud,
     )
 
@@ -209,12 +209,12 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
     metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, OPENING_RAD)
-    found = []
+    candidates = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
         locations = lud_over_groups(_weight_points(graph, classes, point_weight), groups)
         if locations is not None and projected_length(graph, locations) > 0.0:
-            found.append((robust_cost(graph, locations, metric, opening), locations))
-    return None, min(found, key=lambda pair: pair[0])[1] if found else None
+            candidates.append((robust_cost(graph, locations, metric, opening), locations))
+    return None, min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 
 def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
@@ -285,17 +285,17 @@ def _noise(metric: Metric, levels: FloatArray) -> FloatArray:
     """Return the standard deviation of each direction (m,), per axis, radians."""
     variances = levels[metric.classes] ** 2
     if metric.covariance is not None:
-        own = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
-        variances = variances + np.trace(own, axis1=1, axis2=2) / own.shape[1]
+        covariances = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
+        variances = variances + np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
     return np.asarray(np.sqrt(variances))
 
 
-def _count_turned_pairs(problem: _Problem, kept: Start, levels: FloatArray) -> int:
+def _count_turned_pairs(problem: _Problem, chosen: Start, levels: FloatArray) -> int:
     """Return how many pairs the refinement made fit, or not fit any more."""
-    if kept.refined is None:
+    if chosen.refined is None:
         return 0
     before, after = (
-        fitting_pairs(problem.graph, t, problem.metric, levels) for t in (kept.locations, kept.best)
+        fitting_pairs(problem.graph, t, problem.metric, levels) for t in (chosen.locations, chosen.best)
     )
     return int(np.sum(before != after))
 
@@ -342,8 +342,8 @@ def _normalize(t: FloatArray) -> FloatArray:
     return np.asarray(centered / np.linalg.norm(centered))
 
 
-def _measure_moves(kept: Start) -> tuple[float, float]:
+def _measure_moves(chosen: Start) -> tuple[float, float]:
     """Return the median and the largest move by the refinement, see `RefinedPlacement.moved`."""
-    before, after = _normalize(kept.locations), _normalize(kept.best)
+    before, after = _normalize(chosen.locations), _normalize(chosen.best)
     moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
     return float(np.median(moved)), float(moved.max())

@@ -133,11 +133,11 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
     """Return rotations (n, 4) after rounds of a robust loss that narrows from `widest`, in radians."""
     turns, k = turns.copy(), len(given.pairs)
     weights = np.sqrt(given.supports / given.supports.mean())
-    found, gradient = np.empty(k), np.empty((given.num_cameras, 3))
+    robust, gradient = np.empty(k), np.empty((given.num_cameras, 3))
     for step in range(_ROUNDS):
         tau = max(widest * _COOLING**step, float(_COLDEST))
-        reweigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
-        turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), LONGEST_STEP)
+        reweigh_pairs(given.pairs, given.measured, turns, weights, tau, robust, gradient)
+        turned = turn_cameras(turns, system.solve_scalar(robust, gradient, _REDUCTION), LONGEST_STEP)
         if tau <= _COLDEST and turned <= SETTLED:
             break
     return turns

@@ -82,13 +82,13 @@ def evidence_of(relative: RelativeRotations, shares: FloatArray) -> FloatArray:
 
     Shares (k,) are those of `missing_matches.matched_shares`; NaN where unknown.
     """
-    found, known = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
-    if len(known) == 0:
-        return found
-    usual = _usual_shares(rotation_angles_deg(relative.rotations[known]), shares[known])
-    compared = shares[known] / np.maximum(usual, np.finfo(np.float64).tiny)
-    found[known] = np.clip((compared - _EVEN_SHARE) / _SPREAD, -1.0, 1.0)
-    return found
+    evidence, finite = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
+    if len(finite) == 0:
+        return evidence
+    usual = _usual_shares(rotation_angles_deg(relative.rotations[finite]), shares[finite])
+    compared = shares[finite] / np.maximum(usual, np.finfo(np.float64).tiny)
+    evidence[finite] = np.clip((compared - _EVEN_SHARE) / _SPREAD, -1.0, 1.0)
+    return evidence
 
 
 def _usual_shares(angles_deg: FloatArray, shares: FloatArray) -> FloatArray:
@@ -139,8 +139,8 @@ def choose_arrangement(
 
 def agreeing_pairs(relative: RelativeRotations, averaged: AveragedRotations) -> BoolArray:
     """Return which pairs agree with averaged rotations within 5 degrees, (k,)."""
-    known = averaged.registered[relative.pairs].all(axis=1)
-    return np.asarray(known & (relative.residuals_deg(averaged.rotations) <= AGREEMENT_DEG))
+    registered = averaged.registered[relative.pairs].all(axis=1)
+    return np.asarray(registered & (relative.residuals_deg(averaged.rotations) <= AGREEMENT_DEG))
 
 
 def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:

@@ -86,7 +86,7 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
 
 @kernel
 def reweigh_pairs(
-    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, found: Any, gradient: Any
+    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any, gradient: Any
 ) -> None:
     """Fill the robust weights (k,) and the gradient D^T W x (n, 3).
 
@@ -100,7 +100,7 @@ def reweigh_pairs(
         square = _world_residual(measured[e], turns[i], turns[j], x)
         loss = 1.0 + square / (scale * scale)
         w = weights[e] / (loss * loss)
-        found[e] = w
+        robust[e] = w
         for c in range(3):
             gradient[i, c] -= w * x[c]
             gradient[j, c] += w * x[c]

@@ -147,12 +147,12 @@ class AveragingSystem:
                 self._preconditioner = self._factors[1]
             else:
                 self._preconditioner = approximate_cholesky(self.graph, weights, _SEED)
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             apply, self._preconditioner, right, tol=tol, max_iterations=_MAX_STEPS, coupled=coupled
         )
-        if found.iterations > _STALE_STEPS:
+        if solution.iterations > _STALE_STEPS:
             self._preconditioner = None
-        return found.x
+        return solution.x
 
 
 def plan_system(num_nodes: int, pairs: IntArray, weights: FloatArray, threads: int) -> AveragingSystem:

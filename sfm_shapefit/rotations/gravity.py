@@ -92,18 +92,18 @@ def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gr
         gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
-    own = gravity.among(members)
-    if len(own.indices) < FEWEST_GRAVITIES:
+    gravities = gravity.among(members)
+    if len(gravities.indices) < FEWEST_GRAVITIES:
         return averaged
-    upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], own)).T
+    upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], gravities)).T
     inside: BoolArray = np.asarray(averaged.registered[given.pairs].all(axis=1))
-    kept = given.subset(inside)
-    pairs = np.ascontiguousarray(np.searchsorted(members, kept.pairs))
-    found = _refine(upright[members], replace(kept, num_cameras=len(members), pairs=pairs), own)
+    inner = given.subset(inside)
+    pairs = np.ascontiguousarray(np.searchsorted(members, inner.pairs))
+    refined = _refine(upright[members], replace(inner, num_cameras=len(members), pairs=pairs), gravities)
     rotations, sigmas = averaged.rotations.copy(), averaged.sigmas_deg.copy()
-    to_world = Rotation.from_quat(found.turns[:-1]) * Rotation.from_quat(found.turns[-1]).inv()
+    to_world = Rotation.from_quat(refined.turns[:-1]) * Rotation.from_quat(refined.turns[-1]).inv()
     rotations[members] = to_world.as_matrix()
-    sigmas[members] = np.degrees(_sigmas_of_cameras(found))
+    sigmas[members] = np.degrees(_sigmas_of_cameras(refined))
     return replace(averaged, rotations=rotations, sigmas_deg=sigmas, certified=None)
 
 
@@ -117,17 +117,17 @@ class _Refined(NamedTuple):
     system: AveragingSystem
 
 
-def _sigmas_of_cameras(found: "_Refined") -> FloatArray:
+def _sigmas_of_cameras(refined: "_Refined") -> FloatArray:
     """Return the standard deviations of the cameras per axis, in radians, (n,), relative to their mean turn.
 
     The world has no part in that mean: how it is turned about gravity nothing says. It becomes the first
     node, since the system is grounded at the last one, and all is known relative to a camera.
     """
-    n = found.graph.num_cameras
-    pairs = np.ascontiguousarray(np.sort((found.graph.pairs + 1) % n, axis=1))
-    system = plan_system(n, pairs, np.sqrt(found.graph.supports), found.system.threads)
+    n = refined.graph.num_cameras
+    pairs = np.ascontiguousarray(np.sort((refined.graph.pairs + 1) % n, axis=1))
+    system = plan_system(n, pairs, np.sqrt(refined.graph.supports), refined.system.threads)
     is_camera = np.arange(n) > 0
-    return estimate_sigmas(replace(found.graph, pairs=pairs), system, found.last, is_camera)[1:]
+    return estimate_sigmas(replace(refined.graph, pairs=pairs), system, refined.last, is_camera)[1:]
 
 
 def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Refined:

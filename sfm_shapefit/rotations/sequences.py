@@ -145,8 +145,8 @@ def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -
         except UnsolvableError:
             continue
         angles, tolerances = _compare(videos, averaged, relative.subset(loops))
-        known = np.isfinite(angles)
-        loops, angles, tolerances = loops[known], angles[known], tolerances[known]
+        finite = np.isfinite(angles)
+        loops, angles, tolerances = loops[finite], angles[finite], tolerances[finite]
         found = _judge_visits(videos, relative.subset(loops), angles, tolerances)
         visits += found[0]
         refused.append(loops[found[1]])

@@ -188,8 +188,8 @@ def _facing_triangles(scene: RenderedScene, image: int) -> _Triangles:
     v = np.ascontiguousarray(in_camera.swapaxes(1, 2))
     volume = np.linalg.det(v)
     size = np.prod(np.linalg.norm(in_camera, axis=2), axis=1)
-    kept = np.flatnonzero((volume < -1e-12 * size) & (in_camera[:, :, 2].max(axis=1) > _NEAREST_DEPTH_M))
-    return _Triangles(kept, in_camera[kept], np.linalg.inv(v[kept]))
+    facing = np.flatnonzero((volume < -1e-12 * size) & (in_camera[:, :, 2].max(axis=1) > _NEAREST_DEPTH_M))
+    return _Triangles(facing, in_camera[facing], np.linalg.inv(v[facing]))
 
 
 def _bounds(corners: FloatArray, rays: FloatArray) -> IntArray:

@@ -182,8 +182,8 @@ def _candidates(layout: SceneLayout, options: SceneOptions) -> Iterator[IntArray
     radius_m = max(ahead_m, r) * (1.0 + 1e-9)
     tree = KDTree(layout.points)
     for center, axis in zip(layout.centers, layout.rotations[:, 2], strict=True):
-        found = tree.query_ball_point(center + ahead_m * axis, radius_m, return_sorted=True)
-        yield np.asarray(found, dtype=np.int64)
+        rows = tree.query_ball_point(center + ahead_m * axis, radius_m, return_sorted=True)
+        yield np.asarray(rows, dtype=np.int64)
 
 
 def _photograph(
@@ -312,19 +312,19 @@ def _false_lists(
 ) -> dict[int, _FalseList]:
     """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs."""
     asked = round(options.corrupted_pair_fraction * len(pairs))
-    found: dict[int, _FalseList] = {}
+    false_lists: dict[int, _FalseList] = {}
     for e in rng.permutation(len(pairs)):
-        if len(found) == asked:
+        if len(false_lists) == asked:
             break
         false = _false_list(layout, keypoint_points, pairs[e], options, rng)
         if false is not None:
-            found[int(e)] = false
-    if len(found) < asked:
+            false_lists[int(e)] = false
+    if len(false_lists) < asked:
         raise InputError(
-            f"only {len(found)} of the {asked} pairs to corrupt have a false baseline that keeps"
+            f"only {len(false_lists)} of the {asked} pairs to corrupt have a false baseline that keeps"
             f" {options.min_matches} points in view; lower corrupted_pair_fraction or raise num_points"
         )
-    return found
+    return false_lists
 
 
 def _false_list(
@@ -356,8 +356,8 @@ def _false_list(
     rows = np.flatnonzero(in_view[first])[: min(shared, _MOST_FALSE_MATCHES)]
     exact = project_points(points[rows], layout.rotations[displaced], centers[first], options.calibration)
     noisy = exact + options.pixel_noise_px * rng.standard_normal(exact.shape)
-    kept = _inside_image(noisy, options)
-    return _FalseList(displaced=side, keypoints=chosen[rows][kept], xy=noisy[kept], center=centers[first])
+    inside = _inside_image(noisy, options)
+    return _FalseList(displaced=side, keypoints=chosen[rows][inside], xy=noisy[inside], center=centers[first])
 
 
 def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -135,14 +135,14 @@ def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbors: Int32Arr
 @kernel
 def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
     """Return which pairs are among the first `few` kept at one of their nodes, at least, (m,)."""
-    kept = np.zeros(num_nodes, dtype=np.int64)
+    counts = np.zeros(num_nodes, dtype=np.int64)
     is_kept = np.zeros(len(edges), dtype=np.bool_)
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        if kept[i] < few or kept[j] < few:
+        if counts[i] < few or counts[j] < few:
             is_kept[e] = True
-            kept[i] += 1
-            kept[j] += 1
+            counts[i] += 1
+            counts[j] += 1
     return is_kept
 
 
