@@ -47,8 +47,10 @@ STILL_ALIKE = {
     "shorten",
 }
 
-# The identifier would be the subject of such a sentence.
-OPENING = re.compile(r"(Of|Those|From so many|So many|By what|The latter)\b", flags=re.IGNORECASE)
+# The identifier would be the subject of such a sentence; the shape of an array may stand before it.
+OPENING = re.compile(
+    r"(\([^)]*\) )?(Of|Those|From so many|So many|By what|The latter)\b", flags=re.IGNORECASE
+)
 PHRASE = re.compile(r"\bwhat there is\b|\bthe latter\b|\btells?(?= *(?:[.,;:)]|$))", flags=re.IGNORECASE)
 
 
@@ -165,7 +167,14 @@ def test_no_two_public_names_are_alike():
 
 
 def test_the_rules_see_what_they_are_to_see():
-    for text in ("Of each pair.", "Sound. Those that move.", "of pairs", "What there is.", "nothing tells."):
+    for text in (
+        "Of each pair.",
+        "Sound. Those that move.",
+        "of pairs",
+        "(k,) those that fit.",
+        "What there is.",
+        "nothing tells.",
+    ):
         assert list(faults_of(text)), text
     for text in ("Offsets of groups.", "A pair of those.", "It tells them apart.", "Angle of each pair."):
         assert not list(faults_of(text)), text

@@ -59,11 +59,11 @@ class ObservationCounts:
     image_ids: IntArray
     """(n,)"""
     checked: IntArray
-    """(n,) all of them."""
+    """(n,) their number."""
     agreeing: IntArray
-    """(n,) those that see a 3D point."""
+    """(n,) number that sees a 3D point."""
     contradicting: IntArray
-    """(n,) those that see none, and most of whose matches miss the epipolar lines of the cameras."""
+    """(n,) number that sees none, and most of whose matches miss the epipolar lines of the cameras."""
 
     def shares(self) -> ObservationShares:
         """Return the shares of all images together."""

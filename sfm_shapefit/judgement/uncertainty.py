@@ -75,7 +75,7 @@ class Information(NamedTuple):
     units: FloatArray
     """(m, d) directions of the baselines."""
     lengths: FloatArray
-    """(m,) of the baselines."""
+    """(m,) lengths of the baselines."""
     across: FloatArray
     """(m, d, d) P Lambda P with P = I - u u^T, rad^-2: the scale stays exactly free."""
     blocks: FloatArray

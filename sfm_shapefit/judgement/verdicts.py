@@ -59,7 +59,7 @@ class Assessment:
     excess_deg: float
     """The part of it, per axis, that the pairs' own covariances do not explain."""
     trust: FloatArray
-    """(k,) of each camera, in [0, 1], see `trust.judge_cameras`."""
+    """(k,) trust of each camera, in [0, 1], see `trust.judge_cameras`."""
     reasons: tuple[str, ...]
     """k sentences that say why a trust is low; empty where it is not."""
     hold: FloatArray

@@ -76,7 +76,7 @@ def estimate_relative_rotations(
         batch: rays in camera axes, that is, of a model whose rotations are the identity.
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
-        num_pairs: those of the whole database; if many, each is tried less often.
+        num_pairs: pairs of the whole database; if many, each is tried less often.
         likely: poses of the batch's pairs. Where most matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
@@ -102,7 +102,7 @@ def stored_relative_rotations(
     middle axis; W is 1.
 
     Args:
-        database: of the model's images.
+        database: database of the model's images.
         model: whose focal lengths count.
         min_matches: pairs with fewer inlier matches are left out.
 

@@ -86,7 +86,7 @@ class _Image(NamedTuple):
     place_of: IntArray
     """Place of each keypoint of the image among them."""
     size: FloatArray
-    """(2,) of the image."""
+    """(2,) width and height of the image."""
 
     @classmethod
     def of(cls, pixels: FloatArray, size: FloatArray, partners: IntArray) -> "_Image":

@@ -63,7 +63,7 @@ class TwoViewPoses(NamedTuple):
     translations: FloatArray
     """(k, 3) unit vectors in axes of camera j, x_j = rotation x_i + translation; the sign is the start's."""
     information: FloatArray
-    """(k, 3, 3) of the rotations, in rad^-2; axes of camera j, see `RelativeRotations`."""
+    """(k, 3, 3) information of the rotations, in rad^-2; axes of camera j, see `RelativeRotations`."""
     weight_shares: FloatArray
     """(k,) mean robust weight of the matches, in [0, 1]."""
 

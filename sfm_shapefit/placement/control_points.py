@@ -50,7 +50,7 @@ class TriangulatedControl(NamedTuple):
     positions: FloatArray
     """(k, 3), NaN for those that cannot be triangulated."""
     errors_px: FloatArray
-    """(m,) of the marks, from the point to the mark; NaN where there is no point or the image is not in the
+    """(m,) distances of the marks from their points; NaN where there is no point or the image is not in the
     model."""
     agreeing: BoolArray
     """(m,) the marks that the point was triangulated from."""
@@ -62,7 +62,7 @@ class ControlFit(NamedTuple):
     motion: Similarity
     """From the model to the control points."""
     fitting: BoolArray
-    """(k,) those that set it."""
+    """(k,) points that set it."""
     sigma: float
     """Standard deviation of their coordinates; 0 if they are too few to have one."""
     residuals: FloatArray

@@ -64,9 +64,9 @@ class ModelJoin:
     scale_sigma: float
     """Relative standard deviation of its scale."""
     turn_sigma_deg: float
-    """Standard deviation of its rotation: of the angle of its error."""
+    """Standard deviation of the angle by which its rotation is off."""
     center_sigma: float
-    """Standard deviation of where the second model's cameras come to lie, median, in units of the first."""
+    """Median standard deviation of the second model's cameras, in units of the first."""
     evidence: str
     """What it rests on, in words."""
     agreeing: BoolArray | None = None
@@ -79,7 +79,7 @@ class Ties(NamedTuple):
     eyes_first: FloatArray
     """(k, 3) center of the first model's camera."""
     eyes_second: FloatArray
-    """(k, 3) of the second one's."""
+    """(k, 3) center of the second one's."""
     rays_first: FloatArray
     """(k, 3) unit rays in the first model's world."""
     rays_second: FloatArray
@@ -162,7 +162,7 @@ class PlacedByPriors(NamedTuple):
     """A model on the position priors of its cameras, and how well it stands there."""
 
     centers: FloatArray
-    """(n, 3) of its cameras, in its world."""
+    """(n, 3) centers of its cameras, in its world."""
     priors_from_model: Similarity
     parts: tuple[Similarity, ...]
     """The same without some of the priors in turn."""

@@ -40,7 +40,7 @@ class Near(NamedTuple):
     """Where an adjustment has cameras already."""
 
     locations: FloatArray
-    """(n, 3) of all cameras, in any scale and from any origin; NaN for those it lacks."""
+    """(n, 3) centers of all cameras, in any scale and from any origin; NaN for those it lacks."""
     refined: RefinedPlacement
     """The placement that it started from."""
 

@@ -69,7 +69,7 @@ class Metric(NamedTuple):
     """What a residual is judged by."""
 
     covariance: FloatArray | None
-    """(m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
+    """(m, d - 1, d - 1) covariances in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
     classes: IntArray
     """(m,) the class of each pair, 0, 1, ...; each has a level of its own."""
 

@@ -29,7 +29,7 @@ class Rigs:
     sensor_rotations: FloatArray
     """(rigs, sensors, 3, 3) sensor_from_rig."""
     sensor_centers: FloatArray
-    """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
+    """(rigs, sensors, 3) place of each sensor in its rig, in meters; 0 for the reference."""
 
     def rotations_of(self, frame_rotations: FloatArray) -> FloatArray:
         """Return cam_from_world (n, 3, 3) of the images from rig_from_world (f, 3, 3) of their frames."""

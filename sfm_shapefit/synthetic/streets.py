@@ -26,7 +26,7 @@ class StreetProblem(GraphProblem):
 
     num_cameras: int
     covariance: FloatArray
-    """(m, 2, 2) of each direction in its tangent plane, rad^2, as far as it is not wrong."""
+    """(m, 2, 2) covariance of each direction in its tangent plane, rad^2, as far as it is not wrong."""
 
 
 def street_problem(

@@ -87,7 +87,7 @@ def solve_hybrid(
         max_iterations: limit of iterations of the splitting. Newton steps follow a stall, or a few hundred
             iterations where they are cheap, not this limit.
         resources: threads, of the passes over edges and of the factor, and memory of a factor.
-        prediction: of the factor, if it is there already, to save a second ordering.
+        prediction: prediction of the factor, if it is there already, to save a second ordering.
         on_iteration: called after each iteration and each factorization; returning False cancels. What
             has been reached is certified all the same.
 
