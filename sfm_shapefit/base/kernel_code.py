@@ -1,9 +1,8 @@
 """Compiled code as it is kept on disk: packed into bytes, and made ready to run again.
 
-numba's own way to load a kernel first sets up all that is needed to compile one, and reads the kernel's LLVM
-code, which is of use to other kernels only, when they are compiled. Here both wait until something is
-compiled: that takes a quarter of the time. It rests on parts of numba that are not public. Where they are
-not as expected, numba loads the kernel its own way.
+numba's own loader first sets up all that is needed to compile a kernel, and reads the kernel's LLVM code, of
+use to other kernels only. Here both wait until something is compiled: that takes a quarter of the time. It
+rests on parts of numba that are not public; where they are not as expected, numba loads the kernel its way.
 """
 
 import io
@@ -20,7 +19,7 @@ from numba.core.environment import Environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-# Of strings in sets and dictionaries: numba defines these symbols when it is ready to compile.
+# Symbols of string hashes in sets and dictionaries: numba defines them when it is ready to compile.
 _NEEDS_COMPILER = b"_numba_hashsecret"
 
 
@@ -82,11 +81,7 @@ def pack(compiled: Any) -> bytes:
 
 
 def unpack(content: bytes, target_context: Any) -> Any:
-    """Return compiled code that is ready to run.
-
-    Raises:
-        Exception: of any type, if the content is damaged or of another version.
-    """
+    """Return compiled code that is ready to run; raises anything if it is damaged or of another version."""
     reduced = _Reader(io.BytesIO(content)).load()
     try:
         return _load(target_context, reduced)
@@ -96,11 +91,7 @@ def unpack(content: bytes, target_context: Any) -> Any:
 
 
 def _load(target_context: Any, reduced: tuple[Any, ...]) -> Any:
-    """Do what `CompileResult._rebuild` does.
-
-    Raises:
-        ValueError: if the code needs more than is set up here.
-    """
+    """Do what `CompileResult._rebuild` does; ValueError if the code needs more than is set up here."""
     (
         (name, kind, (machine_code, llvm_code)),
         description,

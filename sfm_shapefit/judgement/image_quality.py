@@ -11,8 +11,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.files.colmap.model import PosedModel
 
-# Cells per side of the picture, for its coverage.
-_CELLS = 8
+_CELLS = 8  # cells per side of the picture; its coverage is the share of these with a point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -4,9 +4,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 
-# All but a few directions lie within this angle of the line.
-_MOST_DEG, _SHARE = 1.0, 0.95
-_FEWEST_DIRECTIONS = 3
+_MOST_DEG, _SHARE = 1.0, 0.95  # degrees from the line, and share of directions within; a few may be wrong
+_FEWEST_DIRECTIONS = 3  # directions; fewer lie on a line by chance
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:
@@ -28,16 +27,13 @@ def find_line(directions: FloatArray) -> FloatArray | None:
 
 
 def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:
-    """Return the median standard deviation along a line, as a share of the cameras' extent along it.
+    """Return the median standard deviation along a unit line (d,), over the cameras' extent along it.
 
-    Args:
-        line: (d,) unit.
-        locations: (n, d)
-        covariances: (n, d, d) of the locations, NaN where not known.
+    The covariances (n, d, d) of the locations (n, d) are NaN where not known.
     """
     variances = np.einsum("a,kab,b->k", line, covariances, line)
-    known = np.isfinite(variances) & (variances >= 0.0)
+    valid = np.isfinite(variances) & (variances >= 0.0)
     extent = float(np.ptp(locations @ line)) if len(locations) else 0.0
-    if not known.any() or extent == 0.0:
+    if not valid.any() or extent == 0.0:
         return float("nan")
-    return float(np.median(np.sqrt(variances[known]))) / extent
+    return float(np.median(np.sqrt(variances[valid]))) / extent

@@ -14,30 +14,20 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.joining import sampson_px
 
-# So many frames stay whatever they see.
-_FEWEST_FRAMES = 3
-# Matches in other images that make a keypoint part of a track that can be checked.
-_CHECKED_BY = 2
-# Of an image with this many such keypoints, the least share that sees points: less is chance. No right image
-# of data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed,
-# had none.
+_FEWEST_FRAMES = 3  # frames; so many stay whatever they see, as a model of fewer is none
+_CHECKED_BY = 2  # matches of a keypoint in other images; with as many its track can be checked
+# Keypoints that can be checked, and share of them that sees points; less is chance. No right image of
+# data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed, 0.
 _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 
 
 def deregister_of_few_points(
     structure: pycolmap.Reconstruction, least: int, fixed_frames: Collection[int] = ()
 ) -> dict[int, int]:
-    """Deregister the frames each of whose images sees fewer than `least` points, with what they observe.
+    """Deregister the frames each of whose images sees fewer than `least` points, with their observations.
 
-    An image that goes takes observations along, which may leave others with too few; three frames stay.
-
-    Args:
-        structure: ours, which is changed.
-        least: points.
-        fixed_frames: ids of frames that stay whatever they see.
-
-    Returns:
-        By the id of each image that went, the number of points it saw then.
+    An image that goes takes observations along, which may leave others with too few; three frames, and the
+    `fixed_frames`, stay. Returns the number of points that each such image saw then, by its id.
     """
     gone: dict[int, int] = {}
     while True:
@@ -54,7 +44,7 @@ def deregister_of_few_points(
 
 
 class ObservationShares(NamedTuple):
-    """Of the keypoints that are matched in two or more other registered images; NaN without any."""
+    """Shares of the keypoints that are matched in two or more other registered images; NaN without any."""
 
     agreeing: float
     """The share that sees a 3D point."""
@@ -64,16 +54,16 @@ class ObservationShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
-    """Of n registered images, the keypoints that are matched in two or more other ones."""
+    """Numbers of keypoints that are matched in two or more other images, of n registered images."""
 
     image_ids: IntArray
     """(n,)"""
     checked: IntArray
-    """(n,) all of them."""
+    """(n,) their number."""
     agreeing: IntArray
-    """(n,) those that see a 3D point."""
+    """(n,) number that sees a 3D point."""
     contradicting: IntArray
-    """(n,) those that see none, and most of whose matches miss the epipolar lines of the cameras."""
+    """(n,) number that sees none, and most of whose matches miss the epipolar lines of the cameras."""
 
     def shares(self) -> ObservationShares:
         """Return the shares of all images together."""
@@ -105,7 +95,7 @@ def count_observations(
 
     Args:
         structure: triangulated from these matches.
-        model: that has the given rotations, whose images the batches' pairs index.
+        model: model of the given rotations, whose images the batches' pairs index.
         batches: matches of all pairs, the rays in world axes by the given rotations.
         max_error_px: distance from the epipolar line (of both images together, to first order) from which a
             match contradicts.
@@ -151,15 +141,8 @@ def images_without_support(
     """Return the images of frames whose matches could make points with those of others, and hardly make any.
 
     Directions can agree with a wrong pose, of an image on a repeated structure for one: points, which need
-    three images, do not. If fewer than three frames have points, none is returned.
-
-    Args:
-        structure: the model.
-        counts: of it.
-        fixed_frames: ids of frames that are not asked.
-
-    Returns:
-        By the id of each such image, the number of points it sees.
+    three images, do not. The value is the number of points of each such image, by its id; `fixed_frames` are
+    left out, and all are if fewer than three frames have points.
     """
     could = counts.checked >= _FEWEST_CHECKED
     does = could & (counts.agreeing >= _LEAST_AGREEING * counts.checked)
