@@ -56,11 +56,7 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 def claimed_output(
     out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
 ) -> Iterator[None]:
-    """Hold the place of an output folder while the block works; `atomic_folder` inside it writes there.
-
-    Arguments and errors as of `check_output`, which is called first; InputError too if another run holds the
-    place.
-    """
+    """Hold the place of an output folder, as `check_output` has it, while `atomic_folder` inside writes."""
     check_output(out, overwrite=overwrite, protect=protect)
     with _claim(Path(os.path.abspath(out))) as private:
         token = _claimed.set(private)

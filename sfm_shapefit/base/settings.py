@@ -28,10 +28,7 @@ _HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a ter
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and its sentence, `help`.
-
-    `also` is an earlier name of the field, which the command line still takes.
-    """
+    """Return a field with its default and its sentence; `also` is an earlier name that flags still take."""
     return field(default=default, metadata={"help": help, "also": also})
 
 
