@@ -58,7 +58,7 @@ class Group(NamedTuple):
     fields: tuple[Field[Any], ...]
 
 
-def groups_of(settings: type[Settings]) -> Iterator[Group]:
+def setting_groups(settings: type[Settings]) -> Iterator[Group]:
     """Yield the fields of a settings class, grouped by the class that states them, its own first.
 
     The title of a group is the first sentence of that class. A field that is stated again, with another
@@ -76,7 +76,7 @@ def groups_of(settings: type[Settings]) -> Iterator[Group]:
 def explained(settings: type[S]) -> type[S]:
     """Add the options of a settings class, with defaults and sentences, to its docstring."""
     lines = [(settings.__doc__ or "").rstrip(), "", "Options:"]
-    for group in groups_of(settings):
+    for group in setting_groups(settings):
         for item in group.fields:
             sentence = textwrap.wrap(item.metadata["help"], _HELP_WIDTH)
             lines += [f"    {item.name} = {item.default!r}", *(f"        {line}" for line in sentence)]

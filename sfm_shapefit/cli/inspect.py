@@ -56,10 +56,6 @@ def inspect_command(
     *,
     input_path: InputPath = None,
     database: Database = None,
-    theory: Annotated[
-        bool,
-        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centers."),
-    ] = False,
     as_json: Json = False,
     **given: Any,
 ) -> None:
@@ -72,7 +68,7 @@ def inspect_command(
 
         catch_termination()
         with show_progress(not as_json) as progress:
-            found = inspect_model(source, database, options=options, theory=theory, progress=progress)
+            found = inspect_model(source, database, options=options, progress=progress)
         if as_json:
             print_json(found.summary())
         else:
@@ -111,5 +107,4 @@ def _inspection_table(found: "Inspection") -> Rows:
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
         *([("will take", found.expected.statement)] if found.expected else []),
-        *([("theory", found.theory.statement)] if found.theory else []),
     ]

@@ -128,7 +128,5 @@ def _describe_pairs(facts: dict[str, Any]) -> str:
 
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
-    filtered = facts["num_pairs_filtered"]
-    of_them = f", {filtered} left out by the filter" if filtered else ""
     others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
-    return "\n".join([f"{usable} usable ({contradicting} contradict the solution{of_them})", *others])
+    return "\n".join([f"{usable} usable ({contradicting} contradict the solution)", *others])

@@ -94,7 +94,6 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     rejected = counted(len(placement.rejected_pairs), "pair")
-    filtered = f", {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
     return Told(
         figures=[
             *figure_rows(facts),
@@ -105,7 +104,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
         details=[
             ("directions", found.statement),
             ("dimension", str(placement.graph.dimension)),
-            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution{filtered}"),
+            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution"),
             ("residuals", _describe_residuals(facts["residuals_deg"])),
             ("locations", placement.refined.statement()),
             ("certificate", found.departure.statement),

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.certified import Departure, compare_with_certified
 from sfm_shapefit.facts.columns import Column, TableName, table_of
@@ -18,14 +18,12 @@ from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.facts.key_figures import figure_rows
-from sfm_shapefit.facts.notebook import notebook_html
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.summary import summarize_graph, summarize_model
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
-from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.judged import Judged
@@ -36,6 +34,7 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
 
 if TYPE_CHECKING:
@@ -99,9 +98,9 @@ class LocateResult(Displayed):
     points."""
     gauge: Gauge
     """From the solver's units to the output's."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
-    adjustment: AdjustedPlacement | None
+    adjustment: Estimate | None
     """What became of the placement and of the given rotations, before any bundle adjustment; None if the
     placement stayed as it was found."""
     timings_s: dict[str, float]
@@ -164,7 +163,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -355,7 +354,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

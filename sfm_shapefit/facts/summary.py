@@ -156,7 +156,6 @@ def _summarize(
         "figures": key_figures(found.cameras, residuals["quantile_50"], *measures),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
-        "num_pairs_filtered": len(placement.dropped),
         "sigma_of": sigma_of(placement),
         "residual_level_deg": placement.assessment.level_deg,
         "residuals_deg": residuals,

@@ -37,9 +37,7 @@ _FEWEST_TWOFOLD = 3
 
 def quality_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if not placement.certified.status.has_certificate:
-        yield placement.certified.status.value
-    elif placement.certified.status is not Status.CONVERGED:
+    if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"

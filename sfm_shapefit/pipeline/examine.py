@@ -42,7 +42,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.pipeline.measure import measure_directions
+from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
 
 _FAR_DEG, _FAR_LEVELS = 1.0, 6.0
@@ -84,7 +84,7 @@ def examine(
         model = read_model(folder)
         inputs = choose_inputs(folder, database, options.directions)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, inputs, options, clock)
+        found = examine_source(matches, options, clock)
     poses = poses_of(model, [row.name for row in found.cameras])
     # The input is what is shown; there is nothing to be compared with it.
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
@@ -97,12 +97,11 @@ def examine(
     return replace(drawing, further=further, points=points), found.facts
 
 
-def examine_source(matches: MatchSource, inputs: Inputs, options: LocateOptions, clock: Clock) -> Examined:
+def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -> Examined:
     """Return what can be said of a model whose matches are open.
 
     Args:
         matches: of the model, which is not changed.
-        inputs: where they come from.
         options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
@@ -111,14 +110,14 @@ def examine_source(matches: MatchSource, inputs: Inputs, options: LocateOptions,
         quality = image_quality(model)
     with clock("directions"):
         try:
-            directions = measure_directions(matches, options, clock)
+            directions = measure(matches, options, clock).directions
         except UnsolvableError:  # no pair shares anything
             directions = None
     pairs, level_deg = _pair_rows(model, directions)
     cameras = _camera_rows(model, quality, pairs)
     focal_length_px = float(np.median(model.focal_lengths_px))
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
-    facts = _facts(inputs, cameras, pairs, level_deg) | {
+    facts = _facts(matches.inputs, cameras, pairs, level_deg) | {
         "figures": key_figures(cameras, error_deg, focal_length_px, "of the model's units"),
         "sigma_of": "",
         "mean_reprojection_error_px": _mean(quality.point_errors_px),

@@ -10,9 +10,9 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.facts.options import KnownDistance, LocateOptions
-from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
@@ -28,7 +28,7 @@ from sfm_shapefit.scene.given import PositionPriors
 
 
 def read_priors(
-    model: PosedModel, inputs: Inputs, options: LocateOptions, table: Path | str | None
+    model: PosedModel, file: DatabaseFile | None, options: LocateOptions, table: Path | str | None
 ) -> PositionPriors | None:
     """Return the position priors of the model's images, if they are wanted.
 
@@ -51,9 +51,9 @@ def read_priors(
         if options.refine_with_priors:
             raise InputError("refine_with_priors needs priors; give a table, or the scale prior")
         return None
-    if inputs.database is None:
+    if file is None:
         raise InputError("the scale prior needs position priors; give a table with --priors, or a database")
-    return database_priors(inputs.database, model)
+    return database_priors(file, model)
 
 
 class GaugeRule(NamedTuple):

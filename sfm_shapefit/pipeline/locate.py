@@ -4,10 +4,11 @@ Each stage is one function from values to a new value; the input is never change
 """
 
 from concurrent.futures import Executor
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -16,7 +17,13 @@ from sfm_shapefit.pipeline.adjustment import weight_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.gauge_choice import read_priors
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out, without_structure
+from sfm_shapefit.pipeline.inputs import (
+    choose_inputs,
+    open_matches,
+    read_left_out,
+    see_matches,
+    without_structure,
+)
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import Told, settle
@@ -70,23 +77,25 @@ def locate(
     """
     options = merge_options(options, LocateOptions, overrides)
     clock = Clock.of(progress, executor)
-    with clock("read"):
-        model = read_model(reconstruction)
-        inputs = choose_inputs(reconstruction, database, options.directions)
-        inputs = read_left_out(inputs, model.names, options)
-        model, intrinsics = settle_intrinsics(model, inputs, options)
-        known = read_priors(model, inputs, options, priors)
-        control = read_control(model, options)
-        rigid = find_rigid_parts(model, options, has_priors=known is not None)
-        model, colors = without_structure(model, inputs)
-    told = Told(
-        inputs,
-        rigid,
-        weight_of_rotations(options),
-        priors=known,
-        control=control,
-        intrinsics=intrinsics,
-        colors=colors,
-    )
-    with open_source(model, inputs, options) as opened:
-        return settle(opened, told, options, clock)
+    with ExitStack() as stack:
+        with clock("read"):
+            model = read_model(reconstruction)
+            inputs = choose_inputs(reconstruction, database, options.directions)
+            inputs = read_left_out(inputs, model.names, options)
+            matches = stack.enter_context(closing(open_matches(model, inputs)))
+            model, intrinsics = settle_intrinsics(model, matches.file, options, inputs.left_out)
+            known = read_priors(model, matches.file, options, priors)
+            control = read_control(model, options)
+            rigid = find_rigid_parts(model, options, has_priors=known is not None)
+            model, colors = without_structure(model, matches)
+            source = see_matches(matches, model, inputs, options)
+        told = Told(
+            inputs,
+            rigid,
+            weight_of_rotations(options),
+            priors=known,
+            control=control,
+            intrinsics=intrinsics,
+            colors=colors,
+        )
+        return settle(source, told, options, clock)

@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.lines import text_of
@@ -25,7 +24,8 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
-from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
+from sfm_shapefit.placement.tied_groups import is_scaled
+from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Extent of the fixed centers, of their distance from the origin, that counts as none.
@@ -80,7 +80,7 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
             f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
             "points"
         )
-    refuse_options_of_groups(options)
+    refuse_admm(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.base.errors import InputError, UnsolvableError
@@ -54,7 +54,14 @@ from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.measure import add_evidence, build_graph, count_work, measure_directions
+from sfm_shapefit.pipeline.measure import (
+    Wanted,
+    add_evidence,
+    build_graph,
+    count_work,
+    measure,
+    wants_points,
+)
 from sfm_shapefit.pipeline.memory import keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
 from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
@@ -104,12 +111,12 @@ class Stand(NamedTuple):
     directions: PairDirections
     located: Located
     intrinsics: Intrinsics
-    uncertainty: Uncertainty = Uncertainty()
-    """Of the centers, by the last adjustment."""
+    estimate: Estimate | None = None
+    """Of the last adjustment; None if there was none."""
     scale: float = 1.0
-    """From the solver's units to those of the uncertainty."""
-    adjustment: AdjustedPlacement | None = None
-    """How the placement was adjusted; None if it was not."""
+    """From the solver's units to those of the estimate."""
+    adjustment: Estimate | None = None
+    """How this placement was adjusted; None if it was not."""
 
 
 def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -122,16 +129,19 @@ def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock
         clock: of the run.
     """
     with clock("directions"):
-        directions = measure_directions(opened, options, clock, clock.executor)
+        wanted = Wanted(tracks=wants_points(opened, options), errors=opened.economy.samples)
+        measured = measure(opened, options, clock, wanted)
+    directions = measured.directions
     with clock("solve"):
-        measured = told.rigid.apply(build_graph(opened, directions, options))
+        graph = told.rigid.apply(build_graph(opened.model, measured))
         work = count_work(opened, directions)
-        economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
-        source = opened.with_economy(economy)
-        measured = add_evidence(measured, source, directions, options)
-        near = None if told.near is None else told.near.stand
-        pieces = list(place_cameras(measured, options, clock, near))
+        economy, graph, options = keep_within_memory(work, graph, options, opened.economy)
+        source = opened.at(opened.model, economy)
+        graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
+        near = None if told.near is None else told.near.stand
+        pieces = list(place_cameras(graph, options, clock, near))
+        del graph
     models = []
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
         piece = pieces.pop(0)
@@ -188,7 +198,7 @@ def finish_piece(
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        judged = with_uncertainty(judged, given, seeded.adjusted.uncertainty, scale)
+        judged = with_uncertainty(judged, given, seeded.adjusted, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
     sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
     for done in (stand.adjustment, seeded.adjusted):
@@ -257,7 +267,7 @@ def _start(
         return stand
     centers = told.near.stand.locations[placement.cameras]
     scale = median_spread(centers) / median_spread(placement.locations)
-    return stand._replace(uncertainty=told.near.adjusted.uncertainty, scale=scale)
+    return stand._replace(estimate=told.near.adjusted, scale=scale)
 
 
 def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> Stand:
@@ -271,10 +281,10 @@ def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> S
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
         after = adjust_placed(stand.source, stand.directions, located, options, clock, told.rotations)
         intrinsics = stand.intrinsics.after(after.adjusted.lenses)
+        frames = stand.source.model.images.frames
         given = located.given._replace(
-            weight=after.adjusted.weight,
-            weight_frames=after.adjusted.frame_ids,
-            model=stand.source.model.reconstruction,
+            weight=after.adjusted.weight.among(after.part.frames, len(frames.ids)),
+            rotations=frames.rotations,
             lenses=intrinsics.free,
         )
         return Stand(
@@ -282,7 +292,7 @@ def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> S
             directions=after.directions,
             located=located._replace(placement=after.placement, given=given),
             intrinsics=intrinsics,
-            uncertainty=after.adjusted.uncertainty,
+            estimate=after.adjusted,
             scale=located.gauge.similarity.scale,
             adjustment=after.adjusted,
         )
@@ -294,7 +304,9 @@ def _judge(stand: Stand, given: PosedModel, options: LocateOptions) -> Judged:
     placement = stand.located.placement
     among = placement.cameras if placement.piece else None
     relative = ask_pairs(stand.source, stand.directions, options, among)
-    judged = with_uncertainty(judge(placement, options), given, stand.uncertainty, stand.scale)
+    judged = judge(placement, options)
+    if stand.estimate is not None:
+        judged = with_uncertainty(judged, given, stand.estimate, stand.scale)
     return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
 
 
@@ -351,6 +363,5 @@ def _structure_warnings(source: MatchSource, num_points: int) -> Iterator[str]:
     """Yield what the user should know of points and of the database."""
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
-    if source.database is not None and source.database.unmatched_names:
-        names = source.database.unmatched_names
+    if names := source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.base.settings import _fits, groups_of, merge_options
+from sfm_shapefit.base.settings import _fits, merge_options, setting_groups
 from sfm_shapefit.facts import key_figures
 from sfm_shapefit.facts.columns import columns_of
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
@@ -43,7 +43,7 @@ def test_every_default_is_what_its_option_takes(settings):
 
 
 def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
-    names = [item.name for group in groups_of(MapOptions) for item in group.fields]
+    names = [item.name for group in setting_groups(MapOptions) for item in group.fields]
     assert sorted(names) == sorted(item.name for item in dataclasses.fields(MapOptions))
     again = {"adjust", "min_points_per_image"}  # for rotations that were averaged
     own = [name for one in ALL for name in inspect.get_annotations(one)]
@@ -72,7 +72,7 @@ REFUSED = [
         for settings in OUT_OF_RANGE
         for name, value in OUT_OF_RANGE[settings]
     ),
-    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (PlacementOptions, {"objective": "l2"}, "shapefit"),
     (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
     (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
     (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
@@ -81,7 +81,6 @@ REFUSED = [
     (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-    (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"rotations": "free", "adjust": "none"}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": 0.1, "adjust": "none"}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),
@@ -163,7 +162,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert repr(solved).startswith("<SolverResult: 12 locations, converged")
     placed = sfm_shapefit.place(problem.view_graph, refine=False)
     assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
-    assert repr(placed).startswith("<Placement: 12 of 12 nodes placed, 0 of")
+    assert repr(placed).startswith("<Judged: 12 of 12 nodes placed, 0 of")
     located.timings_s["<script>"] = 1.0
     table = located._repr_html_()
     del located.timings_s["<script>"]

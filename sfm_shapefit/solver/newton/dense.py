@@ -26,7 +26,7 @@ from sfm_shapefit.solver.newton.steps import (
     is_cancelled,
     is_within,
     linearize_program,
-    measure,
+    measure_gap,
     pays,
     set_gradient,
     set_residuals,
@@ -81,7 +81,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = NewtonProgress(*measure(problem, iterate))
+        progress = NewtonProgress(*measure_gap(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:

@@ -26,7 +26,7 @@ from sfm_shapefit.solver.newton.steps import (
     NewtonProgress,
     combine,
     dot,
-    measure,
+    measure_gap,
     scale_to,
     set_residuals,
 )
@@ -57,7 +57,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0
-    floor = max(MU_PER_GAP * NewtonProgress(*measure(problem, iterate)).gap, LEAST_MU)
+    floor = max(MU_PER_GAP * NewtonProgress(*measure_gap(problem, iterate)).gap, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):

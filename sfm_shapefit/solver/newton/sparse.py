@@ -77,7 +77,7 @@ def solve_newton_reduced(
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     else:
         _begin_at(problem, *start, iterate)
-    progress, count, stalled = NewtonProgress(*steps.measure(problem, iterate)), 0, 0
+    progress, count, stalled = NewtonProgress(*steps.measure_gap(problem, iterate)), 0, 0
     while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
         progress = _cycle(work, reduction, progress, tol)

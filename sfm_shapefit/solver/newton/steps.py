@@ -219,7 +219,7 @@ def _set_dual(basis: Any, y: Any, dual: Any) -> None:
 
 
 @kernel
-def measure(problem: Any, iterate: Any) -> Scalars:
+def measure_gap(problem: Any, iterate: Any) -> Scalars:
     """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
     for e in range(len(problem.w)):
