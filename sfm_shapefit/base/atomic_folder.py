@@ -6,8 +6,8 @@ aside first.
 
 The private folder `.shapefit-<hash of the name>.partial` is also the claim on a place: its run holds a lock
 on it (flock) as long as it lives. A second run into the same place is told so, and a folder whose lock is
-free was left by a killed run: the next one that writes to the same parent removes it. Only folders with a
-`locate.json` or `map.json`, which runs leave, are ever replaced.
+free was left by a killed run: the next one that writes to the same parent removes it. A folder that holds
+files is replaced only if it has a `locate.json` or `map.json`, as runs leave them.
 """
 
 import ctypes

@@ -155,7 +155,7 @@ def _is_decided(before: float, after: float, other_cost: float) -> bool:
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel, k^2 pi / 4 times the weight at most, at the levels (radians)."""
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 times its weight; levels in rad."""
     return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
 
 
