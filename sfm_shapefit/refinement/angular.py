@@ -155,7 +155,7 @@ def _is_decided(before: float, after: float, other_cost: float) -> bool:
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 by weight, at levels in radians."""
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 by weight; levels in radians."""
     return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
 
 
