@@ -6,8 +6,8 @@ aside first.
 
 The private folder `.shapefit-<hash of the name>.partial` is also the claim on a place: its run holds a lock
 on it (flock) as long as it lives. A second run into the same place is told so, and a folder whose lock is
-free was left by a killed run: the next one that writes to the same parent removes it. Only folders with a
-`locate.json` or `map.json`, which runs leave, are ever replaced.
+free was left by a killed run: the next one that writes to the same parent removes it. A folder that holds
+files is replaced only if it has a `locate.json` or `map.json`, as runs leave them.
 """
 
 import ctypes
@@ -56,11 +56,7 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 def claimed_output(
     out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
 ) -> Iterator[None]:
-    """Hold the place of an output folder while the block works; `atomic_folder` inside it writes there.
-
-    Arguments and errors as of `check_output`, which is called first; InputError too if another run holds the
-    place.
-    """
+    """Hold the place of an output folder, as `check_output` has it, while `atomic_folder` inside writes."""
     check_output(out, overwrite=overwrite, protect=protect)
     with _claim(Path(os.path.abspath(out))) as private:
         token = _claimed.set(private)

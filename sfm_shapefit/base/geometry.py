@@ -205,10 +205,7 @@ def fits_of_few_points(
 
 
 def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
-    """Return the angles of rotations (..., 3, 3) in degrees, in [0, 180].
-
-    By atan2 of the sine (skew part) and the cosine (trace): exact to rounding at 0 and at 180 degrees.
-    """
+    """Return the angles of rotations (..., 3, 3) in degrees, [0, 180], by atan2: exact at both ends."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
     cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0

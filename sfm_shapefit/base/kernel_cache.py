@@ -66,10 +66,7 @@ _measuring: "list[CompileTime]" = []
 
 
 def choose_target() -> str:
-    """Return the name of the processor that kernels are compiled for; set it, if no other code did before.
-
-    numba has one target in a process. Once something was compiled for another, it stays.
-    """
+    """Return, and set unless it is set, numba's one target: the processor that kernels are compiled for."""
     is_chosen = "_toplevel_target_context" in vars(cpu_target)
     if not is_chosen and config.CPU_NAME == "host":
         config.CPU_NAME = config.CPU_FEATURES = None

@@ -51,10 +51,7 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _Reader(pickle.Unpickler):
-    """Reads what `pack` writes, and leaves the modules alone that functions of numba come from.
-
-    Compiled code does not look into them, and importing them takes as long as loading all kernels of a run.
-    """
+    """Reads what `pack` writes; modules of numba's functions, which code does not need, are not imported."""
 
     def find_class(self, module_name: str, name: str) -> Any:
         """Return an object of a module."""

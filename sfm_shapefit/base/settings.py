@@ -28,10 +28,7 @@ _HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a ter
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and its sentence, `help`.
-
-    `also` is an earlier name of the field, which the command line still takes.
-    """
+    """Return a field with its default and its sentence; `also` is an earlier name that flags still take."""
     return field(default=default, metadata={"help": help, "also": also})
 
 
@@ -61,7 +58,7 @@ class Group(NamedTuple):
     fields: tuple[Field[Any], ...]
 
 
-def groups_of(settings: type[Settings]) -> Iterator[Group]:
+def setting_groups(settings: type[Settings]) -> Iterator[Group]:
     """Yield the fields of a settings class, grouped by the class that states them, its own first.
 
     The title of a group is the first sentence of that class. A field that is stated again, with another
@@ -79,7 +76,7 @@ def groups_of(settings: type[Settings]) -> Iterator[Group]:
 def explained(settings: type[S]) -> type[S]:
     """Add the options of a settings class, with defaults and sentences, to its docstring."""
     lines = [(settings.__doc__ or "").rstrip(), "", "Options:"]
-    for group in groups_of(settings):
+    for group in setting_groups(settings):
         for item in group.fields:
             sentence = textwrap.wrap(item.metadata["help"], _HELP_WIDTH)
             lines += [f"    {item.name} = {item.default!r}", *(f"        {line}" for line in sentence)]

@@ -81,10 +81,7 @@ class RigidGroups:
         return sum_by(self.group_of, values, self.num_groups)
 
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
-        """Return the x whose A x is nearest to locations (n, d), and its largest distance from them.
-
-        s is 0 if every group stands at a single point.
-        """
+        """Return x with A x nearest to locations (n, d), and its largest distance; s is 0 without offsets."""
         centered = self.center()
         spread = float(np.sum(centered.offsets**2))
         sizes = np.bincount(self.group_of)[:, None]

@@ -106,10 +106,7 @@ class ViewGraph:
         )
 
     def restricted_to(self, edge_indices: npt.NDArray[np.integer]) -> tuple["ViewGraph", IntArray]:
-        """Return the graph of some edges, by index (k,), and their cameras, renumbered.
-
-        The second value is (n',) the index in this graph of each of its cameras, ascending.
-        """
+        """Return the graph of some edges and their cameras, renumbered, and their indices here, ascending."""
         cameras, renumbered = np.unique(self.edges[edge_indices], return_inverse=True)
         names = None if self.names is None else [self.names[c] for c in cameras]
         graph = ViewGraph(

@@ -125,10 +125,7 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
 
 @inner_kernel
 def _add_samples(pair: Any, match: Any, factors: Any, score: Any, terms: Any, scores: Any) -> None:
-    """Add the score of one match times its residual in each sample.
-
-    Two signs of either keypoint make sixteen residuals, and `terms` (16, 3) holds what each of them adds.
-    """
+    """Add a match's score times its residual in each sample; `terms` (16, 3), for the signs of both ends."""
     one, two, four = np.uint64(1), np.uint64(2), np.uint64(4)
     for signs in range(16):
         residual = factors[0] if signs & 1 else -factors[0]

@@ -32,7 +32,7 @@ from sfm_shapefit.judgement.verdicts import Assessment
 _PRIOR = 30.0  # matches that every camera has beforehand; half of them for it
 _USUAL_SHARE = 0.75  # share of a camera's matches; with that many for it, it loses nothing
 _AMBIGUOUS = (0.62, 0.72)  # range of f; kept by default, but below the trust that goes without reasons
-_UNSUPPORTED = 0.1  # f; below any share of a camera with evidence for it
+_UNSUPPORTED = 0.1  # f; low, as no pair speaks for the camera
 
 
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:

@@ -170,10 +170,7 @@ def _best(gains: dict[float, FloatArray]) -> float:
 
 
 def _is_doubtful(gains: FloatArray, images: IntArray, *, hold: bool) -> bool:
-    """Return whether the gains (k,) of a camera's best factor speak against it, rotations held or not.
-
-    `images` (k, 2) are those of each pair that the camera took, -1 for others.
-    """
+    """Return whether a camera's gains (k,) speak against it; `images` (k, 2) are its own, -1 for others."""
     least, inner = _LEAST_GAINS[hold], (images >= 0).all(axis=1)
     if not _is_clear(gains, least) or _is_clear(-gains[inner], least):
         return False

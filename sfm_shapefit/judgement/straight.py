@@ -9,10 +9,7 @@ _FEWEST_DIRECTIONS = 3  # directions; fewer lie on a line by chance
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:
-    """Return the line, (d,), within a degree of which the unit directions (m, d) lie; None if there is none.
-
-    One in twenty may be off, as wrong directions are.
-    """
+    """Return the line (d,) within a degree of 19 in 20 unit directions (m, d); None if there is none."""
     if len(directions) < _FEWEST_DIRECTIONS:
         return None
     _, _, axes = np.linalg.svd(directions, full_matrices=False)
@@ -27,10 +24,7 @@ def find_line(directions: FloatArray) -> FloatArray | None:
 
 
 def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:
-    """Return the median standard deviation along a unit line (d,), over the cameras' extent along it.
-
-    The covariances (n, d, d) of the locations (n, d) are NaN where not known.
-    """
+    """Return the median known standard deviation along a unit line (d,), over the cameras' extent."""
     variances = np.einsum("a,kab,b->k", line, covariances, line)
     valid = np.isfinite(variances) & (variances >= 0.0)
     extent = float(np.ptp(locations @ line)) if len(locations) else 0.0

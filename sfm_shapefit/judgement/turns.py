@@ -412,10 +412,7 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
 
 
 def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: float) -> dict[int, _Judged]:
-    """Return the groups that all pairs together say are turned, by more than `least_rad`.
-
-    Turns near 0 are `level` times as large as the standard deviations say.
-    """
+    """Return the groups that all pairs say are turned, by more than `least_rad`, at an error `level`."""
     # Here, since it takes long to import, and where no pair is asked it is not used.
     from scipy.spatial.transform import Rotation
 

@@ -48,7 +48,7 @@ _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 _LIKELY_SHARE = 0.6  # mean robust weight; a pose known beforehand that fits as well needs no trial
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
 _PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
-_STORED_NOISE_PX = 20.0  # pixels of a stored pose without matches; it counts little beside an estimate
+_STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
 
 
 class LikelyPoses(NamedTuple):
@@ -100,7 +100,7 @@ def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> R
     middle axis; W is 1.
 
     Args:
-        view: of images whose focal lengths count.
+        view: view of the images, whose focal lengths count.
         min_matches: pairs with fewer inlier matches are left out.
 
     Raises:

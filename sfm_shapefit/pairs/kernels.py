@@ -79,10 +79,7 @@ def _fill_matches(a: FloatArray, b: FloatArray, pixel_angle: float, matches: Flo
 
 @kernel
 def _residual(match: FloatArray, d: FloatArray) -> float:
-    """Return the signed Sampson error in px.
-
-    |a x d|^2 + |b x d|^2 has a floor where both rays run along the baseline.
-    """
+    """Return the signed Sampson error in px; its divisor has a floor where rays run along the baseline."""
     along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
     along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
     square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)

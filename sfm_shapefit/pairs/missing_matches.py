@@ -96,11 +96,7 @@ class _Image(NamedTuple):
 
 
 def _share(image: _Image, matched: IntArray, affine: FloatArray, size: FloatArray) -> float:
-    """Return the share of an image's overlap with another that is matched.
-
-    `matched` (m,) are the keypoints matched with the other, `size` is the other's, `affine` see
-    `_affine_maps`.
-    """
+    """Return the share of the keypoints in the overlap with another image that are `matched` (m,) there."""
     own = np.zeros(len(image.partners), dtype=np.bool_)
     own[image.place_of[matched]] = True
     inside = image.partners > own

@@ -25,10 +25,7 @@ _OPPOSITE_RAD = 0.2
 
 
 def triangle_scores(graph: ViewGraph, iterations: int = _ITERATIONS) -> FloatArray:
-    """Return each pair's mean angle to what its triangles say, (m,) radians; 0 for pairs in no triangle.
-
-    With 0 iterations all triangles weigh alike (AAB).
-    """
+    """Return each pair's mean angle to what its triangles say, (m,) radians; 0 for pairs in no triangle."""
     sides = _triangles(graph)
     if len(sides) == 0:
         return np.zeros(graph.num_edges)

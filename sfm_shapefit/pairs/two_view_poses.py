@@ -119,10 +119,7 @@ def refine_pairs(
     information: FloatArray,
     weight_shares: FloatArray,
 ) -> None:
-    """Refine rotations (k, 3, 3) and translations (k, 3) of the pairs begin..end-1 in place.
-
-    Fills their information (k, 3, 3) and weight shares (k,).
-    """
+    """Refine rotations and translations of the pairs begin..end-1; fill information and weight shares."""
     system, basis, step = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.empty((2, 3)), np.empty(_UNKNOWNS)
     for p in range(begin, end):
         first, last = offsets[p], offsets[p + 1]
@@ -190,10 +187,7 @@ def _linearize(
     basis: FloatArray,
     line: FloatArray,
 ) -> None:
-    """Fill the derivatives of a match's residual by the five unknowns, then the residual in px.
-
-    q has a floor where both rays run along the translation.
-    """
+    """Fill a residual's derivatives by the five unknowns, then it in px; q has a floor along the baseline."""
     a0 = rotation[0, 0] * a[0] + rotation[0, 1] * a[1] + rotation[0, 2] * a[2]
     a1 = rotation[1, 0] * a[0] + rotation[1, 1] * a[1] + rotation[1, 2] * a[2]
     a2 = rotation[2, 0] * a[0] + rotation[2, 1] * a[1] + rotation[2, 2] * a[2]

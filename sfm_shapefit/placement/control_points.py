@@ -74,10 +74,7 @@ class ControlFit(NamedTuple):
 def triangulate_control_points(
     control: ControlPoints, seen: MarkedViews, options: StructureOptions
 ) -> TriangulatedControl:
-    """Return where the placed images of a model have control points; marks may be wrong.
-
-    `seen` has the views of the marks; a mark may miss by four times what `options` allow a keypoint.
-    """
+    """Return where the placed images have control points; marks may be wrong, or off by 4 keypoint errors."""
     counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),

@@ -179,10 +179,7 @@ def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPrio
 
 
 def join_by_priors(first: PlacedByPriors, second: PlacedByPriors) -> ModelJoin:
-    """Return the join of two models by position priors of cameras of each.
-
-    UnsolvableError, whose message is the reason, a clause, if it is not safe.
-    """
+    """Return the join of two models by position priors; UnsolvableError, the reason, if it is not safe."""
     one, other = first.priors_from_model, second.priors_from_model
     errors = [[_chain(part, other) for part in first.parts], [_chain(one, part) for part in second.parts]]
     evidence = f"position priors of {first.num_priors} and {second.num_priors} cameras"
@@ -209,10 +206,7 @@ def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Sim
 
 
 def _fit_priors(centers: FloatArray, priors: PositionPriors) -> tuple[Similarity, list[Similarity]]:
-    """Return the map of a model onto its priors, and the maps that leave out some of them in turn.
-
-    UnsolvableError if they are few, lie on a line, or do not fit.
-    """
+    """Return a model's map onto its priors, and maps that leave out some; UnsolvableError if none is good."""
     if len(priors) <= FEWEST_WITNESSES:
         raise UnsolvableError(
             f"one of them has {counted(len(priors), 'position prior')}, and a join needs "
@@ -254,10 +248,7 @@ def _search(ties: Ties, turns: FloatArray, *, metric: bool) -> Similarity:
 
 
 def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int, *, metric: bool) -> None:
-    """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one.
-
-    False pairs that contradict one another are no rivals, be they ever so many up to a limit.
-    """
+    """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one."""
     num_against = len(np.unique(rest.pairs))
     if num_against > _MOST_AGAINST * num_supporting:
         raise UnsolvableError(

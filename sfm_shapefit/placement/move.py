@@ -11,10 +11,7 @@ from sfm_shapefit.refinement.near import follow_cameras
 
 
 def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
-    """Return the placement with its k cameras at `locations` (k, 3), in the solver's units.
-
-    Points follow their cameras. A camera whose row is NaN stays where it is.
-    """
+    """Return the placement with k cameras at `locations` (k, 3), NaN unmoved, and its points after them."""
     refined, before = placement.refined, placement.locations
     has_location = np.isfinite(locations).all(axis=1)
     moved = refined.locations.copy()

@@ -18,10 +18,7 @@ _LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means n
 
 
 def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
-    """Return whether any group has two nodes apart that pairs with other groups see.
-
-    Without one the scale of the offsets is open.
-    """
+    """Return whether a group has two nodes apart that others see; else the offsets' scale is open."""
     nodes = np.unique(edges[groups.joins(edges)])
     return bool(len(nodes)) and bool(groups.restricted_to(nodes).center().offsets.any())
 
@@ -52,10 +49,7 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
 
 
 def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
-    """Return the length of the offsets' unit at the locations (n, d) of tied groups.
-
-    UnsolvableError if it is not positive, or too small to mean anything.
-    """
+    """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
     assert part.groups is not None
     unit = float(part.groups.fit(locations)[0][-1])
     size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())

@@ -155,10 +155,7 @@ def _is_decided(before: float, after: float, other_cost: float) -> bool:
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel over the pairs at locations (n, d), at the level of each class, radians.
-
-    No pair adds more than k^2 pi / 4 times its weight.
-    """
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 by weight; levels in radians."""
     return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
 
 
@@ -234,10 +231,7 @@ def fitting_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, level
 def residual_levels(
     graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray
 ) -> FloatArray:
-    """Return the level of each class, from the median of the residuals that its kernel does not reject.
-
-    That kernel is the one at the present `levels`. Own covariances are part of a level.
-    """
+    """Return each class's level: median residual, own covariances included, inside the present kernel."""
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
     unknowns = graph.dimension * (graph.num_nodes - 1) - 1
@@ -289,11 +283,7 @@ def _unit(t: FloatArray) -> FloatArray:
 
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:
-    """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
-
-    A few loose nodes may wander for long; in a long chain the cost may hardly fall while all of it still
-    moves.
-    """
+    """Return the most that nine tenths of the nodes moved, over the extent; loose ones wander for long."""
     return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 

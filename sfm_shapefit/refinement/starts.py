@@ -45,7 +45,7 @@ _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 
 _LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
-_POINT_LENGTH = 1e-6  # share of the mean length; cameras of a shorter pair stand in one place
+_POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
 OPENING_RAD = 0.1
 """Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 

@@ -78,10 +78,7 @@ class Chosen(NamedTuple):
 
 
 def evidence_of(relative: RelativeRotations, shares: FloatArray) -> FloatArray:
-    """Return how much speaks for each of k pairs being right, (k,), from -1 to 1; 0 where no share is known.
-
-    Shares (k,) are those of `missing_matches.matched_shares`; NaN where unknown.
-    """
+    """Return how much the `matched_shares` speak for each pair being right, -1 to 1; 0 where unknown."""
     evidence, finite = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
     if len(finite) == 0:
         return evidence

@@ -292,10 +292,7 @@ def _are_definite(blocks: FloatArray) -> BoolArray:
 def _ordered(
     pairs: IntArray, rotations: FloatArray, information: FloatArray, supports: FloatArray, num_images: int
 ) -> tuple[AveragingPairs, int]:
-    """Return checked pairs with i < j in ascending order, their information capped, and the number of images.
-
-    A pair that is turned around has R^T for R, and -R^T w for w.
-    """
+    """Return checked pairs, turned to i < j (R^T, -R^T w), ascending, capped; and the number of images."""
     turned = pairs[:, 0] > pairs[:, 1]
     back = rotations[turned].transpose(0, 2, 1)
     rotations, information, pairs = rotations.copy(), information.copy(), np.sort(pairs, axis=1)

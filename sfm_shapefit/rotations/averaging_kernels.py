@@ -88,10 +88,7 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
 def reweigh_pairs(
     pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any, gradient: Any
 ) -> None:
-    """Fill the robust weights (k,) and the gradient D^T W x (n, 3).
-
-    The robust weight is weights[e] / (1 + (|x| / scale)^2)^2.
-    """
+    """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and the gradient D^T W x (n, 3)."""
     x = np.empty(3)
     for i in range(len(gradient)):
         gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0

@@ -41,9 +41,9 @@ from sfm_shapefit.rotations.annealing import LONGEST_STEP
 from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
-_TOLERANCE = 1e-6  # mu relative to f(X) / 3n; far below any error of a rotation
+_TOLERANCE = 1e-6  # mu relative to f(X) / 3n; see the header
 _ROUNDING = 1e-13  # share of the mean diagonal; rounding of a factorization's pivots
-_MOST_FLOPS = 3e11  # operations of a factorization; more take minutes, Lanczos decides
+_MOST_FLOPS = 3e11  # operations of a factorization; half a minute at 10 Gflop/s, more is not checked
 _POLISHING_STEPS = 30  # steps to the stationary point; a bound
 _SETTLED = 1e-10  # radians; a shorter step is the last
 _REDUCTION = 1e-3  # share of the residual that a polishing step may leave; the next one takes it

@@ -218,10 +218,7 @@ def turn_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Gener
 
 
 def looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:
-    """Return cam_from_world (n, 3, 3) of cameras that look along `forward` (n, 3), `up` upwards.
-
-    Up is z if None. The rows are the camera's axes in the world: x to the right, y down, z ahead.
-    """
+    """Return cam_from_world, rows right, down, ahead, of cameras along `forward` (n, 3); up is z if None."""
     ahead = normalized(forward)
     upward = np.broadcast_to([0.0, 0.0, 1.0], ahead.shape) if up is None else up
     right = normalized(np.cross(ahead, upward))

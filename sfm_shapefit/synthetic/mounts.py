@@ -52,10 +52,7 @@ def mounted(kind: RigKind, num_images: int) -> Rigs:
 
 
 def rigs_of(num_frames: int, yaw_deg: FloatArray, offsets_m: FloatArray) -> Rigs:
-    """Return one rig and its frames, in each of which all sensors take an image.
-
-    Sensors look `yaw_deg` (s,) to the left of ahead and stand at `offsets_m` (s, 3) in the rig.
-    """
+    """Return one rig, sensors turned left by `yaw_deg` and at `offsets_m`, and its frames, all complete."""
     count = len(yaw_deg)
     return Rigs(
         rig_of_frame=np.zeros(num_frames, dtype=np.int64),

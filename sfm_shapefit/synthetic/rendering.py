@@ -96,10 +96,7 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
 
 
 def draw_image(scene: RenderedScene, image: int) -> ByteArray:
-    """Return one photograph, (height, width, 3): red, green, blue.
-
-    Depends on the scene's options and the image's index only, not on what was drawn before.
-    """
+    """Return one photograph, (height, width, 3) red, green, blue: a function of options and index alone."""
     rng = np.random.default_rng([scene.options.seed, 2, image])
     height, width = scene.options.image_height, scene.options.image_width
     y, x = (np.indices((_SAMPLES * height, _SAMPLES * width)).reshape(2, -1) + 0.5) / _SAMPLES

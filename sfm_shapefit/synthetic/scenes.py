@@ -95,10 +95,7 @@ class _FalseList:
 
 
 def make_scene(options: SceneOptions) -> Scene:
-    """Lay out, photograph, pair and corrupt a scene.
-
-    InputError if no two images share `min_matches` points, or fewer pairs can be corrupted than asked for.
-    """
+    """Lay out, photograph, pair and corrupt a scene; InputError if too few points are shared for that."""
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
     return build_scene(*lay_out_scene(options, rngs[0]), options, rngs[1:])
 
@@ -189,10 +186,7 @@ def _candidates(layout: SceneLayout, options: SceneOptions) -> Iterator[IntArray
 def _photograph(
     layout: SceneLayout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
 ) -> tuple[IntArray, FloatArray]:
-    """Return which of the candidates an image shows, ascending, and their noisy pixels, all inside the image.
-
-    A point shows when it is in front, near enough, inside the image, and faces the camera.
-    """
+    """Return the candidates that an image shows, ascending: in front, near, inside, facing; and pixels."""
     center, cam_from_world = layout.centers[image], layout.rotations[image]
     points = layout.points[candidates]
     ids = candidates[_in_view_from(points, center[None], cam_from_world, options)[0]]

@@ -74,10 +74,7 @@ _ALONG_X = np.array([1.0, 0.0, 0.0])  # unit vector; the axis of walls without a
 
 
 def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
-    """Return the surfaces that the cameras of a layout look at; InputError if the shape has none.
-
-    The fraction `repeated` of the houses, or of the tower's sides, are one and the same.
-    """
+    """Return a layout's surfaces, the fraction `repeated` of them alike; InputError if the shape has none."""
     if shape not in _BUILDERS:
         raise InputError(
             f"a {shape} has no surfaces to draw; choose one of the shapes {', '.join(_BUILDERS)}"

@@ -64,10 +64,7 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
 
 
 def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
-    """Return whether the pairs fix all n nodes up to one translation and one scale, generically.
-
-    A node without pairs is rigid; arguments and errors as of `parallel_rigid_pieces`.
-    """
+    """Return whether pairs fix all n nodes up to translation and scale, generically; one node is rigid."""
     checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
         graph = adjacency(num_nodes, checked)

@@ -26,7 +26,7 @@ from sfm_shapefit.solver.newton.steps import (
     is_cancelled,
     is_within,
     linearize_program,
-    measure,
+    measure_gap,
     pays,
     set_gradient,
     set_residuals,
@@ -73,10 +73,7 @@ class DenseNewtonFactor(NamedTuple):
 def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a dense Cholesky factor of nd x nd, n up to about a thousand.
-
-    All else is as in `solve_newton_sparse`.
-    """
+    """Solve as `solve_newton_sparse` with a dense factor of nd x nd, for n up to about a thousand."""
     problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
@@ -84,7 +81,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = NewtonProgress(*measure(problem, iterate))
+        progress = NewtonProgress(*measure_gap(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -240,10 +237,7 @@ def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
 def _propose(
     problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
-    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
-
-    Returns lambda+, and whether the refinement converged; the step must not be taken otherwise.
-    """
+    """Return lambda+ of the refined step, and whether D^T y+ = lambda+ c: else do not take it."""
     c, a, nodes, addend = problem.c, linearization.a, step.nodes, step.addend
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
     set_gradient(problem, iterate, linearization, mu, step)

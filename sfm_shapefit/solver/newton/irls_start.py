@@ -26,7 +26,7 @@ from sfm_shapefit.solver.newton.steps import (
     NewtonProgress,
     combine,
     dot,
-    measure,
+    measure_gap,
     scale_to,
     set_residuals,
 )
@@ -57,7 +57,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0
-    floor = max(MU_PER_GAP * NewtonProgress(*measure(problem, iterate)).gap, LEAST_MU)
+    floor = max(MU_PER_GAP * NewtonProgress(*measure_gap(problem, iterate)).gap, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):
@@ -70,10 +70,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
 
 @inner_kernel
 def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degrees: Any) -> float:
-    """Write s_e = w_e / sqrt(||r_e||^2 + floor^2), their sums at the cameras, and D^T S r at T.
-
-    An infinite floor stands for s_e = w_e. Returns the mean residual.
-    """
+    """Write s_e (w_e at an infinite floor), their sums at cameras, D^T S r; return the mean residual."""
     edges, v = problem.edges, problem.v
     gradient[:] = 0.0
     degrees[:] = 0.0

@@ -23,10 +23,7 @@ from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 
 
 class Reduction:
-    """The map A from unknowns to locations, and memory for a factor of A^T D^T S D A; here A is the identity.
-
-    A reduction to fewer unknowns overrides all methods.
-    """
+    """The map A from unknowns to locations, here the identity, and memory for a factor of A^T D^T S D A."""
 
     def __init__(self, factor: CholeskyFactor) -> None:
         """Keep the sparse factor behind it, which says what a factorization and a solve cost."""

@@ -77,7 +77,7 @@ def solve_newton_reduced(
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     else:
         _begin_at(problem, *start, iterate)
-    progress, count, stalled = NewtonProgress(*steps.measure(problem, iterate)), 0, 0
+    progress, count, stalled = NewtonProgress(*steps.measure_gap(problem, iterate)), 0, 0
     while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
         progress = _cycle(work, reduction, progress, tol)
@@ -125,10 +125,7 @@ def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: floa
 
 
 def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:
-    """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
-
-    Returns lambda+, and whether the refinement converged; the step must not be taken otherwise.
-    """
+    """Return lambda+ of the refined step, and whether A^T D^T y+ = lambda+ A^T c: else do not take it."""
     problem, iterate, linearization, step = work
     reduction = system.reduction
     c = reduction.reduce(problem.c)

@@ -163,10 +163,7 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: New
 
 @kernel
 def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
-    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column.
-
-    And S_e = w_e, which makes M the projected Laplacian.
-    """
+    """Write the bases B_e, by reflections of v_e to the first axis, and S_e = w_e: M is the Laplacian."""
     for e in range(len(v)):
         sign = np.copysign(1.0, v[e, 0])
         inverse = 1.0 / (1.0 + abs(v[e, 0]))
@@ -222,7 +219,7 @@ def _set_dual(basis: Any, y: Any, dual: Any) -> None:
 
 
 @kernel
-def measure(problem: Any, iterate: Any) -> Scalars:
+def measure_gap(problem: Any, iterate: Any) -> Scalars:
     """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
     for e in range(len(problem.w)):

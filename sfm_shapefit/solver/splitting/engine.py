@@ -255,11 +255,7 @@ class Iteration:
         return float(max(abs(objective - dual_value), _STEPS_LEFT * change)) / self.kappa
 
     def _error(self, state: State) -> float:
-        """Return the estimate of the error of the objective, in its own units.
-
-        By Cauchy and Schwarz it is at most the step times the distance to the fixed point, both in the norm
-        in which the iteration contracts.
-        """
+        """Return the objective's error, by Cauchy and Schwarz at most the step times the distance left."""
         return state.steps_left * float(state.sums[CHANGE]) / self.kappa
 
     def _renew(self, state: State, floor: float) -> None:
@@ -301,10 +297,7 @@ def _mean(residuals: FloatArray, weights: FloatArray) -> float:
 
 
 def _steps_left(state: State) -> float:
-    """Return how many steps of the present length are left, if they go on to shrink as they do.
-
-    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. After a renewal the steps jump.
-    """
+    """Return how many steps are left, 1 / (1 - q) if they go on to shrink by q; a renewal lets them jump."""
     if len(state.steps) <= _CONTRACTION_WINDOW:
         return state.steps_left
     now, before = state.steps[-1], state.steps[-1 - _CONTRACTION_WINDOW]
