@@ -8,11 +8,11 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-_MOST_TEXT = 300
+_MOST_TEXT = 300  # characters; a longer value of a table is counted instead
 _MOST_BYTES = 8_000_000
-"""A notebook that holds a larger page opens slowly."""
+"""Bytes of the page of a notebook, at most; a notebook that holds a larger one opens slowly."""
 _COLORS = {"good": "#2e7d32", "look": "#b26a00", "do not use": "#c62828"}
-_FRAME_HEIGHT_PX = 720
+_FRAME_HEIGHT_PX = 720  # pixels; as high as a notebook shows at once
 
 _drawers: list[Callable[[Any], str]] = []
 

@@ -24,17 +24,11 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 
 S = TypeVar("S", bound="Settings")
 
-_HELP_WIDTH = 88
+_HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a terminal
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and the sentence that explains it.
-
-    Args:
-        default: what holds where the user says nothing.
-        help: the sentence.
-        also: an earlier name of the field, which the command line still takes.
-    """
+    """Return a field with its default and its sentence; `also` is an earlier name that flags still take."""
     return field(default=default, metadata={"help": help, "also": also})
 
 
@@ -50,11 +44,7 @@ class Settings:
                 raise ValueError(f"{item.name} must be {_wanted(kind)}, got {value!r}")
 
     def check_range(self, name: str, low: float, high: float = float("inf")) -> None:
-        """Refuse a field whose value lies outside [low, high].
-
-        Raises:
-            ValueError: a sentence that names the field.
-        """
+        """Raise ValueError, which names the field, if its value lies outside [low, high]."""
         value = getattr(self, name)
         if not low <= value <= high:
             limits = f"be at least {low:g}" if high == float("inf") else f"lie in [{low:g}, {high:g}]"
@@ -68,25 +58,25 @@ class Group(NamedTuple):
     fields: tuple[Field[Any], ...]
 
 
-def groups_of(settings: type[Settings]) -> Iterator[Group]:
+def setting_groups(settings: type[Settings]) -> Iterator[Group]:
     """Yield the fields of a settings class, grouped by the class that states them, its own first.
 
     The title of a group is the first sentence of that class. A field that is stated again, with another
     default, belongs to the class that states it last.
     """
-    known, seen = {item.name: item for item in fields(settings)}, set[str]()
+    by_name, seen = {item.name: item for item in fields(settings)}, set[str]()
     for base in settings.__mro__:
-        names = [name for name in inspect.get_annotations(base) if name in known.keys() - seen]
+        names = [name for name in inspect.get_annotations(base) if name in by_name.keys() - seen]
         seen |= set(names)
         if names:
             title = (base.__doc__ or base.__name__).split("\n")[0].rstrip(".")
-            yield Group(title, tuple(known[name] for name in names))
+            yield Group(title, tuple(by_name[name] for name in names))
 
 
 def explained(settings: type[S]) -> type[S]:
     """Add the options of a settings class, with defaults and sentences, to its docstring."""
     lines = [(settings.__doc__ or "").rstrip(), "", "Options:"]
-    for group in groups_of(settings):
+    for group in setting_groups(settings):
         for item in group.fields:
             sentence = textwrap.wrap(item.metadata["help"], _HELP_WIDTH)
             lines += [f"    {item.name} = {item.default!r}", *(f"        {line}" for line in sentence)]
@@ -97,18 +87,16 @@ def explained(settings: type[S]) -> type[S]:
 def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any]) -> S:
     """Return the settings of a call: those given, or the defaults, with single options set by keyword.
 
-    Raises:
-        TypeError: if what is given are no such settings, or a keyword is no option; the message says what is.
-        ValueError: if a value is refused.
+    TypeError for other settings, or a keyword that is no option; ValueError for a value that is refused.
     """
     if given is not None and not isinstance(given, settings):
         kind, wanted = type(given).__name__, settings.__name__
         raise TypeError(f"options must be {wanted}(...), got a {kind}; or give single options by keyword")
-    known = [item.name for item in fields(settings)]
+    names = [item.name for item in fields(settings)]
     for name in overrides:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(names)}"
             raise TypeError(f"{name!r} is no option of {settings.__name__}; {hint}")
     if given is None:
         return settings(**overrides)

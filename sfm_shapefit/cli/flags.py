@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.base.settings import Settings, groups_of, option
+from sfm_shapefit.base.settings import Settings, option, setting_groups
 
 Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -241,7 +241,7 @@ def takes(
 def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
     """Return a keyword parameter with a typer option for each field."""
     kinds, parameters = get_type_hints(settings), []
-    for group in groups_of(settings):
+    for group in setting_groups(settings):
         for item in group.fields:
             flag = _flag_of(item.name)
             if item.metadata["also"]:

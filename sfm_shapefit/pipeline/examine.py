@@ -37,6 +37,7 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.points import ModelPictures, points_of
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -107,7 +108,8 @@ def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -
     """
     model = matches.model
     with clock("points"):
-        quality = image_quality(model)
+        points = points_of(model.reconstruction, model.images)
+        quality = image_quality(points, model.images, ModelPictures(model.reconstruction, model.images))
     with clock("directions"):
         try:
             directions = measure(matches, options, clock).directions

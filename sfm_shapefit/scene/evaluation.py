@@ -30,8 +30,8 @@ from sfm_shapefit.base.geometry import (
 )
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.pose_errors import (
+    ComparedPoses,
     ErrorSummary,
-    Poses,
     TrajectoryErrors,
     area_under_recall,
     relative_pose_errors,
@@ -281,7 +281,7 @@ def evaluate_poses(
     close = errors < cap
     degenerate = _on_a_line(x, close) or _on_a_line(y, close)
     extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
-    ours, theirs = Poses(model.rotations[in_model], x), Poses(reference.rotations[in_ref], y)
+    ours, theirs = ComparedPoses(model.rotations[in_model], x), ComparedPoses(reference.rotations[in_ref], y)
     pair_errors = relative_pose_errors(ours, theirs, extent)
     in_time = np.argsort(np.array([reference.names[k] for k in in_ref]), kind="stable")
     return Evaluation(

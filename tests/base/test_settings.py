@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.base.settings import _fits, groups_of, merge_options
+from sfm_shapefit.base.settings import _fits, merge_options, setting_groups
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.facts.tables import CameraRow, columns_of
@@ -42,7 +42,7 @@ def test_every_default_is_what_its_option_takes(settings):
 
 
 def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
-    names = [item.name for group in groups_of(MapOptions) for item in group.fields]
+    names = [item.name for group in setting_groups(MapOptions) for item in group.fields]
     assert sorted(names) == sorted(item.name for item in dataclasses.fields(MapOptions))
     again = {"adjust", "min_points_per_image"}  # for rotations that were averaged
     own = [name for one in ALL for name in inspect.get_annotations(one)]

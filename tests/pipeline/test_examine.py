@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import ModelPictures, points_of
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.pipeline.examine import examine
 from sfm_shapefit.report.drawing import PairClass
@@ -15,8 +16,9 @@ from tests.scenes import COURTYARD, RING, fingerprint
 
 def test_quality_is_that_of_the_models_own_observations():
     model = read_model(RING / "sparse" / "0")
-    quality = image_quality(model)
-    reconstruction = model.reconstruction
+    reconstruction, images = model.reconstruction, model.images
+    pictures = ModelPictures(reconstruction, images)
+    quality = image_quality(points_of(reconstruction, images), images, pictures)
     mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
     assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
     image = reconstruction.image(int(model.image_ids[3]))
