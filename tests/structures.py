@@ -7,7 +7,7 @@ import pycolmap
 
 from sfm_shapefit.adjustment import bundle_adjustment
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate as triangulate_matches
 from sfm_shapefit.files.colmap.images import images_of, put_images
@@ -80,26 +80,24 @@ def placed(seed, estimate):
     return AdjustedModel(copy, estimate)
 
 
-def bundle_adjusted(seed, tracks, options=None, given=None):
-    links = links_of(seed, tracks)
-    estimate, points = bundle_adjustment.bundle_adjust(posed_images(seed), links, options, given)
+def bundle_adjusted(seed, tracks, options=None, freedom=None):
+    links, freedom = links_of(seed, tracks), freedom or Freedom()
+    options = options or StructureOptions()
+    estimate, points = bundle_adjustment.bundle_adjust(posed_images(seed), links, options, freedom)
     colors = tracks if isinstance(tracks, pycolmap.Reconstruction) else None
     found = placed(seed, estimate)
     return found._replace(reconstruction=with_points(found.reconstruction, points, options, colors))
 
 
-def adjusted_thinly(seed, tracks, **given):
-    """`given`: fields of `GivenPoses`."""
-    links = links_of(seed, tracks)
-    return placed(
-        seed, bundle_adjustment.adjust_thinly(posed_images(seed), lambda: links, None, GivenPoses(**given))
-    )
+def adjusted_thinly(seed, tracks, fixed=None, **freedom):
+    """`freedom`: fields of `Freedom`."""
+    given, free, links = GivenPoses(fixed=fixed), Freedom(**freedom), links_of(seed, tracks)
+    options, images = StructureOptions(), posed_images(seed)
+    return placed(seed, bundle_adjustment.adjust_thinly(images, lambda: links, options, free, given))
 
 
-def adjusted_placement(seed, tracks, **given):
-    """`given`: fields of `GivenPoses`."""
-    options, links = StructureOptions(), links_of(seed, tracks)
-    return placed(
-        seed,
-        bundle_adjustment.adjust_placement(posed_images(seed), links, options, None, GivenPoses(**given)),
-    )
+def adjusted_placement(seed, tracks, **freedom):
+    """`freedom`: fields of `Freedom`; the matches decide about rotations."""
+    free, links = Freedom(pull_rad=None, **freedom), links_of(seed, tracks)
+    options, images = StructureOptions(), posed_images(seed)
+    return placed(seed, bundle_adjustment.adjust_placement(images, links, options, free))

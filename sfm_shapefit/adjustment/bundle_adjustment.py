@@ -1,31 +1,39 @@
 """Bundle adjustment of images: from a seed by all points, on few tracks, or after a placement."""
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
+
+import numpy as np
 
 from sfm_shapefit.adjustment import AdjustmentOptions
+from sfm_shapefit.adjustment import run as steps
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
-from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
+from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
+_NOTHING_GIVEN = GivenPoses()
+
 
 def bundle_adjust(
     images: Images,
     links: Links,
-    structure_options: StructureOptions | None = None,
-    given: GivenPoses | None = None,
+    options: StructureOptions,
+    freedom: Freedom,
+    given: GivenPoses = _NOTHING_GIVEN,
 ) -> tuple[Estimate, Points]:
     """Adjust poses and points together, starting from the poses of `images`, all of them posed.
 
     Args:
         images: the start.
         links: of these images; points are triangulated from them.
-        structure_options: filters; the defaults if None.
-        given: what is known of poses and lenses, and how it is treated; nothing if None.
+        options: filters.
+        freedom: what moves.
+        given: what is known of the poses.
 
     Returns:
         The images where they stand now, and the points, not filtered yet. The gauge stays that of the start
@@ -35,20 +43,18 @@ def bundle_adjust(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    given = given or GivenPoses()
-    run = AdjustmentRun(images, links, structure_options or StructureOptions(), given)
-    run.weight = given.weight
-    if given.rotations is not None:
-        run.given_rotations = given.rotations
-    points, initial_error_px, last = run.adjust_all()
+    run, points, last, initial_error_px = steps.solve_from_seed(
+        steps.begin(images, links, options, freedom, given)
+    )
     return run.estimate(last, initial_error_px=initial_error_px), points
 
 
 def adjust_thinly(
     images: Images,
     read_links: Callable[[], Links],
-    structure_options: StructureOptions | None = None,
-    given: GivenPoses | None = None,
+    options: StructureOptions,
+    freedom: Freedom,
+    given: GivenPoses = _NOTHING_GIVEN,
     *,
     thorough: bool = False,
 ) -> Estimate:
@@ -61,62 +67,67 @@ def adjust_thinly(
         images: the start, all of them posed.
         read_links: returns the links of these images. Nobody else holds them, so that matches are given back
             before the last solve, which takes most memory.
-        structure_options: filters; the defaults if None. Observations may miss by four times their limit.
-        given: fixed frames, lenses and rigs that change with the poses; nothing else of it counts. A lens
-            whose focal length the points leave open gets what was given back, and the poses are adjusted
-            again.
+        options: filters. Observations may miss by four times their limit.
+        freedom: what moves. A lens whose focal length the points leave open gets what was given back, and the
+            poses are adjusted again.
+        given: what is known of the poses.
         thorough: whether all points follow where a lens or a rig has changed: a shape bends with a focal
             length that few points leave a thousandth off. Up to 2,000 frames.
 
     Returns:
-        All rotations are free; the gauge is as from `bundle_adjust`.
+        The gauge is as from `bundle_adjust`.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    given = given or GivenPoses()
-    freed = GivenPoses(fixed=given.fixed, lenses=given.lenses, free_rigs=given.free_rigs)
-    run = AdjustmentRun(images, read_links(), structure_options or StructureOptions(), freed)
-    adjusted = run.repeat_with_known_lenses(partial(run.adjust_twice_thinly, is_last=True))
-    if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
-        _, _, adjusted = run.adjust_by_all_points()
-    return run.estimate(adjusted, with_sensors=thorough)
+    run = steps.begin(images, read_links(), options, freedom, given)
+    if run.frees_more_than_poses:
+        run, last = steps.repeat_with_known_lenses(run, steps.solve_twice_thinly)
+        if thorough and run.frees_more_than_poses and last.num_frames <= MOST_FRAMES:
+            run, _, last = steps.solve_by_all_points(run)
+        return run.estimate(last, with_sensors=thorough)
+    run, last = steps.solve_coarsely(run)
+    problem = steps.fine_problem(run)
+    if problem is not None:
+        run = replace(run, links=None)  # all matches, at the peak of the memory
+        run, last = steps.solve_finely(run, problem)
+    return run.estimate(last, with_sensors=thorough)
 
 
 def adjust_placement(
     images: Images,
     links: Links,
-    structure_options: StructureOptions,
-    weight: RotationWeight | None,
-    given: GivenPoses | None = None,
+    options: StructureOptions,
+    freedom: Freedom,
+    given: GivenPoses = _NOTHING_GIVEN,
 ) -> Estimate:
     """Adjust placed images whose rotations were given, on all tracks at once.
 
     Args:
         images: the start, all of them posed.
         links: of these images.
-        structure_options: filters.
-        weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
-        given: fixed frames, centers measured otherwise, which pull at the frames, and lenses and rigs that
-            may change.
+        options: filters.
+        freedom: what moves; rotations as the matches decide, if they are to.
+        given: what is known of the poses.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run, errors = AdjustmentRun(images, links, structure_options, given or GivenPoses()), None
-    if run.frees_more_than_poses():  # points are found, and rotations judged, with what comes out
-        run.repeat_with_known_lenses(run.adjust_twice_thinly)
-        run.images = run.images.posed(images.frames.rotations, run.images.frames.centers)
+    run, errors = steps.begin(images, links, options, replace(freedom, pull_rad=np.inf), given), None
+    if run.frees_more_than_poses:  # points are found, and rotations judged, with what comes out
+        run, _ = steps.repeat_with_known_lenses(run, steps.solve_twice_thinly)
+        run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
     _, _, problem = run.problem_of_all(checked=True)
-    if weight is None:
+    decided = replace(run.freedom, pull_rad=freedom.pull_rad)
+    if freedom.pull_rad is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
-        loss_scale_px = run.choose_scale(problem) * structure_options.max_reprojection_error_px
+        loss_scale_px = run.choose_scale(problem) * options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
-        weight = errors.weight()
-    run.weight = weight
-    is_repeated = bool(weight.singled_out(problem.num_frames).any())
-    adjusted = run.adjust_placed(problem, FIRST_FALL if is_repeated else LAST_FALL)
+        decided = errors.decide(run.freedom)
+    run = replace(run, freedom=decided)
+    is_repeated = bool(decided.singled_out().any())
+    run, last = steps.solve_placed(run, problem, FIRST_FALL if is_repeated else LAST_FALL)
     # A frame whose rotation was far off has had few of its tracks; where it stands now it has more, then all.
     for fall in (FIRST_FALL, LAST_FALL) if is_repeated else ():
-        adjusted = run.adjust_placed(run.problem_of_all(checked=True)[2], fall)
-    return run.estimate(adjusted, errors=errors)
+        run, last = steps.solve_placed(run, run.problem_of_all(checked=True)[2], fall)
+    return run.estimate(last, errors=errors)

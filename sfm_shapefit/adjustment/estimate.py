@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.adjustment.free_sensors import SensorSigma
-from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight
+from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
@@ -20,8 +20,6 @@ class RefinedLenses(NamedTuple):
     """Standard deviation of the focal length, as a share of it."""
     undetermined: tuple[int, ...]
     """Those whose focal length the points leave open: it is what was given."""
-    free: FreeLenses = ALL_HELD
-    """What later adjustments may change."""
 
 
 UNREFINED = RefinedLenses({}, ())
@@ -34,8 +32,8 @@ class Estimate:
 
     images: Images
     """All posed."""
-    weight: RotationWeight
-    """How the given rotations were treated."""
+    freedom: Freedom
+    """What moved, and what may move in later adjustments."""
     errors: RotationErrors | None = None
     """What the matches said of them, if they were asked."""
     covariances: FloatArray | None = None
@@ -60,13 +58,13 @@ class Estimate:
     def statement(self) -> str:
         """What was chosen and why, in words."""
         if self.errors is None:
-            if self.weight.hold:
+            if self.freedom.holds_rotations:
                 return "centers and points adjusted, rotations held, as asked"
-            sigma = self.weight.sigma_rad
-            kept = "free" if sigma is None else f"weighted by {math.degrees(sigma):.2g} deg"
+            sigma_deg = math.degrees(self.freedom.least_pull_rad)
+            kept = f"weighted by {sigma_deg:.2g} deg" if math.isfinite(sigma_deg) else "free"
             return f"centers, points and rotations adjusted, rotations {kept}, as asked"
         chance = f"{math.degrees(self.errors.chance_rad):.2g} deg"
-        if self.weight.hold:
+        if self.freedom.holds_rotations:
             return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
         if self.errors.sigma_rad == 0.0:
             freed = counted(int(self.errors.are_wrong.sum()), "rotation")

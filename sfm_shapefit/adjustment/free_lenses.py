@@ -31,19 +31,19 @@ class FreeLenses(NamedTuple):
     focal_held: frozenset[int] = frozenset()
     """Those of them whose focal lengths stay, so that only their distortion changes."""
 
-    def apply(self, problem: AdjustmentProblem, camera_ids: Sequence[int]) -> AdjustmentProblem:
-        """Return the problem with priors, other lenses fixed; `camera_ids` are those of its lenses."""
+    def apply(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+        """Return the problem with priors, other lenses fixed."""
         if not self.doubts:
             return problem
         values = np.array([lens.values() for lens in problem.lenses])
         information = np.zeros_like(values)
         lenses = list(problem.lenses)
-        for k, camera_id in enumerate(camera_ids):
-            doubt = self.doubts.get(camera_id)
+        for k, lens in enumerate(problem.lenses):
+            doubt = self.doubts.get(lens.id)
             if doubt is None:
                 lenses[k] = replace(lenses[k], fixed=True)
             elif not lenses[k].fixed:
-                lenses[k] = replace(lenses[k], focal_fixed=camera_id in self.focal_held)
+                lenses[k] = replace(lenses[k], focal_fixed=lens.id in self.focal_held)
                 values[k], information[k] = doubt.given.values(), doubt.information()
         prior = LensPrior(values=values, information=information)
         return replace(problem, lenses=lenses, lens_prior=prior)

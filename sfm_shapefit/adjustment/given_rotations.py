@@ -30,9 +30,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import rotation_vectors
-from sfm_shapefit.adjustment.problem import AdjustmentProblem, RotationPrior, isotropic_information
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
@@ -60,62 +61,6 @@ _CERTAIN = 10.0 * 2.0 / np.sqrt(3.0)
 _RARE = 4.6
 
 
-class RotationWeight(NamedTuple):
-    """How an adjustment treats the rotations that it was given."""
-
-    hold: bool = False
-    """They stay what they are, to the last bit."""
-    sigma_rad: float | None = None
-    """Standard deviation per axis by which they pull; None: they do not."""
-    noise_px: float = 0.5
-    """Standard deviation of an observation per axis, which the pull is weighed against."""
-    frame_sigmas_rad: FloatArray | None = None
-    """(n,) the same for each frame: by these they pull, or may be wrong although they are held. None: as
-    above for all, and held ones are right."""
-    open_sigmas_rad: FloatArray | None = None
-    """(n,) of frames that pull as if they were held: by what they may be wrong. None: of none."""
-
-    def of(self, frames: IntArray) -> "RotationWeight":
-        """Return the weight of some of the frames."""
-        sigmas, left_open = self.frame_sigmas_rad, self.open_sigmas_rad
-        return self._replace(
-            frame_sigmas_rad=None if sigmas is None else sigmas[frames],
-            open_sigmas_rad=None if left_open is None else left_open[frames],
-        )
-
-    def among(self, frames: IntArray, count: int) -> "RotationWeight":
-        """Return the weight of so many frames, of which it has some; the others have the usual one."""
-        sigmas, left_open = self.frame_sigmas_rad, self.open_sigmas_rad
-        if sigmas is None:
-            return self
-        of_all, of_open = np.full(count, self.sigma_rad or 0.0), np.zeros(count)
-        of_all[frames] = sigmas
-        if left_open is not None:
-            of_open[frames] = left_open
-        return self._replace(frame_sigmas_rad=of_all, open_sigmas_rad=None if left_open is None else of_open)
-
-    def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
-        """Return the problem with the pull of the given rotations (n, 3, 3)."""
-        if self.hold or self.sigma_rad is None:
-            return problem
-        sigmas = self.frame_sigmas_rad
-        if sigmas is None:
-            sigmas = np.full(problem.num_frames, self.sigma_rad)
-        prior = RotationPrior(rotations=given, information=isotropic_information(sigmas))
-        return replace(problem, rotation_prior=prior)
-
-    def singled_out(self, num_frames: int) -> BoolArray:
-        """Return the frames (n,) that pull less than the others: their given rotations are clearly wrong."""
-        if self.hold or self.frame_sigmas_rad is None:
-            return np.zeros(num_frames, dtype=np.bool_)
-        return np.asarray(self.frame_sigmas_rad > self.frame_sigmas_rad.min())
-
-    def open_rad(self) -> float | FloatArray:
-        """Return the standard deviation per axis of the errors of held rotations, or one per frame."""
-        sigmas = self.frame_sigmas_rad if self.hold else self.open_sigmas_rad
-        return 0.0 if sigmas is None else sigmas
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RotationErrors:
     """What the matches say of the given rotations; standard deviations per axis."""
@@ -134,20 +79,19 @@ class RotationErrors:
     num_frames: int
     """Frames that say anything."""
 
-    def weight(self) -> RotationWeight:
-        """Return how to treat the rotations: held, if freeing them would bring more noise than it takes.
+    def decide(self, freedom: Freedom) -> Freedom:
+        """Return the freedom of rotations: held, if freeing them would bring more noise than it takes.
 
         Where others are wrong, those pull so hard that they are nearly held.
         """
-        hold, sigmas = self.sigma_rad == 0.0, self.frame_sigmas_rad
-        if not hold or not self.are_wrong.any():
-            return RotationWeight(hold, self.sigma_rad or None, self.noise_px, sigmas)
-        sigma_rad = _NEARLY_HELD * self.chance_rad
-        return RotationWeight(
-            sigma_rad=sigma_rad,
-            noise_px=self.noise_px,
-            frame_sigmas_rad=np.where(self.are_wrong, sigmas, sigma_rad),
-            open_sigmas_rad=np.where(self.are_wrong, 0.0, sigmas),
+        sigmas, freedom = self.frame_sigmas_rad, replace(freedom, noise_px=self.noise_px)
+        if self.sigma_rad > 0.0:
+            return replace(freedom, pull_rad=sigmas)
+        nearly = _NEARLY_HELD * self.chance_rad if self.are_wrong.any() else 0.0
+        return replace(
+            freedom,
+            pull_rad=np.where(self.are_wrong, sigmas, nearly),
+            doubt_rad=np.where(self.are_wrong, 0.0, sigmas),
         )
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment.views import CUBE, Views, views_of
+from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.images import Images, Pictures
@@ -100,9 +100,9 @@ def collect_tracks(images: Images, pictures: Pictures, points: Points) -> Observ
     )
 
 
-def with_rays_of(views: Views, images: Images, links: Links, changed: BoolArray) -> Links:
+def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:
     """Return the same observations with the rays that lenses (l,) which have changed give them now."""
-    lens, on_plane = images.lens_of[views.images][links.cameras], links.on_plane.copy()
+    lens, on_plane = images.lens_of[views_of(images).images][links.cameras], links.on_plane.copy()
     for k in np.flatnonzero(changed).tolist():
         rows = np.flatnonzero(lens == k)
         on_plane[rows] = images.lenses[k].undistort(links.pixels[rows])

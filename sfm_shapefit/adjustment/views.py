@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
@@ -31,17 +31,6 @@ class Observations(NamedTuple):
     """(o,)"""
     pixels: FloatArray
     """(o, 2) as the lenses of the cameras take them."""
-
-
-class Bounds(NamedTuple):
-    """What holds the frames of an adjustment, and what moves in them."""
-
-    fixed: BoolArray
-    """(f,) frames that stay."""
-    centers: KnownPositions | None = None
-    """Of frames, which they pull at."""
-    free_sensors: BoolArray | None = None
-    """(l,) lenses that may move in their rigs; none if None."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,19 +55,31 @@ class Views:
         )
 
     def problem(
-        self, images: Images, bounds: Bounds, points: FloatArray, seen: Observations
+        self,
+        images: Images,
+        sensors: BoolArray,
+        given: GivenPoses,
+        points: FloatArray,
+        seen: Observations,
     ) -> AdjustmentProblem:
-        """Return the problem of points (x, 3) and their observations, at the poses of the images."""
+        """Return the problem of points and their observations, at the poses of the images.
+
+        Args:
+            images: those of the views.
+            sensors: (l,) lenses that move in their rigs.
+            given: what is known of their poses; rotations have no part yet.
+            points: (x, 3)
+            seen: what the cameras see of them.
+        """
         rotations, translations = self._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         is_plain = np.array_equal(frames, np.arange(len(images.frames.ids))) and not translations.any()
         is_plain = is_plain and bool((rotations == np.eye(3)).all())
-        free = np.zeros(len(images.lenses), np.bool_) if bounds.free_sensors is None else bounds.free_sensors
         rig = Rig(
             frame_of_camera=frames,
             rotations=rotations,
             translations=translations,
-            free_sensor_of_camera=np.where(free, np.cumsum(free) - 1, -1)[lenses],
+            free_sensor_of_camera=np.where(sensors, np.cumsum(sensors) - 1, -1)[lenses],
         )
         return AdjustmentProblem(
             rotations=images.frames.rotations,
@@ -90,8 +91,8 @@ class Views:
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
             rig=None if is_plain else rig,
-            fixed=bounds.fixed,
-            center_prior=bounds.centers,
+            fixed=np.zeros(0, np.bool_) if given.fixed is None else given.fixed,
+            center_prior=given.centers,
         )
 
     def images_of(self, images: Images, solved: AdjustmentProblem) -> Images:
@@ -153,7 +154,11 @@ def observations(tracks: ObservedTracks, points_seen: IntArray) -> Observations:
 
 def _lens_of_views(lens: Lens) -> Lens:
     """Return the lens of the views of an image."""
-    return lens if lens.is_adjustable else Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True)
+    return (
+        lens
+        if lens.is_adjustable
+        else Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)
+    )
 
 
 def _cube() -> FloatArray:

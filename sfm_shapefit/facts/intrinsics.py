@@ -84,11 +84,11 @@ class Intrinsics:
     refined: RefinedLenses = UNREFINED
     """What the adjustments made of them."""
 
-    def after(self, refined: RefinedLenses) -> "Intrinsics":
+    def after(self, refined: RefinedLenses, free: FreeLenses) -> "Intrinsics":
         """Return the same after one more adjustment; what it left open is held from then on."""
         undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *refined.undetermined)))
-        together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined, refined.free)
-        return replace(self, refined=together, free=refined.free)
+        together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined)
+        return replace(self, refined=together, free=free)
 
     def how(self, camera: int) -> How:
         """Return what decided about the focal length of a camera at last."""

@@ -101,11 +101,12 @@ class PlacementAdjustment(Record):
         """Return how a placement was adjusted; None if it was not."""
         if estimate is None:
             return None
-        weight, errors = estimate.weight, estimate.errors
+        errors, sigma_rad = estimate.errors, estimate.freedom.least_pull_rad
+        held, free = estimate.freedom.holds_rotations, math.isinf(sigma_rad)
         return cls(
             statement=estimate.statement,
-            rotations="held" if weight.hold else "free" if weight.sigma_rad is None else "weighted",
-            rotation_sigma_deg=None if weight.sigma_rad is None else math.degrees(weight.sigma_rad),
+            rotations="held" if held else "free" if free else "weighted",
+            rotation_sigma_deg=None if held or free else math.degrees(sigma_rad),
             chance_deg=None if errors is None else math.degrees(errors.chance_rad),
         )
 

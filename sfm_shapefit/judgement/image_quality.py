@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.filter import reprojection_errors_px
+from sfm_shapefit.tracks.filter import keypoint_errors_px
 
 _CELLS = 8  # cells per side of the picture; its coverage is the share of these with a point
 
@@ -36,7 +36,7 @@ class ImageQuality:
 
 def image_quality(points: Points, images: Images, pictures: Pictures) -> ImageQuality:
     """Return how well each of posed images is held by the points that they observe."""
-    misses_px = reprojection_errors_px(points, images, pictures, ahead=False)
+    misses_px = keypoint_errors_px(points, images, pictures, ahead=False)
     n, lengths, seen = images.num_images, points.lengths(), points.points_seen()
     counts, errors = points.count_seen(n), np.full(n, np.nan)
     tracks, coverage = np.full(n, np.nan), np.zeros(n)

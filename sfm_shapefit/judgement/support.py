@@ -57,14 +57,14 @@ class ObservationShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
-    """Of i images, the keypoints that are matched in two or more other posed ones; 0 of one that is not."""
+    """Numbers of the keypoints that are matched in two or more other posed images; 0 without a pose."""
 
     checked: IntArray
-    """(i,) all of them."""
+    """(i,) all such keypoints of each image."""
     agreeing: IntArray
-    """(i,) those that see a 3D point."""
+    """(i,) keypoints among them that see a 3D point."""
     contradicting: IntArray
-    """(i,) those that see none, and most of whose matches miss the epipolar lines of the cameras."""
+    """(i,) keypoints among them that see none, and most of whose matches miss the cameras' epipolar lines."""
 
     def shares(self, chosen: BoolArray) -> ObservationShares:
         """Return the shares of some of the images (i,) together."""

@@ -15,8 +15,9 @@ from sfm_shapefit.adjustment import (
     estimate_covariances,
     isotropic_information,
 )
+from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.sources import collect_tracks
-from sfm_shapefit.adjustment.views import Bounds, observations, views_of
+from sfm_shapefit.adjustment.views import observations, views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
@@ -84,8 +85,8 @@ def bundle_adjust(
     images, points, tracks = read_bundle(reconstruction)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
     seen = observations(tracks, np.where(has_ray, points.points_seen(), -1))
-    views, bounds = views_of(images), Bounds(np.isin(images.frames.ids, sorted(fixed_frames)))
-    problem = views.problem(images, bounds, points.xyz, seen)
+    views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))
+    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, points.xyz, seen)
     if rotation_sigma_deg is not None:
         sigmas = np.full(problem.num_frames, np.radians(rotation_sigma_deg))
         prior = RotationPrior(rotations=problem.rotations, information=isotropic_information(sigmas))

@@ -12,7 +12,6 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import LocateOptions
@@ -40,11 +39,11 @@ _SAID_OF_MATCHES = (
 )
 
 
-def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
-    """Return how given rotations are treated; None: as the matches say."""
+def pull_of_rotations(options: LocateOptions) -> float | None:
+    """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
     if not isinstance(options.rotations, str):
-        return RotationWeight(sigma_rad=math.radians(options.rotations))
-    return {"auto": None, "held": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+        return math.radians(options.rotations)
+    return {"auto": None, "held": 0.0, "free": math.inf}[options.rotations]
 
 
 def pull_cameras(
@@ -82,9 +81,9 @@ def adjust_placed(
     located: Located,
     options: LocateOptions,
     clock: Clock,
-    weight: RotationWeight | None,
+    pull_rad: float | None,
 ) -> AfterAdjustment:
-    """Adjust all placed cameras, in the gauge that was chosen; `weight` is of their rotations.
+    """Adjust all placed cameras, in the gauge that was chosen; `pull_rad` is that of their rotations.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
@@ -93,14 +92,15 @@ def adjust_placed(
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     posed = posed_part(pose_images(model, everyone))
     links = read_links(source, everyone, posed, clock.advance)
-    adjusted = adjust_placement(posed.images, links, options, weight, located.given_of(posed, model))
+    freedom = replace(located.freedom, pull_rad=pull_rad)
+    adjusted = adjust_placement(posed.images, links, options, freedom, located.given_of(posed, model))
     del links
     similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
     centers[posed.rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
-    if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
+    if not adjusted.freedom.holds_rotations or adjusted.lenses.sigmas or adjusted.sensors:
         source = source.at(turned_model(model, adjusted.images))
-        corrected = posed.frames[adjusted.weight.singled_out(len(posed.frames))]
+        corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
         is_corrected = np.isin(model.images.frame_of, corrected)
         directions = _measure_again(source, directions, is_corrected, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations

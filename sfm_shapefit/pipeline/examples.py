@@ -17,6 +17,7 @@ from sfm_shapefit.adjustment import (
     estimate_covariances,
 )
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -47,6 +48,7 @@ from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.tracks.options import StructureOptions
 
 
 def _random_graph(dimension: int = 3) -> ViewGraph:
@@ -222,7 +224,7 @@ def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
     model = read_model(_workspace(folder, WorkspaceOptions(database=False)))
     images, _, tracks = read_bundle(model.reconstruction)
-    adjust_thinly(images, lambda: tracks)
+    adjust_thinly(images, lambda: tracks, StructureOptions(), Freedom())
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     estimate_covariances(adjusted.problem)
     estimate_center_errors(adjusted.problem, AdjustmentOptions())

@@ -13,7 +13,7 @@ import numpy as np
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.pipeline.clock import Clock
@@ -77,8 +77,8 @@ def adjust_first_placement(
     del graph
     posed = posed_part(pose_images(model, located))
     links = partial(read_links, source, located, posed, clock.advance)
-    given = GivenPoses(lenses=lenses, free_rigs=options.rigs == "free")
-    adjusted = adjust_thinly(posed.images, links, options, given, thorough=thorough)
+    freedom = Freedom(lenses=lenses, has_sensors=options.rigs == "free")
+    adjusted = adjust_thinly(posed.images, links, options, freedom, thorough=thorough)
     rotations, centers = model.rotations.copy(), np.full((model.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(model.num_images), posed.rows)

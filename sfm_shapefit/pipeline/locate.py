@@ -13,7 +13,7 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.pipeline.adjustment import weight_of_rotations
+from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.gauge_choice import read_priors
@@ -92,7 +92,7 @@ def locate(
         told = Told(
             inputs,
             rigid,
-            weight_of_rotations(options),
+            pull_of_rotations(options),
             priors=known,
             control=control,
             intrinsics=intrinsics,

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -374,13 +373,13 @@ class _Run(NamedTuple):
             with self.clock("first placement"):
                 rule = GaugeRule(model, rigid, options, priors)
                 first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
-            intrinsics = intrinsics.after(first.adjusted.lenses)
+            intrinsics = intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses)
             source = averaged.at(self._pose_as(image_ids, first))
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
         told = Told(
             inputs,
             rigid,
-            RotationWeight(),
+            np.inf,
             priors=priors,
             control=control,
             gravity=gravity,

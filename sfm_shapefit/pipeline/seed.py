@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
@@ -60,6 +60,8 @@ class Located(NamedTuple):
     given: GivenPoses = GivenPoses()
     """What is known of the frames of the model: the rotations of the input, and position priors that pull at
     the cameras and hold the gauge by that."""
+    freedom: Freedom = Freedom()
+    """Of the frames of the model."""
 
     @property
     def cameras(self) -> IntArray:
@@ -163,7 +165,8 @@ def _make_points(
     with clock("bundle adjustment" if options.adjust == "full" else "triangulation"):
         if options.adjust == "full":  # which triangulates at the poses of the start itself
             assert links is not None
-            adjusted, points = bundle_adjust(posed.images, links, options, located.given_of(posed, model))
+            freedom, given = located.freedom.of(posed.frames), located.given_of(posed, model)
+            adjusted, points = bundle_adjust(posed.images, links, options, freedom, given)
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         elif own:
             rules = TrackRules(

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.facts.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
@@ -82,8 +81,8 @@ class Told(NamedTuple):
 
     inputs: Inputs
     rigid: Rigid
-    rotations: RotationWeight | None
-    """How an adjustment treats the rotations; None: as the matches say."""
+    pull_rad: float | None
+    """How an adjustment treats the rotations, see `Freedom`; None: as the matches say."""
     priors: PositionPriors | None = None
     control: ControlPoints | None = None
     gravity: Gravity | None = None
@@ -199,7 +198,7 @@ def finish_piece(
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         judged = with_uncertainty(judged, given, seeded.adjusted, scale)
-        intrinsics = intrinsics.after(seeded.adjusted.lenses)
+        intrinsics = intrinsics.after(seeded.adjusted.lenses, seeded.adjusted.freedom.lenses)
     sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
     for done in (stand.adjustment, seeded.adjusted):
         sensors |= {} if done is None else done.sensors
@@ -258,8 +257,8 @@ def _start(
     rule = GaugeRule(model, told.rigid, options, told.priors)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
-    given = GivenPoses(lenses=told.intrinsics.free, free_rigs=options.rigs == "free")
-    located = Located(placement, everyone, gauge, told.rigid.fixed, rule, given)
+    freedom = Freedom(lenses=told.intrinsics.free, has_sensors=options.rigs == "free")
+    located = Located(placement, everyone, gauge, told.rigid.fixed, rule, freedom=freedom)
     if told.priors is not None and options.refine_with_priors:
         located = pull_cameras(model, located, told.priors, options)
     stand = Stand(source, directions, located, told.intrinsics)
@@ -279,18 +278,15 @@ def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> S
     if is_small or (told.near is not None and not is_pulled) or not adjusts:
         return stand
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-        after = adjust_placed(stand.source, stand.directions, located, options, clock, told.rotations)
-        intrinsics = stand.intrinsics.after(after.adjusted.lenses)
-        frames = stand.source.model.images.frames
-        given = located.given._replace(
-            weight=after.adjusted.weight.among(after.part.frames, len(frames.ids)),
-            rotations=frames.rotations,
-            lenses=intrinsics.free,
-        )
+        after = adjust_placed(stand.source, stand.directions, located, options, clock, told.pull_rad)
+        frames, freedom = stand.source.model.images.frames, after.adjusted.freedom
+        intrinsics = stand.intrinsics.after(after.adjusted.lenses, freedom.lenses)
+        given = located.given._replace(rotations=frames.rotations)
+        freedom = freedom.among(after.part.frames, len(frames.ids))
         return Stand(
             source=after.source,
             directions=after.directions,
-            located=located._replace(placement=after.placement, given=given),
+            located=located._replace(placement=after.placement, given=given, freedom=freedom),
             intrinsics=intrinsics,
             estimate=after.adjusted,
             scale=located.gauge.similarity.scale,

@@ -23,7 +23,7 @@ def filter_points(points: Points, images: Images, pictures: Pictures, options: S
         pictures: of these.
         options: what points must satisfy.
     """
-    errors_px = reprojection_errors_px(points, images, pictures)
+    errors_px = keypoint_errors_px(points, images, pictures)
     fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
     kept = points.taken(fitting)
     sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
@@ -33,7 +33,7 @@ def filter_points(points: Points, images: Images, pictures: Pictures, options: S
     return kept.taken(is_kept[kept.points_seen()])
 
 
-def reprojection_errors_px(
+def keypoint_errors_px(
     points: Points, images: Images, pictures: Pictures, *, ahead: bool = True
 ) -> FloatArray:
     """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.

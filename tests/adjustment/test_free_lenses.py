@@ -18,9 +18,9 @@ TRUE_PX = 500.0
 def doubted(problem, given_px, sigma, *, distortion=False):
     """All lenses of a problem in doubt, as given with another focal length, and the problem started there."""
     model, (_, *others) = problem.lenses[0].model, problem.lenses[0].parameters
-    given = Lens(model, (given_px, *others))
+    given = Lens(model, (given_px, *others), id=7)
     free = FreeLenses({7: LensDoubt(given, sigma, 0.1)}, distortion=distortion)
-    return free, free.apply(replace(problem, lenses=[given]), [7])
+    return free, free.apply(replace(problem, lenses=[given]))
 
 
 def solve(free, problem):
@@ -83,15 +83,15 @@ def test_what_the_points_do_not_tell_is_not_accepted():
 def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
     rng = np.random.default_rng(0)
     problem = ring_problem(rng, models=("SIMPLE_RADIAL", "SIMPLE_RADIAL"), noise_px=0.3)
-    given = Lens("SIMPLE_RADIAL", (520.0, 320.0, 240.0, 0.0))
+    given = Lens("SIMPLE_RADIAL", (520.0, 320.0, 240.0, 0.0), id=3)
     start = replace(problem, lenses=[given, problem.lenses[1]])
     for distortion in (False, True):
         free = FreeLenses({3: LensDoubt(given, 0.3, 0.1)}, distortion=distortion)
-        found = adjust(free.apply(start, [3, 5]), OPTIONS, **free.overrides()).problem.lenses
+        found = adjust(free.apply(start), OPTIONS, **free.overrides()).problem.lenses
         assert found[1].parameters == problem.lenses[1].parameters
         assert (found[0].parameters[3] != 0.0) == distortion
         assert abs(found[0].parameters[0] - TRUE_PX) < 2.0
-    assert ALL_HELD.apply(start, [3, 5]) is start
+    assert ALL_HELD.apply(start) is start
     assert free.holding([3]).focal_held == {3}
     none = {"free_focal_lengths": False, "free_distortion": False}
     assert free.holding([3]).holding([3]).overrides() == none
@@ -129,7 +129,7 @@ def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
     assert not free.doubts[7].accepts(lens, sigma)
     held = free.holding([7])
     options = replace(OPTIONS, **held.overrides())
-    found = adjust(held.apply(start, [7]), options).problem
+    found = adjust(held.apply(start), options).problem
     focal_px, _, _, k1 = found.lenses[0].parameters
     assert focal_px == given_px
     assert focal_sigmas(found, options)[0] == 0.0

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust, estimate_covariances
-from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
+from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
 
 FOCAL_PX = 1000.0
 OPTIONS = AdjustmentOptions(loss_scale_px=2.0)
@@ -44,7 +45,7 @@ def ring_problem(sigma_deg, noise_px, num_frames=16, num_points=400, seed=0):
 def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
     problem, _ = ring_problem(0.0, noise_px, seed=seed)
     found = estimate_rotation_errors(problem, OPTIONS)
-    assert found.weight().hold
+    assert found.decide(Freedom()).holds_rotations
     assert found.num_frames == 16
     covariances = estimate_covariances(adjust(problem, OPTIONS).problem, OPTIONS, noise_px=noise_px)
     sigmas = np.sqrt(np.trace(covariances.rotations, axis1=1, axis2=2) / 3.0)
@@ -58,10 +59,10 @@ def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
 @pytest.mark.parametrize("sigma_deg", [0.05, 0.3])
 def test_the_standard_deviation_of_wrong_rotations_is_found(sigma_deg, seed):
     found = estimate_rotation_errors(ring_problem(sigma_deg, 0.3, seed=seed)[0], OPTIONS)
-    weight = found.weight()
-    assert not weight.hold
+    freedom = found.decide(Freedom())
+    assert not freedom.holds_rotations
     # The root mean square of 16 x 3 normal numbers is within 4 / sqrt(96) = 41 % of sigma.
-    assert np.degrees(weight.sigma_rad) == pytest.approx(sigma_deg, rel=0.41)
+    assert np.degrees(freedom.least_pull_rad) == pytest.approx(sigma_deg, rel=0.41)
 
 
 @pytest.mark.parametrize("sigma_deg", [0.0, 0.05])
@@ -69,16 +70,17 @@ def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_de
     problem, _ = ring_problem(sigma_deg, 0.2)
     turned = problem.rotations.copy()
     turned[5] = Rotation.from_rotvec(np.radians([0.5, -0.4, 0.3])).as_matrix() @ turned[5]
-    weight = estimate_rotation_errors(
+    errors = estimate_rotation_errors(
         problem.with_values(turned, problem.centers, problem.points, problem.lenses), OPTIONS
-    ).weight()
-    own = np.degrees(weight.frame_sigmas_rad)
-    assert not weight.hold  # it would be held too
-    assert weight.singled_out(len(own))[5]
+    )
+    freedom = errors.decide(Freedom())
+    own = np.degrees(freedom.pull_rad)
+    assert not freedom.holds_rotations  # it would be held too
+    assert freedom.singled_out()[5]
     assert own[5] == pytest.approx(np.sqrt(0.5 / 3.0), rel=0.2)
     assert sigma_deg > 0.0 or np.delete(own, 5).max() < 0.05
     assert np.delete(own, 5).max() < 0.25
-    pull = weight.apply(problem, problem.rotations).rotation_prior
+    pull = freedom.apply(problem, problem.rotations).rotation_prior
     assert np.trace(pull.information[5]) < 0.5 * np.trace(pull.information[6])
 
 
@@ -88,7 +90,7 @@ def test_a_common_turn_of_all_is_no_error():
     turned = problem.with_values(
         problem.rotations @ turn.T, problem.centers @ turn.T, problem.points @ turn.T, problem.lenses
     )
-    assert estimate_rotation_errors(turned, OPTIONS).weight().hold
+    assert estimate_rotation_errors(turned, OPTIONS).decide(Freedom()).holds_rotations
 
 
 def test_few_frames_that_see_enough_say_nothing():
@@ -96,7 +98,7 @@ def test_few_frames_that_see_enough_say_nothing():
     few = problem.of_points(np.arange(problem.num_points) < 12)
     found = estimate_rotation_errors(few, OPTIONS)
     assert found.num_frames < 3
-    assert found.weight().hold
+    assert found.decide(Freedom()).holds_rotations
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -105,16 +107,31 @@ def test_weighted_rotations_end_nearer_to_the_truth_than_held_and_free_ones(seed
     problem, truth = ring_problem(0.05, 2.0, num_points=40, seed=seed)
     given = problem.rotations
     off = {}
-    for name, weight in {
-        "held": RotationWeight(hold=True),
-        "free": RotationWeight(),
-        "weighted": RotationWeight(sigma_rad=np.radians(0.05), noise_px=2.0),
+    for name, freedom in {
+        "held": Freedom(pull_rad=0.0),
+        "free": Freedom(),
+        "weighted": Freedom(pull_rad=np.radians(0.05), noise_px=2.0),
     }.items():
-        options = AdjustmentOptions(loss_scale_px=None, hold_rotations=weight.hold, noise_px=weight.noise_px)
-        ended = adjust(weight.apply(problem, given), options).problem.rotations
+        options = AdjustmentOptions(
+            loss_scale_px=None, hold_rotations=freedom.holds_rotations, noise_px=freedom.noise_px
+        )
+        ended = adjust(freedom.apply(problem, given), options).problem.rotations
         apart = Rotation.from_matrix(ended @ truth.transpose(0, 2, 1)).as_rotvec()
         apart -= np.einsum(
             "nab,nb->na", truth, np.tile(np.einsum("nba,nb->na", truth, apart).mean(0), (16, 1))
         )
         off[name] = np.sqrt(np.mean(apart**2))
     assert off["weighted"] < min(off["held"], off["free"])
+
+
+def test_freedom_follows_its_frames_when_some_are_left_out():
+    own = Freedom(pull_rad=np.array([0.1, 0.7, 0.2]), doubt_rad=np.array([0.0, 0.0, 0.3]))
+    of_all = own.among(np.array([4, 5, 9]), 10)
+    some = of_all.of(np.array([5, 8, 9]))
+    assert some.pull_rad.tolist() == [0.7, 0.1, 0.2]
+    assert some.doubt_rad.tolist() == [0.0, 0.0, 0.3]
+    assert own.singled_out().tolist() == [False, True, True]
+    for pull_rad in (0.0, np.inf, None, 0.1):
+        one = Freedom(pull_rad=pull_rad)
+        assert one.among(np.array([4, 5]), 10).of(np.array([5, 9])).pull_rad == pull_rad
+        assert one.holds_rotations == (pull_rad == 0.0)

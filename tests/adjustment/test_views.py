@@ -11,7 +11,8 @@ from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.views import Bounds, observations, views_of
+from sfm_shapefit.adjustment.freedom import GivenPoses
+from sfm_shapefit.adjustment.views import observations, views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.points import points_of
@@ -100,9 +101,9 @@ def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
     images, tracks = posed_images(given), links_of(given, given)
     points = points_of(given, images)
     assert points.ids.tolist() == sorted(given.point3D_ids())
-    none = np.zeros(len(images.frames.ids), dtype=bool)
+    held = np.zeros(len(images.lenses), dtype=bool)
     seen = observations(tracks, points.points_seen())
-    problem = views_of(images).problem(images, Bounds(none), points.xyz, seen)
+    problem = views_of(images).problem(images, held, GivenPoses(), points.xyz, seen)
     assert problem.num_observations == given.compute_num_observations()
     errors = reprojection_errors_px(problem)
     sums = np.bincount(problem.points_seen, errors)
@@ -250,9 +251,9 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
 def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch):
     dampings = []
 
-    def noting(problem, **options):
-        dampings.append(options["first_damping"])
-        return adjust(problem, **options)
+    def noting(problem, options, **others):
+        dampings.append(others["first_damping"])
+        return adjust(problem, options, **others)
 
     monkeypatch.setattr(adjustment_run, "adjust", noting)
     truth = scene()
@@ -279,7 +280,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
     assert kept[:3] == given[:3]
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
-    again = adjusted_thinly(start, tracks, lenses=held.estimate.lenses.free)
+    again = adjusted_thinly(start, tracks, lenses=held.estimate.freedom.lenses)
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
     monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
     held = adjusted_thinly(start, tracks, lenses=free)

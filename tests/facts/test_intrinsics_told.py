@@ -85,8 +85,8 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     )
     assert [known.how(camera) for camera in (1, 2)] == ["view graph", "held"]
     held = known.free.holding([2, 3])
-    after = known.after(RefinedLenses({1: 0.01}, (2, 3), held))
-    after = after.after(RefinedLenses({1: 0.005}, (3,), held.holding([3])))
+    after = known.after(RefinedLenses({1: 0.01}, (2, 3)), held)
+    after = after.after(RefinedLenses({1: 0.005}, (3,)), held.holding([3]))
     assert set(after.free.doubts) == {1, 2}
     assert after.free.with_free_focal() == [1]
     assert after.refined.undetermined == (2, 3)

@@ -14,7 +14,7 @@ import pytest
 
 from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
@@ -532,8 +532,8 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     fixed = bundle_adjusted(seed, matches)
     assert fixed.reconstruction.camera(3).params[0] == 808.0
     doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
-    given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
-    found = bundle_adjusted(seed, matches, given=given)
+    freedom = Freedom(lenses=FreeLenses(doubts, distortion=False))
+    found = bundle_adjusted(seed, matches, freedom=freedom)
     for camera_id, camera in found.reconstruction.cameras.items():
         if camera_id == 3:
             assert camera.params[0] == pytest.approx(800.0, rel=5e-4)

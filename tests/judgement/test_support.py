@@ -6,8 +6,6 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions
-from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
@@ -61,15 +59,6 @@ def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(fou
     frames = images.frames
     turns = Rotation.from_rotvec([[0.0, 0.0, 0.1 * (k % 3)] for k in frames.ids.tolist()]).as_matrix()
     assert judge(images.posed(turns @ frames.rotations, frames.centers), none).contradicting > 0.5
-
-
-def test_a_weight_follows_its_frames_when_some_are_left_out():
-    weight = RotationWeight(sigma_rad=0.1, frame_sigmas_rad=np.array([0.1, 0.7, 0.2]))
-    of_all = weight.among(np.array([4, 5, 9]), 10)
-    given = GivenPoses(weight=of_all).of(np.array([5, 8, 9]))
-    assert given.weight.frame_sigmas_rad.tolist() == [0.7, 0.1, 0.2]
-    held = RotationWeight(hold=True)
-    assert GivenPoses(weight=held.among(np.array([4, 5]), 10)).of(np.array([5, 9])).weight == held
 
 
 def counts_of(checked, agreeing):

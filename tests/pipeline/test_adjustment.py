@@ -54,7 +54,7 @@ def error(found):
 
 def test_exact_rotations_are_held_to_the_bit_and_centers_gain(placed):
     found = sfm_shapefit.locate(COURTYARD / "sparse" / "0")
-    assert found.adjustment.weight.hold
+    assert found.adjustment.freedom.holds_rotations
     assert "held" in found.adjustment.statement
     assert error(found).position.mean < 0.8 * error(placed).position.mean
     given = pycolmap.Reconstruction(COURTYARD / "sparse" / "0")
