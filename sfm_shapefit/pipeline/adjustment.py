@@ -16,20 +16,22 @@ from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions, Rotations
 from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.rigs import rigid_parts
 from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import MatchBatch
 
@@ -42,15 +44,15 @@ _SAID_OF_MATCHES = (
 )
 
 
-def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
+def weight_of_rotations(rotations: Rotations) -> RotationWeight | None:
     """Return how given rotations are treated; None: as the matches say."""
-    if not isinstance(options.rotations, str):
-        return RotationWeight(sigma_rad=math.radians(options.rotations))
-    return {"auto": None, "held": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+    if not isinstance(rotations, str):
+        return RotationWeight(sigma_rad=math.radians(rotations))
+    return {"auto": None, "held": RotationWeight(hold=True), "free": RotationWeight()}[rotations]
 
 
 def pull_cameras(
-    model: PosedModel, located: Located, priors: PositionPriors, options: LocateOptions
+    model: PosedModel, located: Located, priors: PositionPriors, options: PlacementOptions
 ) -> Located:
     """Return the cameras pulled by position priors, which hold the gauge from here on.
 
@@ -80,7 +82,7 @@ def adjust_placed(
     source: MatchSource,
     directions: PairDirections,
     located: Located,
-    options: LocateOptions,
+    options: PlacingOptions,
     clock: Clock,
     weight: RotationWeight | None,
 ) -> AfterAdjustment:
@@ -94,7 +96,7 @@ def adjust_placed(
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed = seed_of(source, everyone)
     tracks = read_tracks(source, everyone, seed, clock.advance)
-    adjusted = adjust_placement(seed, tracks, options, weight, fixed_frames=fixed, given=located.given)
+    adjusted = adjust_placement(seed, tracks, options.structure, weight, fixed_frames=fixed, given=located.given)
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
@@ -102,11 +104,12 @@ def adjust_placed(
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
         corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
-        directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
+        anew = np.isin(model.frame_ids, corrected)
+        directions = _measure_again(source, directions, anew, options.directions, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
-            measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
+            measured = rigid_parts(source.model, located.fixed_images(model)).apply(measured)
         placement = replace(placement, measured=measured)
     return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted)
 
@@ -126,7 +129,7 @@ def _measure_again(
     source: MatchSource,
     before: PairDirections,
     corrected: BoolArray,
-    options: LocateOptions,
+    options: DirectionOptions,
     clock: Clock,
 ) -> PairDirections:
     """Return the usable directions as they are at other rotations; the others, and what is said, stay.
@@ -136,8 +139,7 @@ def _measure_again(
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
     batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
-    threads = options.num_threads()
-    again = concatenate([estimate_directions(batch, options, threads) for batch in batches])
+    again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}

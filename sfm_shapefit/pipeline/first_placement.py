@@ -16,6 +16,7 @@ from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
@@ -47,6 +48,7 @@ class FirstPlacement(NamedTuple):
 def adjust_first_placement(
     source: MatchSource,
     rule: GaugeRule,
+    options: PlacingOptions,
     clock: Clock,
     lenses: FreeLenses,
     *,
@@ -56,7 +58,8 @@ def adjust_first_placement(
 
     Args:
         source: at the averaged rotations.
-        rule: what sets the gauge, with the options of the run.
+        rule: what sets the gauge.
+        options: of the run.
         clock: of the run.
         lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
@@ -65,10 +68,10 @@ def adjust_first_placement(
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    model, options = source.model, rule.options
-    directions = measure_directions(source, options, clock, clock.executor)
-    measured = rule.rigid.apply(build_graph(source, directions, options))
-    placement = next(place_cameras(measured, options, clock))
+    model, threshold_px = source.model, options.directions.inlier_threshold_px
+    directions = measure_directions(source, options.directions, clock, clock.executor)
+    measured = rule.rigid.apply(build_graph(source, directions, options.nodes, threshold_px))
+    placement = next(place_cameras(measured, options.placement, options.nodes, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = unit_gauge(placement.locations)
     if placement.unit is not None:  # the offsets of sensors have theirs
@@ -77,8 +80,8 @@ def adjust_first_placement(
     seed = seed_of(source, located)
     del directions, measured  # arrays of all pairs
     tracks = partial(read_tracks, source, located, seed, clock.advance)
-    given = GivenPoses(lenses=lenses, free_rigs=options.rigs == "free")
-    adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
+    given = GivenPoses(lenses=lenses, free_rigs=options.freedom.rigs == "free" and model.has_rigs)
+    adjusted = adjust_thinly(seed, tracks, options.structure, given=given, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():

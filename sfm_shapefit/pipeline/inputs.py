@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.options import LocateOptions, Source
+from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import (
     MatchDatabase,
@@ -99,7 +99,7 @@ class MatchSource:
 def open_source(
     model: PosedModel,
     inputs: Inputs,
-    options: LocateOptions | None = None,
+    options: PlacingOptions | None = None,
     opened: MatchDatabase | None = None,
 ) -> Iterator[MatchSource]:
     """Open the matches that were chosen, and close them in the end; without options memory has no limit.
@@ -118,14 +118,14 @@ def open_source(
         else:
             database = opened.among(model, inputs.left_out)
         source = MatchSource(model=model, database=database)
-        if options is not None and options.max_memory_mb:
+        if options is not None and options.memory.max_memory_mb:
             bare = replace(
                 source.workload(),
-                adjusts=options.adjusts_cameras(model.num_images),
-                adjusts_bundle=options.adjust == "full",
+                adjusts=options.placement.refines and options.freedom.adjusts_cameras(model.num_images),
+                adjusts_bundle=options.freedom.adjust == "full",
             )
-            work = replace(bare, has_points=options.uses_points(model.num_images))
-            source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
+            work = replace(bare, has_points=options.nodes.uses_points(model.num_images))
+            source = source.with_economy(choose_economy(work, bare, options.memory.max_memory_mb))
         yield source
 
 
@@ -143,21 +143,21 @@ def without_structure(model: PosedModel, inputs: Inputs) -> tuple[PosedModel, Po
     return replace(model, reconstruction=bare), read_colors(model.reconstruction)
 
 
-def read_left_out(inputs: Inputs, names: Collection[str], options: LocateOptions) -> Inputs:
+def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Inputs:
     """Return the inputs without the pairs that the user wants to be left out.
 
     Raises:
         InputError: if the list cannot be read, names an unknown image, or there is no database.
     """
-    if not options.without:
+    if not without:
         return inputs
     if inputs.database is None:
         raise InputError("pairs can be left out of the matches of a database only; give one with --database")
-    return replace(inputs, left_out=read_pair_list(Path(options.without), names))
+    return replace(inputs, left_out=read_pair_list(Path(without), names))
 
 
 def choose_inputs(
-    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source
+    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source = "auto"
 ) -> Inputs:
     """Decide where directions come from, and say how."""
     folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None

@@ -1,8 +1,8 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
+from sfm_shapefit.adjustment.options import IntrinsicsFreedom
 from sfm_shapefit.facts.intrinsics import Intrinsics
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.intrinsics import (
     Origin,
@@ -18,7 +18,7 @@ _MOST_OFF = 4.0
 
 
 def settle_intrinsics(
-    model: PosedModel, inputs: Inputs, options: LocateOptions
+    model: PosedModel, inputs: Inputs, wanted: IntrinsicsFreedom
 ) -> tuple[PosedModel, Intrinsics]:
     """Return the model to start from, and which intrinsics the adjustments may change.
 
@@ -26,12 +26,12 @@ def settle_intrinsics(
         model: as given, of which nothing changes.
         inputs: whose database, if there is one, says which intrinsics are guesses; pairs that are left out
             say nothing of focal lengths.
-        options: `intrinsics`.
+        wanted: intrinsics that may change.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    wanted, database = options.intrinsics, inputs.database
+    database = inputs.database
     guessed = {} if database is None else find_uncalibrated(database, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}

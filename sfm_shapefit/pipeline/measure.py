@@ -9,18 +9,19 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.tracks.node_tracks import build_tracks, covering_set, join_points
+from sfm_shapefit.tracks.options import NodeOptions
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
 # Beyond so many pairs standard deviations take the pairs as independent.
@@ -34,7 +35,7 @@ _ADVICE = {
 
 
 def measure_directions(
-    source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
+    source: MatchSource, options: DirectionOptions, clock: Clock, executor: Executor | None = None
 ) -> PairDirections:
     """Return the direction of every pair that the source has; an executor shares them out, if it can."""
     model = source.model
@@ -42,9 +43,8 @@ def measure_directions(
         work = PairWork(estimate=partial(estimate_directions, options=options))
         parts = measure_with_workers(source.database, model, work, executor, clock.advance)
     else:
-        threads = options.num_threads()
         batches = source.counted(source.batches(), clock.advance)
-        parts = [estimate_directions(batch, options, threads) for batch in batches]
+        parts = [estimate_directions(batch, options, clock.threads) for batch in batches]
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
@@ -71,13 +71,15 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def build_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> MeasuredGraph:
+def build_graph(
+    source: MatchSource, directions: PairDirections, nodes: NodeOptions, inlier_threshold_px: float
+) -> MeasuredGraph:
     """Return the measured graph, with 3D points as further nodes if the options want them."""
     model = source.model
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
-    if not (options.uses_points(model.num_images) and source.economy.points):
+    if not (nodes.uses_points(model.num_images) and source.economy.points):
         return MeasuredGraph(graph, covariance=covariance)
-    tracks = build_tracks(source.batches(), directions, options.inlier_threshold_px, source.num_keypoints())
+    tracks = build_tracks(source.batches(), directions, inlier_threshold_px, source.num_keypoints())
     chosen = tracks.subset(covering_set(tracks, model.num_images))
     return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 
@@ -98,7 +100,7 @@ def count_work(source: MatchSource, directions: PairDirections) -> Workload:
 
 
 def sample_errors(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource, directions: PairDirections, inlier_threshold_px: float
 ) -> FloatArray | None:
     """Return samples of the usable directions' errors, which share keypoints; None if not known."""
     if not samples_errors(source, directions):
@@ -115,7 +117,7 @@ def sample_errors(
             directions.directions[rows],
             directions.covariance[rows],
             SIGMA_PER_MEDIAN * directions.median_residual_px[rows],
-            options.inlier_threshold_px,
+            inlier_threshold_px,
         )
         kept = place[rows] >= 0
         errors[place[rows[kept]]] = found[kept]
@@ -135,13 +137,13 @@ def collect_evidence(directions: PairDirections, errors: FloatArray | None = Non
 
 
 def add_evidence(
-    measured: MeasuredGraph, source: MatchSource, directions: PairDirections, options: LocateOptions
+    measured: MeasuredGraph, source: MatchSource, directions: PairDirections, inlier_threshold_px: float
 ) -> MeasuredGraph:
     """Return the measured graph with what the matches say; a direction to a point has one match.
 
     The errors of directions to points are independent draws of their own covariance.
     """
-    evidence = collect_evidence(directions, sample_errors(source, directions, options))
+    evidence = collect_evidence(directions, sample_errors(source, directions, inlier_threshold_px))
     assert measured.covariance is not None
     own = measured.covariance[len(evidence.support) :]
     support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])

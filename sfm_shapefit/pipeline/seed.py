@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.structure import triangulate_in_place
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.heap import hand_back_memory
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
@@ -63,6 +63,10 @@ class Located(NamedTuple):
         """The images that are in the output, ascending."""
         return self.placement.cameras[self.kept]
 
+    def fixed_images(self, model: PosedModel) -> BoolArray:
+        """Return which images of the model (n,) keep their poses."""
+        return np.zeros(model.num_images, np.bool_) if self.fixed is None else self.fixed
+
 
 class Seeded(NamedTuple):
     """A seeded model."""
@@ -95,7 +99,7 @@ def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
 def build_seeded_model(
     source: MatchSource,
     located: Located,
-    options: LocateOptions,
+    options: PlacingOptions,
     clock: Clock,
     colors: PointColors | None = None,
 ) -> Seeded:
@@ -110,24 +114,24 @@ def build_seeded_model(
     with clock("structure"):
         seed = seed_of(source, located)
         tracks = read_tracks(source, located, seed, clock.advance)
-    if options.adjust != "full":
+    if options.freedom.adjust != "full":
         with clock("triangulation"):
-            triangulate_in_place(seed, tracks, options, clock.advance, clock.executor)
+            triangulate_in_place(seed, tracks, options.structure, clock.advance, clock.executor)
             del tracks
-            filter_in_place(seed, options)
+            filter_in_place(seed, options.structure)
             seeded = seed
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames, given=located.given)
+            adjusted = bundle_adjust(seed, tracks, options.structure, fixed_frames=frames, given=located.given)
             seeded = adjusted.reconstruction
             del tracks
     hand_back_memory()  # of the tracks, before their matches are read again
-    poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
+    poor = deregister_of_few_points(seeded, options.structure.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
     if source.database is not None:  # points of the model's own tracks have their colors already
-        counts = count_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
+        counts = count_observations(seeded, source.model, source.batches(), options.structure.max_reprojection_error_px)
         unsupported = images_without_support(seeded, counts, frames)
-        if options.min_trust > 0.0:
+        if options.trust.min_trust > 0.0:
             poor |= unsupported
             for frame in {seeded.image(image_id).frame_id for image_id in unsupported}:
                 seeded.deregister_frame(frame)
@@ -155,7 +159,7 @@ def _set_gauge(
     The axes of the input are those in which the rotations agree best with the input's. What fixed cameras
     hold of the gauge is held already.
     """
-    fixed = np.zeros(model.num_images, np.bool_) if located.fixed is None else located.fixed
+    fixed = located.fixed_images(model)
     unit = None if located.placement.unit is None else 1.0
     if fixed.any() and unit is not None:
         return adjusted, located.gauge

@@ -284,7 +284,7 @@ def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlace
             second_start=False,
             finish="the baseline's answer is kept as it is",
         )
-    choice = choose_method(piece, options)
+    choice = choose_method(piece, options.solver)
     second = has_second_start(piece)
     if options.objective == "shapefit":
         finish = "ShapeFit's certified optimum is kept as it is, as asked"

@@ -265,9 +265,9 @@ def _solve_part(
 
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
-        solved = solve_groups(part.graph, part.groups, options, watched)
+        solved = solve_groups(part.graph, part.groups, options.solver, watched)
     elif options.solves_shapefit:
-        solved = solve(part.graph, options, on_iteration=watched)
+        solved = solve(part.graph, options.solver, on_iteration=watched)
     else:
         solved = solve_baseline(part.graph, options.objective)
     return solved, tuple(history)

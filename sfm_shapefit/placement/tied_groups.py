@@ -26,7 +26,7 @@ def refuse_options_of_groups(options: PlacementOptions) -> None:
         raise InputError(
             "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
         )
-    refuse_admm(options)
+    refuse_admm(options.solver)
 
 
 def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:

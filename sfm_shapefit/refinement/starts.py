@@ -152,7 +152,7 @@ def refine_starts(
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
     is_baseline = solved.status is Status.NOT_SOLVED
     refines = options.refines and not is_baseline
-    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.num_threads())
+    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.solver.num_threads())
     problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
@@ -195,7 +195,7 @@ def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
 ) -> SymbolicFactor | LaplacianFactor | None:
     """Return what the refinement solves its steps with; None if its factor would be too large."""
-    graph, groups, max_bytes = measured.graph, measured.groups, options.factor_memory_mb * 1_000_000
+    graph, groups, max_bytes = measured.graph, measured.groups, options.solver.factor_bytes
     if groups is None:
         return plan_refinement(graph, max_bytes)
     try:
