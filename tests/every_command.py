@@ -25,8 +25,8 @@ COMMANDS = """
     convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q
     synth {out}/drive --shape drive --num-images 6 --num-points 300
-    inspect data_synthetic/ring8/sparse/0 --theory
-    place data_synthetic/graph40.txt {out}/linf --objective least-squares --filter 1dsfm -q
+    inspect data_synthetic/ring8/sparse/0
+    place data_synthetic/graph40.txt {out}/lud --objective lud -q
 """
 
 

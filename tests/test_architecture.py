@@ -35,7 +35,7 @@ ROOMS = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 DOORS = {
     "numba": {"base/jit.py", "base/kernel_cache.py", "base/kernel_code.py"},
-    "cvxpy": {"solver/conic.py", "baselines/linf.py"},
+    "cvxpy": {"solver/conic.py"},
     "pymetis": {"laplacian"},
     "distributed": {"pipeline/execution.py"},
     "cv2": {"synthetic", "report/thumbnails.py"},

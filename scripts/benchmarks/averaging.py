@@ -165,7 +165,7 @@ def errors_deg(rotations: "FloatArray", truth: "FloatArray") -> "FloatArray":
 
 def measure_real(folder: Path, averaging: str) -> Real:
     """Average the rotations of a real set; to be called in a process of its own."""
-    from peers.rotation_averaging import average_by_pycolmap
+    from paper.rotation_averaging import average_by_pycolmap
     from sfm_shapefit import relative_rotations
     from sfm_shapefit.rotations.average import average_relative_rotations
 

@@ -186,15 +186,15 @@ def judge(model: "PosedModel", scene: Scene) -> "tuple[PairDirections, Placement
     from sfm_shapefit.pipeline.clock import Clock
     from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
     from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-    from sfm_shapefit.pipeline.measure import add_evidence, build_graph, measure_directions
+    from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure, wants_points
     from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 
     options, clock = LocateOptions(threads=2), Clock()
     rigid = find_rigid_parts(model, options, has_priors=False)
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), options) as source:
-        directions = measure_directions(source, options, clock)
-        measured = rigid.apply(build_graph(source, directions, options))
-        measured = add_evidence(measured, source, directions, options)
+        found = measure(source, options, clock, Wanted(tracks=wants_points(source, options), errors=True))
+        directions = found.directions
+        measured = add_evidence(rigid.apply(build_graph(source.model, found)), found)
         placement = place_cameras(measured, options, clock)
         relative = ask_pairs(source, directions, options)
     return directions, doubt_cameras(placement, directions, relative, model)
@@ -316,11 +316,11 @@ def ask(model: "PosedModel", scene: Scene) -> Any:
     from sfm_shapefit.pipeline.clock import Clock
     from sfm_shapefit.pipeline.doubts import question_focal_lengths
     from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-    from sfm_shapefit.pipeline.measure import measure_directions
+    from sfm_shapefit.pipeline.measure import measure
 
     options = LocateOptions(threads=2)
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), options) as source:
-        directions = measure_directions(source, options, Clock())
+        directions = measure(source, options, Clock()).directions
         return question_focal_lengths(source, directions, options)
 
 

@@ -300,7 +300,7 @@ def _children_s() -> float:
 
 def measure_peer(mapper: str, min_matches: int, database: Path, truth: Path, threads: int) -> Outcome:
     """Run one mapper of pycolmap once, and compare its largest model with the truth; in its own process."""
-    from peers.colmap import map_database
+    from paper.colmap_peer import map_database
     from sfm_shapefit.files.colmap.quiet import quiet_stderr
 
     start = time.perf_counter()

@@ -1,8 +1,8 @@
 """Peers side by side: bare graphs per family and real scenes per set, in one run and one table.
 
 pytheia and gtsam are optional (the extra `peers`); without them their rows say so. What contenders get, and
-with which options, is said in `peers.on_graphs` and `peers.on_scenes`. A failure is a row of the table like
-any other.
+with which options, is said in `paper.peers_on_graphs` and `paper.peers_on_scenes`. A failure is a row of the
+table like any other.
 """
 
 import argparse
@@ -18,7 +18,8 @@ from harness.graphs import GraphSpec, draw
 from harness.metrics import Check, Quantity, number, verdict
 from harness.process import call, thread_environment
 from harness.record import table
-from peers import on_graphs, on_scenes
+from paper import peers_on_graphs as on_graphs
+from paper import peers_on_scenes as on_scenes
 
 CPU_LIMIT_S = 150
 QUICK = GraphSpec(family="er2", n=20, sigma=0.01)

@@ -230,7 +230,7 @@ def _locate(model: Path, **options: str) -> ours.Timed:
 
 def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
     """Locate on rotations from averaging, without and with the adjustment."""
-    from peers.colmap import average_rotations
+    from paper.colmap_peer import average_rotations
     from sfm_shapefit import evaluate
 
     model, truth = average_rotations(folder / "database.db", folder / "sparse" / "0"), folder / scene.truth

@@ -150,7 +150,7 @@ def _best_mapping(scene: "RigScene", workspace: Path) -> Outcome:
 
 def _map(scene: "RigScene", workspace: Path, min_num_matches: int, refine_sensors: bool) -> Outcome:
     """Run global mapping on a copy of the database, whatever it may do to it."""
-    from peers.colmap import map_database
+    from paper.colmap_peer import map_database
     from sfm_shapefit.files.colmap.quiet import quiet_log
 
     with quiet_log():

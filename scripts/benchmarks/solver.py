@@ -149,7 +149,7 @@ def solve_cvxpy(graph: "ViewGraph", tol: float) -> "Solution":
 
 def compare(spec: GraphSpec, repeats: int) -> Compared:
     """Measure the three contenders on one problem; to be called in a process of one thread."""
-    from peers.clarabel_direct import solve_direct
+    from paper.clarabel_direct import solve_direct
 
     problem = draw(spec)
     graph = view_graph(problem)

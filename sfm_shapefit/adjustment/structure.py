@@ -37,9 +37,8 @@ import pycolmap
 from sfm_shapefit.adjustment.filter import Advance, filter_in_place
 from sfm_shapefit.adjustment.sources import TrackSource
 from sfm_shapefit.adjustment.views import add_points, read_frames
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
 from sfm_shapefit.base.executors import answers
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.files.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.files.colmap.seed import copy_without_points
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks

@@ -77,7 +77,8 @@ class Composed(Settings):
             TypeError: if a name is no option; the message says what is.
             ValueError: if a value is refused.
         """
-        homes, values = homes_of(type(self)), {item.name: item.default for item in fields(self)}
+        homes = homes_of(type(self))
+        values: dict[str, Any] = {item.name: item.default for item in fields(self)}
         for name in values.keys() & given.keys():
             kind = type(values[name])
             if issubclass(kind, Settings) and isinstance(given[name], kind):
@@ -87,8 +88,8 @@ class Composed(Settings):
         single: dict[str, dict[str, Any]] = {}
         for name, value in given.items():
             if name not in homes:
-                is_group = f"takes {type(values[name]).__name__}(...)" if name in values else hint(name, homes)
-                raise TypeError(f"{name!r} is no option of {type(self).__name__}; {is_group}")
+                said = f"give {type(values[name]).__name__}(...)" if name in values else hint(name, homes)
+                raise TypeError(f"{name!r} is no option of {type(self).__name__}; {said}")
             single.setdefault(homes[name], {})[name] = value
         for home, some in single.items():
             values[home] = replace(values[home], **some) if isinstance(values[home], Settings) else some[home]
@@ -130,14 +131,14 @@ def groups_of(settings: type[S], defaults: S | None = None) -> Iterator[Group]:
         if isinstance(value, Settings):
             inside.append(value)
         else:
-            own.append(Option(item.name, value, *(item.metadata[key] for key in ("help", "also")), kinds[item.name]))
+            said = item.metadata
+            own.append(Option(item.name, value, said["help"], said["also"], kinds[item.name]))
     if own:
         yield Group((settings.__doc__ or settings.__name__).split("\n")[0].rstrip("."), tuple(own))
     for value in inside:
         yield from groups_of(type(value), value)
 
 
-@cache
 def homes_of(settings: type[Settings]) -> dict[str, str]:
     """Return the field that holds each single option: itself, or the group that it stands in.
 

@@ -20,25 +20,22 @@ from sfm_shapefit.cli.console import (
     shorten,
     show_progress,
 )
-from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
+from sfm_shapefit.cli.flags import (
+    Config,
+    Database,
+    GroupedCommand,
+    InputPath,
+    Json,
+    flags_of,
+    one_path,
+    read_options,
+    takes,
+)
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import InspectOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.pipeline.inspect import Inspection
-
-_INSPECTED = (
-    "directions",
-    "solver",
-    "objective",
-    "refine",
-    "points",
-    "min_inliers",
-    "min_inlier_ratio",
-    "inlier_threshold_px",
-    "threads",
-)
-"""The options of `locate` that decide what the view graph is and what becomes of it."""
 
 
 @app.command(
@@ -47,7 +44,7 @@ _INSPECTED = (
     short_help="Diagnose a model and say what locate would do; write nothing.",
     epilog="Example: sfm-shapefit inspect sparse/0",
 )
-@takes(LocateOptions, only=_INSPECTED)
+@takes(flags_of(InspectOptions, "points", "without", "adjust", "threads"), settings=InspectOptions)
 def inspect_command(
     model: Annotated[
         Path | None,
@@ -56,23 +53,20 @@ def inspect_command(
     *,
     input_path: InputPath = None,
     database: Database = None,
-    theory: Annotated[
-        bool,
-        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centers."),
-    ] = False,
     as_json: Json = False,
+    config: Config = None,
     **given: Any,
 ) -> None:
     """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
     source = one_path(model, input_path, "MODEL")
     with report_errors():
-        options = read_options(LocateOptions, given)
+        options = read_options(InspectOptions, given, config)
 
         from sfm_shapefit.pipeline.inspect import inspect as inspect_model
 
         catch_termination()
         with show_progress(not as_json) as progress:
-            found = inspect_model(source, database, options=options, theory=theory, progress=progress)
+            found = inspect_model(source, database, options=options, progress=progress)
         if as_json:
             print_json(found.summary())
         else:
@@ -111,5 +105,4 @@ def _inspection_table(found: "Inspection") -> Rows:
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
         *([("will take", found.expected.statement)] if found.expected else []),
-        *([("theory", found.theory.statement)] if found.theory else []),
     ]

@@ -15,6 +15,7 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
+    flags_of,
     one_path,
     takes,
 )
@@ -37,13 +38,30 @@ if TYPE_CHECKING:
     from sfm_shapefit.facts.result import LocateResult
 
 
+_FLAGS = (
+    *(
+        "control_points",
+        "known_distance",
+        "fix",
+        "without",
+        "rotations",
+        "intrinsics",
+        "rigs",
+        "adjust",
+        "scale",
+    ),
+    *("min_trust", "points", "threads", "max_memory_mb"),
+)
+"""Options that are flags; the others are keys of --config."""
+
+
 @app.command(
     "locate",
     cls=GroupedCommand,
     short_help="Place the cameras of a model from its rotations and matches.",
     epilog="Example: sfm-shapefit locate sparse/0 out",
 )
-@takes(LocateOptions, OutputFlags)
+@takes(flags_of(LocateOptions, *_FLAGS), flags_of(OutputFlags), settings=LocateOptions)
 def locate_command(
     model: ModelArgument = None,
     out: OutArgument = None,
@@ -63,7 +81,7 @@ def locate_command(
         from sfm_shapefit.pipeline.locate import locate
         from sfm_shapefit.pipeline.write import write_result
 
-        with open_executor(executor, run.options.num_threads()) as workers:
+        with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
             found = locate(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
@@ -128,7 +146,5 @@ def _describe_pairs(facts: dict[str, Any]) -> str:
 
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
-    filtered = facts["num_pairs_filtered"]
-    of_them = f", {filtered} left out by the filter" if filtered else ""
     others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
-    return "\n".join([f"{usable} usable ({contradicting} contradict the solution{of_them})", *others])
+    return "\n".join([f"{usable} usable ({contradicting} contradict the solution)", *others])

@@ -7,7 +7,7 @@ import typer
 
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import shorten
-from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
+from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, flags_of, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import further_piece_rows, next_steps
 from sfm_shapefit.cli.root import app
@@ -24,7 +24,11 @@ if TYPE_CHECKING:
     short_help="Place the nodes of a bare view graph, or of relative poses.",
     epilog="Example: sfm-shapefit place graph.txt out",
 )
-@takes(PlacementOptions, OutputFlags, without=("images",))  # nodes have none
+@takes(
+    flags_of(PlacementOptions, "objective", "tol", "threads"),
+    [flag for flag in flags_of(OutputFlags) if flag.name != "images"],  # nodes have none
+    settings=PlacementOptions,
+)
 def place_command(
     graph: Annotated[
         Path | None,
@@ -94,7 +98,6 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     rejected = counted(len(placement.rejected_pairs), "pair")
-    filtered = f", {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
     return Told(
         figures=[
             *figure_rows(facts),
@@ -105,7 +108,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
         details=[
             ("directions", found.statement),
             ("dimension", str(placement.graph.dimension)),
-            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution{filtered}"),
+            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution"),
             ("residuals", _describe_residuals(facts["residuals_deg"])),
             ("locations", placement.refined.statement()),
             ("certificate", found.departure.statement),

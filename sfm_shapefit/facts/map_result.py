@@ -6,11 +6,12 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 """
 
 import html
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.joins import Joined, JoinedModel
 from sfm_shapefit.facts.json_types import Averaging, LocateSummary, MapSummary
@@ -63,7 +64,7 @@ class MapResult(Displayed):
         facts: MapSummary = {
             "schema_version": SCHEMA_VERSION,
             "inputs": {"database": str(self.database)},
-            "options": asdict(self.options),
+            "options": flat_values(self.options),
             "num_images": self.num_images,
             "num_placed": self.num_placed,
             "num_video_frames": self.num_video_frames,

@@ -6,13 +6,13 @@ Pure data, and cheap to import. Each option is stated once, in the group of the 
 from dataclasses import dataclass
 from typing import Literal
 
-from sfm_shapefit.adjustment.options import FreedomOptions
 from sfm_shapefit.base.settings import Composed, Settings, explained, group, option
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.placement.options import GaugeOptions
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rotations.options import AveragingOptions
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
 
 Rotations = Literal["auto", "held", "free"] | float

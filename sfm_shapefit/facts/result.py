@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.certified import Departure, compare_with_certified
 from sfm_shapefit.facts.columns import Column, TableName, table_of
@@ -18,8 +18,7 @@ from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.facts.key_figures import figure_rows
-from sfm_shapefit.facts.notebook import notebook_html
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.summary import summarize_graph, summarize_model
 from sfm_shapefit.facts.tables import CameraRow, PairRow
@@ -34,6 +33,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import SolverResult
@@ -86,7 +86,7 @@ class LocateResult(Displayed):
     reconstruction: "pycolmap.Reconstruction"
     """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
     inputs: Inputs
-    options: LocateOptions
+    options: PlacingOptions
     model: PosedModel
     """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
     directions: PairDirections
@@ -115,6 +115,8 @@ class LocateResult(Displayed):
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+    distances: tuple[KnownDistance, ...] = ()
+    """Those that were told of its images."""
     triplet_scores: FloatArray | None = None
     """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
     matched_shares: FloatArray | None = None
@@ -164,7 +166,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -213,7 +215,9 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
+            reason = (
+                f"it sees {counted(count, 'point')}, fewer than {self.options.structure.min_points_per_image}"
+            )
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
@@ -355,7 +359,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

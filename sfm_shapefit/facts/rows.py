@@ -18,7 +18,6 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.place import count_large
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
-_FILTERED = "left out by the filter"
 _OUTSIDE = "outside the pieces that are solved"
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
@@ -47,7 +46,7 @@ def camera_rows(
     for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
         for camera in placement.pieces[k].nodes.tolist():
             homes[camera] = k
-    reasons = left_out_reasons(placement.considered, placement.pieces)
+    reasons = left_out_reasons(graph, placement.pieces)
     folders: dict[int, list[str]] = {}
     for piece in further:
         for camera in piece.cameras.tolist():
@@ -143,10 +142,7 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
     judged: dict[int, tuple[Judged, int, float]] = {}
     for piece in (placement, *further):
         dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
-        if not piece.certified.status.has_certificate:
-            dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
-    dropped = set(placement.dropped.tolist())
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
@@ -160,8 +156,7 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
             inner = placement.groups is not None and bool(
                 placement.groups.group_of[i] == placement.groups.group_of[j]
             )
-            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
-            rows.append(replace(row, reason=_INNER if inner else elsewhere))
+            rows.append(replace(row, reason=_INNER if inner else _OUTSIDE))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

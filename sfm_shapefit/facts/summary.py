@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm_shapefit import __version__
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.grade import ModelVerdict
 from sfm_shapefit.facts.json_types import (
     BundleAdjustment,
@@ -35,8 +36,8 @@ from sfm_shapefit.judgement.judged import Judged
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.facts.options import KnownDistance as ToldDistance
     from sfm_shapefit.facts.result import GraphResult, LocateResult, Loop
+    from sfm_shapefit.placement.options import KnownDistance as ToldDistance
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 _QUANTILES = (25, 50, 75, 90)
@@ -79,7 +80,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
         "scale_sigma": found.gauge.scale_sigma,
-        "known_distances": told_distances(found.options.known_distance, found.reconstruction),
+        "known_distances": told_distances(found.distances, found.reconstruction),
         "control_points": list(found.control_points),
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
@@ -150,13 +151,12 @@ def _summarize(
     return {
         "schema_version": SCHEMA_VERSION,
         "verdict": told_verdict(found.verdict),
-        "options": asdict(found.options),
+        "options": flat_values(found.options),
         "num_images": placement.graph.num_nodes,
         "num_placed": len(placement.cameras),
         "figures": key_figures(found.cameras, residuals["quantile_50"], *measures),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
-        "num_pairs_filtered": len(placement.dropped),
         "sigma_of": sigma_of(placement),
         "residual_level_deg": placement.assessment.level_deg,
         "residuals_deg": residuals,

@@ -7,10 +7,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
@@ -37,9 +37,7 @@ _FEWEST_TWOFOLD = 3
 
 def quality_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if not placement.certified.status.has_certificate:
-        yield placement.certified.status.value
-    elif placement.certified.status is not Status.CONVERGED:
+    if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
@@ -179,7 +177,7 @@ def focal_warnings(
 def graph_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
     yield from quality_warnings(placement)
-    floor = LocateOptions().min_trust
+    floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):
         yield (

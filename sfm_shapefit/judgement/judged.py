@@ -4,8 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.placement.place import Placement

@@ -54,6 +54,11 @@ class PairDirections:
     covariance: FloatArray
     """(k, 2, 2) covariance of the direction in rad^2, in the basis `tangent_bases(directions)`."""
 
+    def subset(self, rows: IntArray) -> "PairDirections":
+        """Return some rows, in the order given."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        return PairDirections(status=[self.status[row] for row in rows.tolist()], **columns)
+
     def usable(self) -> IntArray:
         """Return the rows that have a direction."""
         return np.flatnonzero(is_usable(self.status))
@@ -87,6 +92,9 @@ class PairDirections:
         if len(usable):
             weights[usable] = np.maximum(relative / np.median(relative), _MIN_WEIGHT)
         return weights
+
+
+_ARRAYS = tuple(item.name for item in fields(PairDirections) if item.name != "status")
 
 
 def first_reasons(*rules: tuple[BoolArray, DirectionStatus]) -> list[DirectionStatus]:

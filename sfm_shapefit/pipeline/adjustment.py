@@ -96,7 +96,9 @@ def adjust_placed(
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed = seed_of(source, everyone)
     tracks = read_tracks(source, everyone, seed, clock.advance)
-    adjusted = adjust_placement(seed, tracks, options.structure, weight, fixed_frames=fixed, given=located.given)
+    adjusted = adjust_placement(
+        seed, tracks, options.structure, weight, fixed_frames=fixed, given=located.given
+    )
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity

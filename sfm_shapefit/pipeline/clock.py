@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.arrays import hand_back_memory
 from sfm_shapefit.solver.options import IterationInfo, SolverOptions
 
 Progress = Callable[[str, int, int], None]

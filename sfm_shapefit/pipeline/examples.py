@@ -18,10 +18,11 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
-from sfm_shapefit.baselines import FILTERS, LOCATORS
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.evaluate import evaluate
@@ -74,8 +75,9 @@ def start_by_lud(_folder: Path) -> None:
 
 
 def judge_placement(_folder: Path) -> None:
-    """Judge the answer of a baseline, which takes no solver of ours."""
-    place(_random_graph(), objective="least-squares")
+    """Judge exact locations, which takes no solver."""
+    problem = synthetic.random_graph_problem(20, 0.6, sigma=0.02, q=0.1, seed=1)
+    assess(MeasuredGraph(problem.view_graph), problem.locations)
 
 
 def refine_in_angles(_folder: Path) -> None:
@@ -153,7 +155,7 @@ def locate_from_tracks(folder: Path) -> None:
     """Locate the cameras of a model without a database, and inspect it."""
     model = _workspace(folder, WorkspaceOptions(database=False))
     locate(model, threads=1, adjust="full")
-    inspect(model, theory=True)
+    inspect(model)
 
 
 def locate_rigs(folder: Path) -> None:
@@ -186,15 +188,6 @@ def relate_images(folder: Path) -> None:
     database = _workspace(folder, WorkspaceOptions(model="rotations")).parents[1] / "database.db"
     found = relative_rotations(database, threads=2)
     score_triplets(len(found.names), found)
-
-
-def compare_baselines(_folder: Path) -> None:
-    """Place a graph by the objectives and filters that ours are compared with."""
-    graph = _random_graph()
-    for locator in LOCATORS:
-        place(graph, objective=locator)
-    for name in FILTERS:
-        place(graph, filter=name)
 
 
 def average_graphs(_folder: Path) -> None:

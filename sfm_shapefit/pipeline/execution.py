@@ -22,8 +22,8 @@ from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from sfm_shapefit.base.errors import MissingExtraError
 from sfm_shapefit.base.executors import WorkerError, answers
-from sfm_shapefit.base.extras import MissingExtraError
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.database_pairs import PairRows
 from sfm_shapefit.files.colmap.model import PosedModel, from_posed_cameras, posed_cameras

@@ -21,7 +21,7 @@ from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.measure import build_graph, measure_directions
+from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.rigs import place_cameras
 from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
 from sfm_shapefit.placement.gauge import unit_gauge
@@ -68,17 +68,19 @@ def adjust_first_placement(
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    model, threshold_px = source.model, options.directions.inlier_threshold_px
-    directions = measure_directions(source, options.directions, clock, clock.executor)
-    measured = rule.rigid.apply(build_graph(source, directions, options.nodes, threshold_px))
-    placement = next(place_cameras(measured, options.placement, options.nodes, clock))
+    model = source.model
+    wanted = Wanted(tracks=wants_points(source, options.nodes))
+    measured = measure(source, options.directions, clock, wanted)
+    graph = rule.rigid.apply(build_graph(model, measured))
+    del measured  # arrays of all pairs
+    placement = next(place_cameras(graph, options.placement, options.nodes, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = unit_gauge(placement.locations)
     if placement.unit is not None:  # the offsets of sensors have theirs
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
     seed = seed_of(source, located)
-    del directions, measured  # arrays of all pairs
+    del graph
     tracks = partial(read_tracks, source, located, seed, clock.advance)
     given = GivenPoses(lenses=lenses, free_rigs=options.freedom.rigs == "free" and model.has_rigs)
     adjusted = adjust_thinly(seed, tracks, options.structure, given=given, thorough=thorough)

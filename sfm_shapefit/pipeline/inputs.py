@@ -157,7 +157,9 @@ def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Input
 
 
 def choose_inputs(
-    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source = "auto"
+    reconstruction: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None,
+    source: Source = "auto",
 ) -> Inputs:
     """Decide where directions come from, and say how."""
     folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None

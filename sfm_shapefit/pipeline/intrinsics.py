@@ -1,7 +1,6 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.options import IntrinsicsFreedom
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.intrinsics import (
@@ -12,6 +11,7 @@ from sfm_shapefit.files.colmap.intrinsics import (
     with_focal_lengths,
 )
 from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.scene.freedom import IntrinsicsFreedom
 
 # A view graph that wants a focal length further off says more about the graph than about the lens.
 _MOST_OFF = 4.0

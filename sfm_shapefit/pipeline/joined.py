@@ -10,7 +10,7 @@ The verdict is no better than that of any of the models.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -18,12 +18,12 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.grade import Grade, ModelVerdict
 from sfm_shapefit.facts.joins import Joined, JoinedModel
 from sfm_shapefit.facts.json_types import EarthDatum, JoinedSummary, JudgedModel
 from sfm_shapefit.facts.key_figures import UNITS, key_figures
 from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.options import KnownDistance
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
 from sfm_shapefit.facts.summary import told_distances, told_verdict
 from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION, CameraRow
@@ -34,6 +34,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.options import KnownDistance
 
 if TYPE_CHECKING:
     import pycolmap
@@ -78,11 +79,11 @@ def tell_group(
     gauge, rescale = _choose_scale(group, located.gauge, known)
     group = _rescaled(group, rescale)
     model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
-    inputs = choose_inputs(group.reconstruction, database, located.options.directions)
+    inputs = choose_inputs(group.reconstruction, database)
     inputs = replace(inputs, left_out=left_out)
     own = Clock(clock.progress)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, inputs, located.options, own)
+        found = examine_source(matches, inputs, located.options.directions, own)
     weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
     cameras = list(_camera_rows(found.cameras, group, models))
     verdict = _judge(weak, tuple(found.facts["verdict"]["reasons"]), group, models)
@@ -92,7 +93,7 @@ def tell_group(
         "schema_version": SCHEMA_VERSION,
         "examined": True,
         "inputs": {"model": IN_MEMORY, "database": str(database), "directions": inputs.statement},
-        "options": asdict(located.options) | {"known_distance": tuple(known)},
+        "options": flat_values(located.options) | {"known_distance": tuple(known)},
         "verdict": verdict,
         "models": [str(number) for number in group.world_from],
         "joins": [join.summary(f"joined_{next(iter(group.world_from))}") for join in group.joins],

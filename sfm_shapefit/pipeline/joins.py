@@ -13,7 +13,6 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose
 from sfm_shapefit.facts.joins import Joined, JoinedModel
 from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.options import KnownDistance
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.intrinsics import with_parameters
 from sfm_shapefit.files.colmap.merge import merge_models
@@ -31,6 +30,7 @@ from sfm_shapefit.placement.join import (
     join_by_priors,
     place_by_priors,
 )
+from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import MatchBatch
 
@@ -256,7 +256,7 @@ class _Evidence:
 
     def _tie(self, between: "_Between", first: int, second: int) -> Ties:
         """Return the matches between two models with centers and points in the worlds of these."""
-        options = self.models[first].located.options
+        options = self.models[first].located.options.structure
         points = []
         for k, number in enumerate((first, second)):
             structure, ids = self.models[number].located.reconstruction, between.points[:, k]

@@ -7,7 +7,8 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -15,7 +16,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.adjustment import weight_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.pipeline.gauge_choice import read_priors
+from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out, without_structure
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
@@ -50,9 +51,8 @@ def locate(
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
-        priors: a table of position priors, see `files.colmap.priors`, or the folder of the images, whose
-            EXIF data have them; the database's own pose priors
-            serve if the scale is "prior" and there is no table.
+        priors: a table of position priors, see `files.colmap.priors`, the folder of the images, whose EXIF
+            data have them, or "database" for its own pose priors.
         executor: shares out pairs and tracks among its workers, which must see the file of the database, with
             the same answer to the bit; it is not shut down. None: all is done here.
 
@@ -69,20 +69,25 @@ def locate(
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, LocateOptions, overrides)
-    clock = Clock.of(progress, executor)
+    clock = Clock.of(progress, options.placement.solver, executor)
     with clock("read"):
         model = read_model(reconstruction)
-        inputs = choose_inputs(reconstruction, database, options.directions)
-        inputs = read_left_out(inputs, model.names, options)
-        model, intrinsics = settle_intrinsics(model, inputs, options)
-        known = read_priors(model, inputs, options, priors)
-        control = read_control(model, options)
-        rigid = find_rigid_parts(model, options, has_priors=known is not None)
+        inputs = choose_inputs(reconstruction, database, options.source.directions)
+        inputs = read_left_out(inputs, model.names, options.directions.without)
+        model, intrinsics = settle_intrinsics(model, inputs, options.freedom.intrinsics)
+        refuse_unknown_names(options.gauge.known_distance, model.names, "the model has no posed image")
+        if options.freedom.rigs == "free" and not model.has_rigs:
+            raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
+        known = read_priors(model, inputs, priors)
+        control = read_control(model, options.gauge.control_points)
+        rigid = find_rigid_parts(model, options.placement, options.fix)
         model, colors = without_structure(model, inputs)
     told = Told(
         inputs,
         rigid,
-        weight_of_rotations(options),
+        weight_of_rotations(options.rotations),
+        scale=options.gauge.scale,
+        distances=options.gauge.known_distance,
         priors=known,
         control=control,
         intrinsics=intrinsics,

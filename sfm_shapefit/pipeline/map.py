@@ -9,7 +9,7 @@ Images that the averaging drops form components of their own.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
-from sfm_shapefit.facts.options import LocateOptions, MapOptions
+from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult, Loop
 from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
@@ -37,7 +37,7 @@ from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.components import ComponentAveraging, pairs_among
 from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors, refuse_unknown_names
 from sfm_shapefit.pipeline.gravity import read_gravity
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
@@ -92,7 +92,7 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = database_in(Path(database)), Clock.of(progress, executor)
+    path, clock = database_in(Path(database)), Clock.of(progress, options.placement.solver, executor)
     run = _start(path, options, clock, priors)
     with open_database(path, run.unposed, run.without) as opened:
         return _map_opened(run._replace(opened=opened))
@@ -102,7 +102,7 @@ def _map_opened(run: "_Run") -> MapResult:
     """Do what `map_database` does, once the matches are open."""
     options, path, clock = run.options, run.database, run.clock
     relative = run.measure()
-    if options.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
+    if options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
         if differ_in_rays(known, run.unposed):
             run = run._replace(unposed=known)
@@ -117,7 +117,7 @@ def _map_opened(run: "_Run") -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            told = ToldOfJoins(run.priors, options.known_distance, run.without)
+            told = ToldOfJoins(run.priors, options.gauge.known_distance, run.without)
             found = join_models(models, run.unposed, path, told, clock)
     left_out = {
         name: reasons[frame]
@@ -138,7 +138,7 @@ def _map_opened(run: "_Run") -> MapResult:
         warnings=(
             *map_warnings(run.images.rigs.incomplete, models, left_out),
             *found.warnings,
-            *lost_distances(options.known_distance, models, found.joined),
+            *lost_distances(options.gauge.known_distance, models, found.joined),
         ),
     )
     return tell_joins(result)
@@ -163,22 +163,15 @@ def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | N
         images = read_images(path)
         unposed = read_model(images.reconstruction)
         frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-        if not _has_shared_frames(frame_of_image):
-            if options.rigs == "free":
-                raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
-            if options.scale == "rig":
-                raise InputError(
-                    f"{path} has no rig of several cameras to take the scale from; use another scale"
-                )
-        inputs = choose_inputs(images.reconstruction, path, options.directions)
-        inputs = read_left_out(inputs, unposed.names, options)
-        unposed, intrinsics = settle_intrinsics(unposed, inputs, options)
-        for name in (name for one in options.known_distance for name in one[:2]):
-            if name not in unposed.names:
-                raise InputError(f"known_distance: the database has no image {name}")
-        positions = read_priors(unposed, inputs, options, priors)
-        control = read_control(unposed, options)
-        gravity = read_gravity(path, unposed, options)
+        if options.freedom.rigs == "free" and len(np.unique(frame_of_image)) == len(frame_of_image):
+            raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
+        inputs = choose_inputs(images.reconstruction, path)
+        inputs = read_left_out(inputs, unposed.names, options.directions.without)
+        unposed, intrinsics = settle_intrinsics(unposed, inputs, options.freedom.intrinsics)
+        refuse_unknown_names(options.gauge.known_distance, unposed.names, "the database has no image")
+        positions = read_priors(unposed, inputs, priors)
+        control = read_control(unposed, options.gauge.control_points)
+        gravity = read_gravity(path, unposed, options.averaging.gravity)
     return _Run(
         options=options,
         clock=clock,
@@ -223,7 +216,7 @@ class _Run(NamedTuple):
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
-            sharing = Sharing(self.options.num_threads(), self.clock.executor, self.clock.advance)
+            sharing = Sharing(self.clock.threads, self.clock.executor, self.clock.advance)
             return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, sharing)
 
     def matches(self) -> MatchDatabase:
@@ -233,7 +226,7 @@ class _Run(NamedTuple):
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
-        asked = self.options.sequence
+        asked = self.options.averaging.sequence
         nothing = Videos(np.full(self.unposed.num_images, -1), np.full(self.unposed.num_images, -1))
         videos = nothing if asked == "none" else find_videos(self.unposed.names)
         return confirm_videos(videos, relative) if asked == "auto" else videos
@@ -245,7 +238,7 @@ class _Run(NamedTuple):
         if not videos.num_videos:
             return self, relative, ()
         with self.clock("rotation averaging"):
-            loops = judge_loops(videos, relative, self.options.num_threads())
+            loops = judge_loops(videos, relative, self.clock.threads)
         names = self.unposed.names
         refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
         kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
@@ -283,14 +276,15 @@ class _Run(NamedTuple):
         """
         found: dict[int, list[float]] = {}
         for _, members, averaging in self.average_images(relative, {}):
-            options = self._options_of(members, has_priors=False)
             model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
             inputs = self.inputs_of(model)
-            rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
-            with open_source(model, inputs, options, self.opened) as source, suppress(UnsolvableError):
+            rule = GaugeRule(model, find_rigid_parts(model, self.options.placement), "unit")
+            with open_source(model, inputs, self.options, self.opened) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
-                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
+                    first = adjust_first_placement(
+                        source, rule, self.options, self.clock, free, thorough=False
+                    )
                 found = first.parameters() | found
         return with_parameters(self.unposed, found)
 
@@ -301,7 +295,7 @@ class _Run(NamedTuple):
         of_image, sensors = self.frame_of_image, self.sensor_rotations
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
         gravity = None if self.gravity is None else self.gravity.of_frames(of_image, sensors)
-        averaging = ComponentAveraging(self.options, self.clock, gravity, self.shares_of_frames())
+        averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, self.shares_of_frames())
         for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
             members = np.flatnonzero(np.isin(of_image, frames))
             places = np.searchsorted(frames, of_image[members])
@@ -360,26 +354,28 @@ class _Run(NamedTuple):
         image_ids = self.unposed.image_ids[members].tolist()
         control = None if self.control is None else self.control.of(members)
         gravity = None if self.gravity is None else self.gravity.among(members)
-        options = self._options_of(members, has_priors=priors is not None)
+        names = {self.unposed.names[k] for k in members.tolist()}
+        distances = tuple(one for one in self.options.gauge.known_distance if {*one[:2]} <= names)
         model = self._pose(image_ids, averaging.rotations)
         inputs = self.inputs_of(model)
         if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
             _, among = pairs_among(relative, members)
             inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
-        rigid = find_rigid_parts(model, options, has_priors=priors is not None)
-        with open_source(model, inputs, options, self.opened) as averaged:
+        rigid = find_rigid_parts(model, self.options.placement)
+        with open_source(model, inputs, self.options, self.opened) as averaged:
             source, first, intrinsics = averaged, None, self.intrinsics
-            if self.options.adjust != "none":
+            if self.options.freedom.adjust != "none":
                 with self.clock("first placement"):
-                    rule = GaugeRule(model, rigid, options, priors)
-                    first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
+                    rule = GaugeRule(model, rigid, "unit")
+                    first = adjust_first_placement(averaged, rule, self.options, self.clock, intrinsics.free)
                 intrinsics = intrinsics.after(first.adjusted.lenses)
                 source = averaged.turned(self._pose_as(image_ids, first))
-                rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+                rigid = find_rigid_parts(source.model, self.options.placement)
             told = Told(
                 inputs,
                 rigid,
                 RotationWeight(),
+                distances=distances,
                 priors=priors,
                 control=control,
                 gravity=gravity,
@@ -388,8 +384,7 @@ class _Run(NamedTuple):
                 near=first,
             )
             with self.clock("locate"):
-                own = Clock.of(self.clock.progress, self.clock.executor)
-                found = settle(source, told, options, own)
+                found = settle(source, told, self.options, self.clock.anew())
         ends = members[found.directions.pairs].tolist()
         unknown = (np.nan, np.nan)
         scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
@@ -402,29 +397,8 @@ class _Run(NamedTuple):
 
     def inputs_of(self, model: PosedModel) -> Inputs:
         """Return what the images of a component are located from."""
-        inputs = choose_inputs(model.reconstruction, self.database, self.options.directions)
+        inputs = choose_inputs(model.reconstruction, self.database)
         return replace(inputs, left_out=self.without)
-
-    def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
-        """Return the options of one component, whose scale is what is known of its own images."""
-        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
-        names = {self.unposed.names[k] for k in members.tolist()}
-        # Other known distances belong to other components.
-        known = tuple(one for one in self.options.known_distance if {*one[:2]} <= names)
-        if len(known) < len(self.options.known_distance):
-            settings["known_distance"] = known
-            settings["scale"] = settings["scale"] if known else "auto"
-        if not has_priors:
-            settings["refine_with_priors"] = False
-        has_rigs = _has_shared_frames(self.frame_of_image[members])
-        settings["rigs"] = settings["rigs"] if has_rigs else "held"
-        if settings["scale"] == "rig" and not has_rigs:  # that of other components
-            settings["scale"] = "auto"
-        is_told = bool(known or has_priors or has_rigs or self.options.control_points)
-        if not is_told and settings["scale"] in ("auto", "input", "prior"):
-            # There is no input whose scale could be taken.
-            settings["scale"] = "unit"
-        return LocateOptions(**settings)
 
     def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
         """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
@@ -439,11 +413,6 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
-
-
-def _has_shared_frames(frames: IntArray) -> bool:
-    """Return whether several images (n,) are of one frame, whose rig then knows a scale."""
-    return len(np.unique(frames)) < len(frames)
 
 
 def _false_pairs(model: PosedModel, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:

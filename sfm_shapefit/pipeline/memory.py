@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment.options import FreedomOptions
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database import BATCH, KEPT_MATCHES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_BESIDE_TRACKS, MOST_MATCHES
@@ -24,6 +23,7 @@ from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method
 from sfm_shapefit.solver.splitting.linear import predict_factor
@@ -99,7 +99,9 @@ class Economy:
 
     def limit(self, options: PlacementOptions) -> PlacementOptions:
         """Return how to place: as asked, or, if the factor is given up, unrefined and without one."""
-        return options if self.factor else replace(options, factor_memory_mb=NO_FACTOR, refine=False)
+        if self.factor:
+            return options
+        return replace(options, solver=replace(options.solver, factor_memory_mb=NO_FACTOR), refine=False)
 
 
 def _list_economies() -> Iterator[Economy]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
@@ -91,7 +91,7 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock.of(progress)
+    clock = Clock.of(progress, options.solver)
     cam_from_world, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -99,8 +99,9 @@ def place_graph_file(
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
         with clock("rotations"):
-            threads = options.num_threads()
-            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg, threads)
+            graph, cam_from_world, statement = _orient(
+                geometries, rotations, max_rotation_error_deg, clock.threads
+            )
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:

@@ -75,15 +75,14 @@ def relative_rotations(
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options = SolverOptions(threads=threads)
     if source not in get_args(RelativeSource):
         raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    path, clock = Path(database), Clock.of(progress)
+    path, clock = Path(database), Clock.of(progress, SolverOptions(threads=threads), executor)
     with clock("relative rotations"):
         model = read_model(read_images(path).reconstruction)
-        sharing = Sharing(options.num_threads(), executor, clock.advance)
+        sharing = Sharing(clock.threads, executor, clock.advance)
         with open_database(path, model) as matches:
             if source == "stored":
                 found = stored_relative_rotations(matches, model, min_matches)

@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import FIX_SOLVED
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.lines import text_of
@@ -25,8 +24,9 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
-from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
+from sfm_shapefit.placement.tied_groups import is_scaled
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -61,7 +61,7 @@ def find_rigid_parts(model: PosedModel, options: PlacementOptions, fix: str = ""
     """
     rigid = rigid_parts(model, _read_fixed_images(model, fix))
     if rigid.groups is not None:
-        refuse_options_of_groups(options)
+        refuse_admm(options.solver)
     return rigid
 
 

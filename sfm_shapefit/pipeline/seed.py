@@ -13,9 +13,8 @@ from sfm_shapefit.adjustment.filter import filter_in_place
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import TrackSource, collect_matches
 from sfm_shapefit.adjustment.structure import triangulate_in_place
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.database import MatchDatabase
 from sfm_shapefit.files.colmap.model import PosedModel
@@ -122,14 +121,18 @@ def build_seeded_model(
             seeded = seed
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options.structure, fixed_frames=frames, given=located.given)
+            adjusted = bundle_adjust(
+                seed, tracks, options.structure, fixed_frames=frames, given=located.given
+            )
             seeded = adjusted.reconstruction
             del tracks
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.structure.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
     if source.database is not None:  # points of the model's own tracks have their colors already
-        counts = count_observations(seeded, source.model, source.batches(), options.structure.max_reprojection_error_px)
+        counts = count_observations(
+            seeded, source.model, source.batches(), options.structure.max_reprojection_error_px
+        )
         unsupported = images_without_support(seeded, counts, frames)
         if options.trust.min_trust > 0.0:
             poor |= unsupported

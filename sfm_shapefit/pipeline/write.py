@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
+from sfm_shapefit.base.display import draw_pages_by
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.joins import JoinedModel
 from sfm_shapefit.facts.map_result import MapResult
@@ -113,6 +114,17 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_json(found.summary(), folder / MARKER)
     if options.report:
         _report(found, folder, options)
+
+
+def draw_page(found: LocateResult | GraphResult) -> str:
+    """Return the page of a result's report, as notebooks show it."""
+    from sfm_shapefit.report.page import report_html
+    from sfm_shapefit.report.read_back import draw_result
+
+    return report_html(draw_result(found), found.summary())
+
+
+draw_pages_by(draw_page)
 
 
 def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:

@@ -23,7 +23,6 @@ from sfm_shapefit.base.geometry import (
     median_spread,
     rotation_angles_deg,
 )
-from sfm_shapefit.refinement.options import Scale
 from sfm_shapefit.scene.given import Datum, PositionPriors
 
 # An input center that is farther off, of the spread of all, is lost and must not set the scale.
@@ -32,6 +31,9 @@ _CAP_OF_SIZE = 0.5
 _ROUGH = 0.1
 # A smaller spread of centers, relative to their distance from the origin, counts as none.
 _COINCIDENT = 1e-9
+ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
+"""What can set a scale, by precedence."""
+
 FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
 # A spread across a line of fewer residuals than this says nothing of the turn about the line.
@@ -51,8 +53,8 @@ class Gauge:
 
     similarity: Similarity
     """Scale and shift in the input's axes; its rotation is the identity."""
-    scale: Scale | Literal["fixed", "control points"]
-    """The choice that was carried out."""
+    scale: ScaleKind
+    """What set the scale."""
     statement: str
     """What scale, origin and axes the output has, for the report."""
     axes: FloatArray | None = None

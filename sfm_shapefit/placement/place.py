@@ -15,19 +15,18 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
+from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit
 from sfm_shapefit.refinement.agreement import Agreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
-from sfm_shapefit.refinement.options import Filter, PlacementOptions
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.solve import refuse_admm, solve_groups
 from sfm_shapefit.solver.solve import solve
 
 SMALLEST_PIECE = 3
@@ -51,15 +50,13 @@ class Placement(Displayed):
 
     measured: MeasuredGraph
     """The whole graph."""
-    dropped: IntArray
-    """Its edges that the filter left out, ascending."""
     pieces: list[RigidPiece]
-    """The parallel-rigid pieces of the others, most cameras first; or the one of tied rigid groups."""
+    """Its parallel-rigid pieces, most cameras first; or the one of tied rigid groups."""
     piece: int
     """The one that is placed: 0, the largest, or one of the further ones."""
     certified: SolverResult
-    """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
-    `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
+    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to its
+    edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     agreement: Agreement
@@ -115,11 +112,6 @@ class Placement(Displayed):
         return len(self.measured.pairs)
 
     @property
-    def considered(self) -> ViewGraph:
-        """The whole graph without the edges that the filter left out."""
-        return _drop_edges(self.graph, self.dropped)[0]
-
-    @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
         rejected = self.pairs[~self.agreement.agrees[self.pairs]]
@@ -132,7 +124,6 @@ class Placement(Displayed):
             "num_placed": len(self.nodes),
             "num_pairs": self.num_pairs,
             "num_pairs_rejected": len(self.rejected_pairs),
-            "num_pairs_filtered": len(self.dropped),
             "residual_level_deg": float(np.degrees(self.agreement.level_rad)),
             "start": self.refined.start,
             "solve": self.certified.summary(),
@@ -180,23 +171,23 @@ def place_pieces(
         UnsolvableError: if a graph of many cameras has no three that are rigid, if the pairs do not tie its
             rigid groups to one another, or see `solve`.
     """
-    split = _split(measured, options)
-    yield _place_piece(split, 0, options, near, on_iteration)
-    for k in range(1, count_large(split.pieces, measured.num_cameras)):
+    pieces = _split(measured, options)
+    yield _place_piece(measured, pieces, 0, options, near, on_iteration)
+    for k in range(1, count_large(pieces, measured.num_cameras)):
         with suppress(UnsolvableError):
-            yield _place_piece(split, k, options, near)
+            yield _place_piece(measured, pieces, k, options, near)
 
 
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
 def _place_piece(
-    split: "_Split",
+    measured: MeasuredGraph,
+    pieces: list[RigidPiece],
     k: int,
     options: PlacementOptions,
     near: Near | None = None,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
     """Solve piece k, refine it robustly, and see which directions agree."""
-    measured, dropped, pieces = split
     part, _ = measured.part(pieces[k].edges)
     solved, history = _solve_part(part, options, on_iteration)
     nodes = pieces[k].nodes
@@ -208,7 +199,6 @@ def _place_piece(
     unit = None if part.groups is None else measure_unit(part, refined.locations)
     return Placement(
         measured=measured,
-        dropped=dropped,
         pieces=pieces,
         piece=k,
         certified=solved,
@@ -231,32 +221,20 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
     return Placement(**moved)
 
 
-class _Split(NamedTuple):
-    """A measured graph and its pieces."""
-
-    measured: MeasuredGraph
-    dropped: IntArray
-    """Edges that the filter left out."""
-    pieces: list[RigidPiece]
-
-
-def _split(measured: MeasuredGraph, options: PlacementOptions) -> _Split:
-    """Return the edges that the filter leaves out, and the pieces of the others, most cameras first."""
+def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiece]:
+    """Return the pieces, most cameras first; or the one of tied rigid groups."""
     if measured.groups is not None:
-        refuse_options_of_groups(options)
-        return _Split(measured, np.zeros(0, dtype=np.int64), [find_tied_piece(measured)])
-    dropped = _filter_pairs(measured, options.filter)
-    considered, edge_of = _drop_edges(measured.graph, dropped)
-    pieces = order_pieces(considered, measured.num_cameras)
-    refuse_without_triangle(considered, pieces, measured.num_cameras)
-    pieces = [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
-    return _Split(measured, dropped, pieces)
+        refuse_admm(options.solver)
+        return [find_tied_piece(measured)]
+    pieces = order_pieces(measured.graph, measured.num_cameras)
+    refuse_without_triangle(measured.graph, pieces, measured.num_cameras)
+    return pieces
 
 
 def _solve_part(
     part: MeasuredGraph, options: PlacementOptions, on_iteration: OnIteration | None
 ) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
-    """Return the optimum of the convex program, or a baseline's answer, and the iterations that led to it."""
+    """Return the optimum of the convex program, and the iterations that led to it."""
     history: list[IterationInfo] = []
 
     def watch(info: IterationInfo) -> bool | None:
@@ -266,30 +244,9 @@ def _solve_part(
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
         solved = solve_groups(part.graph, part.groups, options.solver, watched)
-    elif options.solves_shapefit:
-        solved = solve(part.graph, options.solver, on_iteration=watched)
     else:
-        solved = solve_baseline(part.graph, options.objective)
+        solved = solve(part.graph, options.solver, on_iteration=watched)
     return solved, tuple(history)
-
-
-def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:
-    """Return the edges that a filter leaves out; it looks at pairs of cameras only."""
-    pairs = measured.pairs
-    if name == "none":
-        return pairs[:0]
-    dropped: IntArray = pairs[~FILTERS[name](measured.pair_graph)]
-    if len(dropped) == len(pairs):
-        raise UnsolvableError(
-            f"the filter {name} leaves none of the {len(pairs)} pairs; use another, or none"
-        )
-    return dropped
-
-
-def _drop_edges(graph: ViewGraph, dropped: IntArray) -> tuple[ViewGraph, IntArray]:
-    """Return a graph of the same nodes without some of its edges, and the index of each edge that is left."""
-    kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    return graph.subset(kept) if len(dropped) else graph, kept
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

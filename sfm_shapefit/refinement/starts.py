@@ -29,7 +29,7 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
-from sfm_shapefit.solver.options import SolverResult, Status
+from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
@@ -81,7 +81,7 @@ class RefinedPlacement:
     locations: FloatArray
     """(n, d) centered, scaled like the solver's."""
     start: str
-    """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
+    """The program they come from: "ShapeFit" or "LUD"."""
     is_refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -146,17 +146,15 @@ def refine_starts(
     Args:
         measured: connected and parallel rigid, or rigid groups that are tied to one another, in which case
             every pair joins two of them.
-        solved: its certified ShapeFit solution, or a baseline's answer, which is kept as it is.
+        solved: its certified ShapeFit solution.
         options: which starts, and whether to refine.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    is_baseline = solved.status is Status.NOT_SOLVED
-    refines = options.refines and not is_baseline
-    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.solver.num_threads())
-    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if refines else None)
+    lud, second = _find_second_start(measured, options.solver.num_threads())
+    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    candidates = [(solved.method if is_baseline else "ShapeFit", solved.locations)]
+    candidates = [("ShapeFit", solved.locations)]
     if second is not None:
         candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
@@ -168,10 +166,8 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = starts[0], "the baseline's own answer, as asked"
-    if not is_baseline:
-        kept, reason = _choose(starts, costs, apart, options)
-    if problem.normal_solver is None and refines:
+    kept, reason = _choose(starts, costs, apart, options)
+    if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _measure_moves(kept)
     # To the bit: the certificate is that of these very locations.

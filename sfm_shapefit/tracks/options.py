@@ -1,4 +1,4 @@
-"""Which 3D points join the view graph, and what they must satisfy in the output. Pure data, cheap to import."""
+"""Which 3D points join the view graph, and what those of the output must satisfy. Pure data, cheap."""
 
 from dataclasses import dataclass
 from typing import Literal

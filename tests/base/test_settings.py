@@ -72,7 +72,7 @@ REFUSED = [
         for settings in OUT_OF_RANGE
         for name, value in OUT_OF_RANGE[settings]
     ),
-    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (PlacementOptions, {"objective": "l2"}, "shapefit"),
     (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
     (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
     (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
@@ -81,7 +81,6 @@ REFUSED = [
     (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-    (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"rotations": "free", "adjust": "none"}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": 0.1, "adjust": "none"}, "matters only to an adjustment"),
     (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),

@@ -116,7 +116,7 @@ def test_the_models_own_tracks_serve_as_well():
 
 
 def test_an_optimum_that_was_asked_for_is_delivered_as_it_is():
-    for option in ({"objective": "shapefit"}, {"refine": False}, {"objective": "least-squares"}):
+    for option in ({"objective": "shapefit"}, {"refine": False}):
         assert sfm_shapefit.locate(RING / "sparse" / "0", **option).adjustment is None
 
 

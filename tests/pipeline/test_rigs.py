@@ -170,8 +170,7 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
     model = workspace / "sparse" / "0"
     for source, option, sentence in (
         (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
-        (model, {"objective": "linf"}, "go with the objectives auto, shapefit and lud"),
-        (model, {"filter": "1dsfm"}, "go with the objectives auto, shapefit and lud"),
+        (model, {"solver": "admm"}, "no solver admm"),
         (RING / "sparse" / "0", {"scale": "rig"}, "no rig of several cameras"),
     ):
         with pytest.raises(InputError, match=sentence):

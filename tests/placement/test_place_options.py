@@ -64,12 +64,10 @@ OPTIONS = {
         "lud",
         lambda found, _: found.refined.start == "LUD" and "as asked" in found.refined.reason,
     ),
-    "filter": ("triangles", lambda found, _: len(found.dropped) > 0),
     "refine": (False, lambda found, usual: usual.refined.is_refined and not found.refined.is_refined),
 }
 REFUSED_BY_GROUPS = {
     "solver": "no solver admm",
-    "filter": "without a filter",
     "factor_memory_mb": "factor over .* groups takes",
 }
 
@@ -96,9 +94,7 @@ def test_every_option_is_obeyed_or_refused_in_one_sentence(usual, name):
     assert holds(place(measured, options), placement)
 
 
-def test_baselines_are_refused_with_groups_and_the_conic_solver_knows_them():
-    with pytest.raises(InputError, match="rigs and fixed cameras go with the objectives"):
-        place(measure("rigs"), PlacementOptions(objective="linf"))
+def test_the_conic_solver_knows_groups():
     assert place(measure("rigs"), PlacementOptions(solver="conic")).certified.method == "conic"
 
 

@@ -11,7 +11,8 @@ import sfm_shapefit
 from benchmarks import INDEX, endtoend
 from harness import driver
 from harness.driver import RESULTS
-from peers import on_graphs, on_scenes
+from paper import peers_on_graphs as on_graphs
+from paper import peers_on_scenes as on_scenes
 from tests.program import run
 from tests.scenes import RING, ROOT, fingerprint
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import figure
-from figures import noise_robustness, phase_transition, theory_plot, trials
-from figures.methods import METHODS
-from figures.trials import Cell, run_batch, run_trials
+from paper import noise_robustness, phase_transition, theory_plot, trials
+from paper.methods import METHODS
+from paper.trials import Cell, run_batch, run_trials
 
 CELLS = [Cell(12, 0.0), Cell(12, 0.2, 0.05)]
 

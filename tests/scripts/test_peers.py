@@ -11,9 +11,11 @@ import sfm_shapefit
 from benchmarks import solver
 from benchmarks.real import SCENES, Errors
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from peers import colmap, on_graphs, on_scenes
-from peers.clarabel_direct import solve_direct
-from peers.on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
+from paper import colmap_peer as colmap
+from paper import peers_on_graphs as on_graphs
+from paper import peers_on_scenes as on_scenes
+from paper.clarabel_direct import solve_direct
+from paper.peers_on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
 from sfm_shapefit import certify
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene

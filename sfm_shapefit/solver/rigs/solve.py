@@ -79,9 +79,7 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
-    factor = ReducedFactor(
-        graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes
-    )
+    factor = ReducedFactor(graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes)
 
     def newton(graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None) -> tuple[Any, ...]:
         return solve_newton_reduced(graph, factor, tol, limit, watch)

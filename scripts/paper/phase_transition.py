@@ -15,9 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from figures.trials import Cell, Results, problems, run_trials
 from harness import ours
 from harness.graphs import view_graph
+from paper.trials import Cell, Results, problems, run_trials
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.synthetic.graphs import Corruption
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit import baselines
+from paper import baselines
+from paper.baselines import onedsfm_scores
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.baselines.onedsfm import onedsfm_scores
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.solver.program import differences
@@ -41,11 +41,9 @@ def test_least_squares_minimises_the_sum_of_squared_distances_across():
 
 
 def test_the_sparse_eigenvector_is_the_dense_one(monkeypatch):
-    from sfm_shapefit.baselines import least_squares
-
     graph = box_graph_problem(60, 12, sigma=0.02, seed=3).view_graph
     dense = baselines.locate_least_squares(graph)
-    monkeypatch.setattr(least_squares, "_DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr(baselines, "_DENSE_UNKNOWNS", 0)
     assert shape_error(baselines.locate_least_squares(graph), dense) < 1e-6
 
 

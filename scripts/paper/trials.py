@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from figures.methods import METHODS
 from harness.driver import Kept
 from harness.graphs import relative_error, to_unit_norm, view_graph
 from harness.process import thread_environment
+from paper.methods import METHODS
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.graph.viewgraph import ViewGraph

@@ -10,7 +10,6 @@ Source: Hand, Lee, Voroninski (2015), theorems of sections 2.1 and 3.1.
 """
 
 import argparse
-import os
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,11 +17,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from figures.methods import METHODS
 from harness.graphs import relative_error, view_graph
+from paper.methods import METHODS
+from paper.theory import recovery_conditions
 from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.synthetic.graphs import GraphProblem, random_graph_problem
-from sfm_shapefit.theory import recovery_conditions
 
 EXACT = 1e-9
 SIZES, P_OF_SIZES = (20, 30, 40, 60, 80, 120, 160, 240), 0.5
@@ -48,11 +47,10 @@ class Point(NamedTuple):
 
 def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
     """Compute the constants of some graphs, and solve their problems at growing corruption."""
-    threads = os.cpu_count() or 1
     granted, outcomes = [], []
     for trial in range(trials):
         clean = random_graph_problem(n, p, seed=trial)
-        found = recovery_conditions(clean.locations, clean.edges, threads=threads)
+        found = recovery_conditions(clean.locations, clean.edges)
         granted.append((found.granted, found.granted_in_space, found.feasible))
         for k, q in enumerate(np.linspace(0.0, 0.5, num_shares)[1:]):
             problem = random_graph_problem(n, p, q=float(q), seed=1000 * (k + 1) + trial)

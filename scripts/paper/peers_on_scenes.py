@@ -2,7 +2,7 @@
 
 pytheia and gtsam get the directions that `locate` measures, all of its rigid piece, with the same rotations
 and before any bundle adjustment. pycolmap's global positioning gets the same rotations and intrinsics and the
-tracks of the same matches, in the three settings of `peers.colmap`; its global mapping gets the database,
+tracks of the same matches, in three settings; its global mapping gets the database,
 averages rotations itself and ends with bundle adjustment, in two settings. Ours stands twice: from the same
 directions alone, all cameras kept, and as `locate` does it by default, with points as nodes and without the
 cameras it does not trust. Every contender runs in its own fresh process, on one thread, once; errors are
@@ -19,8 +19,8 @@ from benchmarks.real import Errors, Scene
 from harness import ours
 from harness.metrics import Check
 from harness.process import peak_memory_mb, reset_peak
-from peers.on_graphs import CONTENDERS as GRAPH_CONTENDERS
-from peers.on_graphs import Answer, ask
+from paper.peers_on_graphs import CONTENDERS as GRAPH_CONTENDERS
+from paper.peers_on_graphs import Answer, ask
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.arrays import FloatArray
@@ -46,7 +46,7 @@ class Directions(NamedTuple):
 
 def contenders() -> tuple[str, ...]:
     """Return the names of all contenders, ours first."""
-    from peers.colmap import SETTINGS
+    from paper.colmap_peer import SETTINGS
 
     positioning = (f"{POSITIONING}, {setting.label}" for setting in SETTINGS)
     mapping = (f"{MAPPING}, min_num_matches {count}" for count in _MAPPING_MATCHES)
@@ -93,7 +93,7 @@ def _locate(name: str, folder: Path, scene: Scene) -> Answer:
     """Run what starts from the database; to be called once per process."""
     if name in (SAME_DIRECTIONS, BY_DEFAULT):
         return _ours(name, folder, scene)
-    from peers.colmap import SETTINGS, map_database, position
+    from paper.colmap_peer import SETTINGS, map_database, position
     from sfm_shapefit.files.colmap.quiet import quiet_log
 
     database = folder / "database.db"

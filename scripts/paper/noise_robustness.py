@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from figures.trials import Cell, run_trials
+from paper.trials import Cell, run_trials
 
 SHOWN = ("ShapeFit", "refined", "LUD", "oracle")
 NUM_LOCATIONS, CORRUPTED = 50, 0.2

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.arrays import hand_back_memory
 
 
 def resident_bytes():

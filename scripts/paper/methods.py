@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from harness import ours
+from paper.baselines import locate_least_squares, locate_lud
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.baselines import locate_least_squares, locate_lud
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic.graphs import GraphProblem
