@@ -73,7 +73,7 @@ EDITS = {
 COUNTS = {
     "locate COURTYARD/sparse/0 OUT": Counts(5, 1, 1, 3, 6),
     "locate COURTYARD/sparse/0 OUT --adjust full": Counts(5, 1, 1, 3, 9),
-    "locate RING/sparse/0 OUT --directions tracks": Counts(2, 1, 1, 0, 5),
+    "locate RING/sparse/0 OUT --config TRACKS": Counts(2, 1, 1, 0, 5),
     "locate RIGS/sparse/0 OUT": Counts(5, 1, 2, 3, 6),
     "locate HINGED/sparse/0 OUT --points never": Counts(6, 2, 2, 3, 7),
     "map PHOTOGRAPHED/database.db OUT": Counts(9, 2, 1, 8, 6),

@@ -209,7 +209,8 @@ class GroupedCommand(TyperCommand):
     def _refuse_unknown(self, ctx: Any, args: Sequence[str], known: set[str]) -> None:
         """Refuse flags that are keys of --config now, or are no more; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
-        keys = {} if settings is None else homes_of(settings)
+        groups = () if settings is None else groups_of(settings)
+        keys = {name: item.name for one in groups for item in one.options for name in (item.also, item.name)}
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]
             name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
@@ -218,7 +219,7 @@ class GroupedCommand(TyperCommand):
             if name in _GONE:
                 ctx.fail(f"{flag} is gone: {_GONE[name]}")
             if name in keys:
-                ctx.fail(f"{flag} is a key of --config now: {name} = ...")
+                ctx.fail(f"{flag} is a key of --config now: {keys[name]} = ...")
 
 
 def _first_words(text: str) -> str:

@@ -30,7 +30,9 @@ def judge(structure):
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs, options) as source:
         batches = source.batches()
-        return count_observations(structure, model, batches, options.max_reprojection_error_px).shares()
+        return count_observations(
+            structure, model, batches, options.structure.max_reprojection_error_px
+        ).shares()
 
 
 def test_observations_of_right_cameras_agree(found):

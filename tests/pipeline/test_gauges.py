@@ -97,12 +97,11 @@ def test_priors_fit_best_as_they_are(ring, adjusted, tmp_path, pulled):
     noise = 0.01 * np.random.default_rng(1).standard_normal(model.centers.shape)
     positions = 2.0 * (model.centers + noise) @ turn.T + [100.0, 200.0, 300.0]
     rows = [
-        f"{name} {x!r} {y!r} {z!r} 0.02"
+        f"{name} {x!r} {y!r} {z!r}{' 0.02' * pulled}"
         for name, (x, y, z) in zip(model.names, positions.tolist(), strict=True)
     ]
     (tmp_path / "priors.txt").write_text("\n".join(rows))
-    table = {"priors": tmp_path / "priors.txt", "refine_with_priors": pulled}
-    found, centers, rotations = located(ring, **table, **adjusted)
+    found, centers, rotations = located(ring, priors=tmp_path / "priors.txt", **adjusted)
     assert found.gauge.scale == "prior"
     assert ("the priors moved cameras by" in found.gauge.statement) == pulled
     if pulled:

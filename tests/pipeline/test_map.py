@@ -93,7 +93,6 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
     found = sfm_shapefit.map_database(
         changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}"),
         priors=table,
-        refine_with_priors=True,
         **FAST,
     )
     scales = {}
@@ -233,9 +232,12 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--rotations", "held"], "map finds the rotations itself"),
-        (["--rotations", "0.1"], "map finds the rotations itself"),
-        (["--rotations", "exact"], "rotations must be one of auto, held, free or of type float, got 'exact'"),
+        (["--rotations", "held"], "No such option: --rotations"),
+        (["--fix", "solved"], "No such option: --fix"),
+        (["--sequence", "none"], "--sequence is a key of --config now: sequence = ..."),
+        (["--no-refine"], "--no-refine is a key of --config now: refine = ..."),
+        (["--refine-with-priors"], "--refine-with-priors is gone: priors that have standard deviations pull"),
+        (["--rigs", "free", "--adjust", "none"], "rigs=free needs an adjustment"),
         (["--min-points-per-image", "-1"], "min_points_per_image must be"),
     ],
 )

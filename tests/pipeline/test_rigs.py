@@ -20,6 +20,7 @@ from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import (
     SceneOptions,
     WorkspaceOptions,
@@ -29,6 +30,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.tracks.options import NodeOptions
 from tests.program import run
 from tests.scenes import RING, copied, edit_database
 
@@ -168,13 +170,8 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
 
 def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
     model = workspace / "sparse" / "0"
-    for source, option, sentence in (
-        (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
-        (model, {"solver": "admm"}, "no solver admm"),
-        (RING / "sparse" / "0", {"scale": "rig"}, "no rig of several cameras"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            sfm_shapefit.locate(source, **option)
+    with pytest.raises(InputError, match="no solver admm"):
+        sfm_shapefit.locate(model, solver="admm")
 
     seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
     assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
@@ -244,7 +241,7 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
     monkeypatch.setattr(rigs_stage, "place_pieces", place_pieces)
     monkeypatch.setattr(rigs_stage, "judge", lambda placement, _: placement)
     measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
-    assert list(rigs_stage.place_cameras(measured, LocateOptions(), Clock())) == [loose]
+    assert list(rigs_stage.place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())) == [loose]
 
 
 def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
@@ -439,11 +436,9 @@ def test_a_component_without_rigs_has_a_scale_of_its_own_beside_one_with_rigs(wo
         f"DELETE FROM frame_data WHERE frame_id IN ({of_second})",
         *(f"DELETE FROM {table} WHERE rig_id = 2" for table in ("frames", "rig_sensors", "rigs")),
     )
-    found = sfm_shapefit.map_database(database, scale="rig", points="never")
+    found = sfm_shapefit.map_database(database, points="never")
     scales = [model.located.gauge.scale for model in found.models]
     assert sorted(scales) == ["rig", "unit"]
-    with pytest.raises(InputError, match="no rig of several cameras to take the scale from"):
-        sfm_shapefit.map_database(RING / "database.db", scale="rig")
 
 
 def test_rigs_that_cannot_be_refined_are_refused(tmp_path):

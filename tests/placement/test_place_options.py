@@ -1,12 +1,11 @@
 """Every option of a placement with plain graphs, rigs, fixed cameras and priors: obeyed or refused."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.settings import homes_of
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -79,7 +78,7 @@ def usual(request) -> tuple[str, MeasuredGraph, Placement]:
 
 
 def test_the_table_has_every_option():
-    assert set(OPTIONS) == {field.name for field in fields(PlacementOptions)}
+    assert set(OPTIONS) == set(homes_of(PlacementOptions))
 
 
 @pytest.mark.parametrize("name", OPTIONS)
