@@ -158,6 +158,8 @@ def workspaces(tmp_path_factory):
     folder = tmp_path_factory.mktemp("work")
     made = {"COURTYARD": COURTYARD, "RING": RING, "PHOTOGRAPHED": BUNDLED / "photographed"}
     made["GRAPH"] = BUNDLED / "graph40.txt"
+    made["TRACKS"] = folder / "tracks.toml"
+    made["TRACKS"].write_text('directions = "tracks"')
     for name, statement in EDITS.items():
         (folder / name).mkdir()
         made[name.upper()] = copied(RING, folder / name)
@@ -174,6 +176,7 @@ def measured(line, workspaces, out, times=1):
     meter = Meter(workspaces[source] / "database.db")
     words = [str(out) if word == "OUT" else word for word in line.split()]
     words = [word.replace(source, str(workspaces[source]), 1) for word in words]
+    words = [str(workspaces.get(word, word)) for word in words]
     with meter.at_work():
         for _ in range(times):
             run(*words, code=0)

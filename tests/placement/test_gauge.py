@@ -26,7 +26,7 @@ from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angl
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
-from tests.scenes import RING
+from tests.scenes import BUNDLED, RING
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -266,9 +266,8 @@ def test_priors_of_other_images_and_those_that_there_are_not_are_refused(ring, t
         table_priors(path, ring)
     of_database = ("--priors", "database")
     assert "no position prior" in run_refused("locate", RING_MODEL, tmp_path / "out", *of_database)
-    assert "give one with --database" in run_refused(
-        "locate", BUNDLED / "facade9" / "sparse" / "0", tmp_path / "out", *of_database
-    )
+    tracks = BUNDLED / "facade9" / "sparse" / "0"
+    assert "give one with --database" in run_refused("locate", tracks, tmp_path / "out", *of_database)
 
 
 NEW = (
