@@ -145,7 +145,7 @@ def say_unused(what: str, chosen: Gauge, find: Callable[[], Gauge]) -> str:
 
 def off_by(scale: float) -> str:
     """Say by how much scales differ whose ratio this is."""
-    return f"they differ by {100.0 * abs(scale - 1.0):.2g} %"
+    return f"they differ by {100.0 * abs(scale - 1.0):.3g} %"
 
 
 def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) -> FloatArray:

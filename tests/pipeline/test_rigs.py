@@ -178,6 +178,25 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
 
 
+def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, rigs, tmp_path):
+    model = read_model(workspace / "truth")
+    apart = float(np.linalg.norm(model.centers[0] - model.centers[20]))
+    rows = zip(model.names, (3.0 * model.centers).tolist(), strict=True)
+    (tmp_path / "priors.txt").write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
+    known = (model.names[0], model.names[20], 2.0 * apart)
+    told = {"known_distance": known, "priors": tmp_path / "priors.txt", "scale": "unit"}
+    found = sfm_shapefit.locate(workspace / "sparse" / "0", points="never", **told)
+    assert found.gauge.scale == "rig"
+    unused = [warning for warning in found.warnings if "not used" in warning]
+    assert [warning.rpartition(" ")[0].partition("; ")[0] for warning in unused][:2] == [
+        f"{what} were not used for the scale, which is that of the rigs"
+        for what in ("known distances", "position priors")
+    ]
+    off = [float(warning.split(" by ")[1].split()[0]) for warning in unused[:2]]
+    np.testing.assert_allclose(off, [100.0, 200.0], atol=1.0)
+    assert unused[2] == "the scale unit was not used, but that of the rigs"
+
+
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
     write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
