@@ -3,11 +3,17 @@
 import hashlib
 import shutil
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.scene.matches import View
 
 ROOT = Path(__file__).parents[1]
 BUNDLED = ROOT / "data_synthetic"
@@ -33,6 +39,19 @@ def edit_database(path: Path, *statements: str | Callable[[sqlite3.Connection], 
         for statement in statements:
             statement(connection) if callable(statement) else connection.execute(statement)
     return path
+
+
+def read_from(path: Path, read: Callable[..., Any], *given: Any) -> Any:
+    """Return what a function reads of a database, which is open for that long."""
+    with closing(DatabaseFile(path)) as file:
+        return read(file, *given)
+
+
+@contextmanager
+def view_of(path: Path, model: PosedModel, **how: Any) -> Iterator[View[PosedModel]]:
+    """Open a database for the matches of a model's images."""
+    with closing(open_database(path, model.names)) as matches:
+        yield matches.at(model, **how)
 
 
 def fingerprint(folder: Path) -> dict[str, str]:

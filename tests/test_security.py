@@ -6,17 +6,18 @@ import signal
 import sqlite3
 import stat
 import tomllib
+from contextlib import closing
 
 import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap import sqlite_file
 from sfm_shapefit.files.colmap.check import check_model_files
-from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.graph_text import read_graph
 from tests.program import run, run_python
-from tests.scenes import RING, ROOT, copied, edit_database
+from tests.scenes import RING, ROOT, copied, edit_database, view_of
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
 FORBIDDEN_IMPORTS = {
@@ -88,8 +89,8 @@ main()
 
 
 def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
-    with open_database(RING / "database.db", read_model(RING / "sparse" / "0")) as database:
-        connection = database._connection
+    with closing(DatabaseFile(RING / "database.db")) as file:
+        connection = file.connection
         assert connection.execute("PRAGMA trusted_schema").fetchone() == (0,)
         assert connection.execute("PRAGMA query_only").fetchone() == (1,)
         for limit, value in sqlite_file._LIMITS.items():
@@ -116,7 +117,7 @@ def test_a_table_whose_rows_are_computed_is_refused(tmp_path, kind):
     edit_database(scene / "database.db", rename, COMPUTED[kind].format("images"))
     with (
         pytest.raises(InputError, match="is not a COLMAP database: its images"),
-        open_database(scene / "database.db", read_model(scene / "sparse" / "0")),
+        view_of(scene / "database.db", read_model(scene / "sparse" / "0")),
     ):
         pytest.fail("it must not be opened")
 
@@ -129,7 +130,7 @@ def test_private_copies_of_a_database_are_private(tmp_path, monkeypatch):
     writer.commit()
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr(sqlite_file.tempfile, "tempdir", str(tmp_path / "tmp"))
-    with open_database(scene / "database.db", read_model(scene / "sparse" / "0")):
+    with closing(DatabaseFile(scene / "database.db")):
         (folder,) = (tmp_path / "tmp").iterdir()
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert list((tmp_path / "tmp").iterdir()) == []
@@ -150,7 +151,7 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, 
         check_model_files(model)
     with (
         pytest.raises(InputError, match="it is a pipe or a device"),
-        open_database(scene / "database.db", sound),
+        view_of(scene / "database.db", sound),
     ):
         pytest.fail("it must not be opened")
 

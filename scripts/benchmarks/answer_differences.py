@@ -14,9 +14,12 @@ import numpy as np
 
 from harness.record import leave_out
 
-NOT_COMPARED = {"options", "timings_s", "seconds", "versions", "schema_version", "expected"}
-"""Keys of JSON objects that tell of the run, not of its answer, wherever they stand. Names of stages are keys
-of `timings_s` and `expected`."""
+NOT_COMPARED = {
+    *("options", "timings_s", "seconds", "versions", "schema_version", "expected"),
+    *("num_pairs_filtered", "theory"),
+}
+"""Keys of JSON objects, wherever they stand, that tell of the run and not of its answer (names of stages are
+keys of `timings_s` and `expected`), or of features that left."""
 ROUNDOFF = 1e-9
 _LIMITS = {"positions": 1e-6, "rotations": 1e-6, "figures": 1e-5}
 _PARTS = ("exit", "verdict", "said", "printed", "files", "models", "tables", "json", "texts", "pages")

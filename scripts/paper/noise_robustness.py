@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> Figure:
         errors = results.mean_errors(method)
         slope = fit_slope(sigmas, errors)
         axis.loglog(sigmas, errors, marker=".", label=f"{method}, slope {slope:.3f}")
-        lost = int(np.sum(results.of(method)[0, :, 0] > NOT_RECOVERABLE))
+        lost = int(np.sum(results.of(method)[0] > NOT_RECOVERABLE))
         print(
             f"{method}: slope {slope:.4f} for sigma <= {LARGEST_FITTED:g}; {lost} problems lost without noise"
         )

@@ -11,23 +11,21 @@ pytheia and gtsam are optional (`pip install pytheia gtsam`, the extra `peers`);
 so.
 """
 
-import contextlib
 import math
-import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from harness import ours
-from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, numbers, ratio
-from harness.process import call, peak_memory_mb, reset_peak, thread_environment
+import numpy as np
 
-if TYPE_CHECKING:
-    from sfm_shapefit.base.arrays import FloatArray
-    from sfm_shapefit.graph.viewgraph import ViewGraph
+import sfm_shapefit
+from harness.graphs import GraphSpec, draw, relative_error
+from harness.process import call, peak_memory_mb, reset_peak, thread_environment, time_call
+from harness.record import Check, ratio, text_of
+from sfm_shapefit import ViewGraph
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.files.colmap.quiet import quiet_stderr
 
 WALL_PER_CPU = 30
 """Wall-clock limit over the limit of CPU time: ends what waits instead of computing."""
@@ -53,7 +51,7 @@ WARM_UP = {
 }
 
 
-Solver = Callable[[], tuple["FloatArray", str]]
+Solver = Callable[[], tuple[FloatArray, str]]
 """Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
 
 
@@ -82,14 +80,6 @@ class Answer(NamedTuple):
         return self.cpu_s if math.isfinite(self.cpu_s) else self.seconds
 
 
-class Compared(NamedTuple):
-    """A problem and all answers."""
-
-    name: str
-    num_edges: int
-    answers: tuple[Answer, ...]
-
-
 def ask(name: str, package: str | None, run: Callable[[], Answer], cpu_limit_s: int) -> Answer:
     """Return what a contender answers in a fresh process of one thread, or why there is none."""
     if package is not None and find_spec(package) is None:
@@ -102,19 +92,18 @@ def ask(name: str, package: str | None, run: Callable[[], Answer], cpu_limit_s: 
     return found
 
 
-def _solve_shapefit(graph: "ViewGraph") -> tuple["FloatArray", str]:
-    found = ours.solve(graph, tol=_SHAPEFIT_TOL)
+def _solve_shapefit(graph: ViewGraph) -> tuple[FloatArray, str]:
+    found = sfm_shapefit.solve(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
     return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
 
 
-def _place(graph: "ViewGraph") -> tuple["FloatArray", str]:
-    found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
+def _place(graph: ViewGraph) -> tuple[FloatArray, str]:
+    found = sfm_shapefit.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
     points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
     return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
 
 
-def _by_pytheia(nonlinear: bool, graph: "ViewGraph") -> Solver:
-    import numpy as np
+def _by_pytheia(nonlinear: bool, graph: ViewGraph) -> Solver:
     from pytheia import sfm
 
     pairs = {}
@@ -127,8 +116,8 @@ def _by_pytheia(nonlinear: bool, graph: "ViewGraph") -> Solver:
         pairs[min(i, j), max(i, j)] = info
     orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
 
-    def run_it() -> tuple["FloatArray", str]:
-        with _silence():
+    def run_it() -> tuple[FloatArray, str]:
+        with quiet_stderr():
             if nonlinear:
                 options = sfm.NonlinearPositionEstimatorOptions()
                 estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
@@ -141,7 +130,7 @@ def _by_pytheia(nonlinear: bool, graph: "ViewGraph") -> Solver:
     return run_it
 
 
-def _by_gtsam(robust: bool, bilinear: bool, graph: "ViewGraph") -> Solver:
+def _by_gtsam(robust: bool, bilinear: bool, graph: ViewGraph) -> Solver:
     import gtsam
 
     noise = gtsam.noiseModel.Isotropic.Sigma(2, _GTSAM_SIGMA)
@@ -153,8 +142,8 @@ def _by_gtsam(robust: bool, bilinear: bool, graph: "ViewGraph") -> Solver:
     ]
     recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), bilinear)
 
-    def run_it() -> tuple["FloatArray", str]:
-        with _silence():
+    def run_it() -> tuple[FloatArray, str]:
+        with quiet_stderr():
             values = recovery.run(measurements, 1.0)
         points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
         return _gather(points, graph.num_nodes), ""
@@ -166,7 +155,7 @@ class Contender(NamedTuple):
     """A solver of bare graphs and the package it needs; None: ours."""
 
     name: str
-    prepare: Callable[["ViewGraph"], Solver]
+    prepare: Callable[[ViewGraph], Solver]
     package: str | None = None
     runs: int = 1
     """The answer is the one of median error; 3 where a random start may fail."""
@@ -194,25 +183,23 @@ def measure(name: str, spec: GraphSpec) -> Answer:
     if contender.package is None:
         # Compiled code is loaded.
         for warm_up in dict.fromkeys((spec.family if spec.family in WARM_UP else "geo", "er2", "small")):
-            contender.prepare(view_graph(draw(WARM_UP[warm_up])))()
+            contender.prepare(draw(WARM_UP[warm_up]).view_graph)()
     problem = draw(spec)
     runs = []
     reset_peak()
     for _ in range(contender.runs):
-        (locations, note), wall_s, cpu_s = ours.time_call(contender.prepare(view_graph(problem)))
+        (locations, note), wall_s, cpu_s = time_call(contender.prepare(problem.view_graph))
         runs.append((relative_error(locations, problem.locations), wall_s, cpu_s, peak_memory_mb(), note))
     runs.sort()
     found = Answer(name, *runs[len(runs) // 2])
     if len(runs) == 1:
         return found
-    note = f"median of {len(runs)} random starts, errors {numbers([run[0] for run in runs])}"
+    note = f"median of {len(runs)} random starts, errors {text_of([run[0] for run in runs])}"
     return found._replace(peak_mb=max(run[3] for run in runs), note=note)
 
 
-def _gather(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
+def _gather(points: dict[int, FloatArray], n: int) -> FloatArray:
     """Return the points as an array; RuntimeError if cameras are missing or not finite."""
-    import numpy as np
-
     missing = n - len(points)
     if missing:
         raise RuntimeError(f"{missing} of {n} cameras have no position")
@@ -222,39 +209,19 @@ def _gather(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
     return locations
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Send what C++ libraries write to stdout and stderr nowhere."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    saved = [os.dup(1), os.dup(2)]
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        for descriptor, target in zip(saved, (1, 2), strict=True):
-            os.dup2(descriptor, target)
-            os.close(descriptor)
-        os.close(nowhere)
-
-
-def checks(one: Compared) -> list[Check]:
+def checks(answers: Sequence[Answer]) -> list[Check]:
     """Return the checks of one problem: the lowest error of all, and the time of the equally accurate.
 
     A peer without an answer has no check; where no peer is as accurate as ours, there is none of the time.
     """
-    answered = [answer for answer in one.answers if math.isfinite(answer.error)]
+    answered = [answer for answer in answers if math.isfinite(answer.error)]
     peers = [answer for answer in answered if not answer.ours]
     if not peers:
         return []
     best = min((a for a in answered if a.ours), key=lambda answer: answer.error, default=Answer("ours"))
     error = best.error
-    found = [Check(name="error", value=error, limit=min(peer.error for peer in peers))]
+    found = [Check("error", error, min(peer.error for peer in peers))]
     as_good = [peer.spent_s for peer in peers if peer.error <= error]
     if as_good:
-        found.append(
-            Check(name="times faster", value=ratio(min(as_good), best.spent_s), limit=FASTER, better="higher")
-        )
+        found.append(Check("times faster", ratio(min(as_good), best.spent_s), FASTER, "higher"))
     return found

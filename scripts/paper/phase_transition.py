@@ -15,16 +15,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from harness import ours
-from harness.graphs import view_graph
-from paper.trials import Cell, Results, problems, run_trials
-from sfm_shapefit.graph.rigidity import is_parallel_rigid
+from paper.trials import Cell, Results, run_trials
 from sfm_shapefit.synthetic.graphs import Corruption
 
 SEED = 0
 EXACT = 1e-9
-AGREE = 1e-6
-"""Of the mean errors of a cell by two solvers."""
 NOISE = 0.05
 
 
@@ -58,18 +53,13 @@ NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
 FINE, COARSE = (tuple(range(10, 81, 2)), _shares(21)), (tuple(range(10, 81, 5)), _shares(11))
 
 
-def _paper(method: str = "ShapeFit") -> list[Panel]:
-    return [Panel(f"{method}, {words}", method, *FINE, sigma=s) for s, words in NOISES]
-
-
 def _coarse(title: str, method: str, **settings: Any) -> Panel:
     return Panel(title, method, *COARSE, **settings)
 
 
 METHODS_SHOWN = ("ShapeFit", "refined", "LUD", "least squares")
 FIGURES: dict[str, list[Panel]] = {
-    "paper": _paper(),
-    "reference": _paper() + _paper("ShapeFit, conic"),
+    "paper": [Panel(f"ShapeFit, {words}", "ShapeFit", *FINE, sigma=s) for s, words in NOISES],
     "methods": [_coarse(f"{m}, {words}", m, sigma=s) for s, words in NOISES for m in METHODS_SHOWN],
     "corruption": [
         _coarse(f"{m}, {kind}", m, corruption=kind)
@@ -114,37 +104,17 @@ def draw(shown: Sequence[Panel], results: Results) -> Figure:
 
 
 def report(shown: Sequence[Panel], results: Results) -> str:
-    """Say what the paper's text says of its figure, and which camera fails where a large problem does."""
+    """Say what the paper's text says of its figure."""
     lines = [f"{len(results.cells)} cells"]
     for panel in shown:
-        values = results.of(panel.method)[[results.cells.index(cell) for cell in panel.cells()]]
-        exact = values[..., 0] < EXACT
+        errors = results.of(panel.method)[[results.cells.index(cell) for cell in panel.cells()]]
+        exact = errors < EXACT
         lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
-        if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
-            lines += _failures(panel.cells(), values)
-    lines += _noisy_where_exact(shown, results)
-    if len(results.methods) == 2:
-        lines.append(_apart(results))
-    return "\n".join(lines)
-
-
-def _apart(results: Results) -> str:
-    """Say how far two methods are apart, and whether they may be: where the optimum is not unique."""
-    apart = np.abs(np.subtract(*(results.mean_errors(m) for m in results.methods)))
-    trials = results.values.shape[2]
-    far = [k for k in np.flatnonzero(apart > AGREE) if not _are_unique(results.cells[k], trials)]
-    said = f"largest difference of a cell between {' and '.join(results.methods)}: {apart.max():.1e}"
-    if far:
-        near = np.delete(apart, far).max(initial=0.0)
-        said += f"; {near:.1e} without {len(far)} cells where an optimum is not certified to be unique"
-    return said
-
-
-def _are_unique(cell: Cell, trials: int) -> bool:
-    """Return whether each problem of a cell has an optimum certified to be unique, or none at all."""
-    graphs = [view_graph(problem) for problem in problems(cell, trials, SEED)]
-    rigid = [g for g in graphs if is_parallel_rigid(g.num_nodes, g.edges, g.dimension)]
-    return all(ours.solve(graph, tol=1e-12, uniqueness=True).unique for graph in rigid)
+        largest = [cell.n == max(panel.n) and cell.q <= 0.3 for cell in panel.cells()]
+        if panel.sigma == 0.0 and any(largest):
+            lost = ~exact[largest]
+            lines.append(f"  n = {max(panel.n)}, q <= 0.3: {lost.sum()} of {lost.size} not recovered")
+    return "\n".join([*lines, *_noisy_where_exact(shown, results)])
 
 
 def _noisy_where_exact(shown: Sequence[Panel], results: Results) -> list[str]:
@@ -157,25 +127,6 @@ def _noisy_where_exact(shown: Sequence[Panel], results: Results) -> list[str]:
         errors = image(noisy, results)[image(clean, results) < EXACT]
         largest = errors.max(initial=0.0)
         lines.append(f"{noisy.title}: at most {largest:.2g} in the {errors.size} cells exact without")
-    return lines
-
-
-def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
-    """Describe the cells the paper speaks of: n = 50 at q = 0.25, and the largest n up to q = 0.3."""
-    lines = []
-    largest = max(cell.n for cell in cells)
-    for cell, trials in zip(cells, values, strict=True):
-        if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
-            mean = np.minimum(trials[:, 0], 1.0).mean()
-            lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
-            lines += [
-                "    a problem that is not parallel rigid"
-                if camera < 0
-                else f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong;"
-                f" {others:.2g} without it"
-                for error, camera, share, others in trials.tolist()
-                if error >= EXACT
-            ]
     return lines
 
 

@@ -17,9 +17,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from harness.graphs import relative_error, view_graph
-from paper.methods import METHODS
+from harness.graphs import relative_error
 from paper.theory import recovery_conditions
+from paper.trials import METHODS
 from sfm_shapefit.base.errors import ShapeFitError
 from sfm_shapefit.synthetic.graphs import GraphProblem, random_graph_problem
 
@@ -69,7 +69,7 @@ def worst_share(problem: GraphProblem) -> float:
 def is_recovered(problem: GraphProblem) -> bool:
     """Return whether ShapeFit is exact; a problem that is not rigid is lost."""
     try:
-        locations = METHODS["ShapeFit"](view_graph(problem), problem)
+        locations = METHODS["ShapeFit"](problem)
     except ShapeFitError:
         return False
     return relative_error(locations, problem.locations) < EXACT

@@ -11,23 +11,60 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from harness.driver import Kept
-from harness.graphs import relative_error, to_unit_norm, view_graph
+from harness.graphs import relative_error
 from harness.process import thread_environment
-from paper.methods import METHODS
+from paper.baselines import locate_least_squares, locate_lud
+from sfm_shapefit import ShapeFitError, UnsolvableError, place, solve
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.errors import ShapeFitError
-from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic.graphs import Corruption, GraphProblem, random_graph_problem
 
 NOT_RECOVERED = 1.0
 """The error of a problem that has no unique answer, as in the paper's black cells."""
-# A process takes so many cells at a time.
+# Cells that a process takes at a time.
 _BATCH = 8
+# Exact recovery means an error below 1e-9.
+_TOL = 1e-12
+
+
+def _refine(problem: GraphProblem) -> FloatArray:
+    """ShapeFit and LUD, both refined in angles, the better kept: what `locate` does."""
+    placement = place(problem.view_graph, tol=_TOL, uniqueness=False)
+    if len(placement.cameras) < len(problem.locations):
+        raise UnsolvableError("the graph is not parallel rigid")
+    return placement.locations
+
+
+def _oracle(problem: GraphProblem) -> FloatArray:
+    """Least squares of the pairs that are not corrupted: no method can be told more.
+
+    Reweighted, they are of sines, which is best for small noise; under large noise that collapses, for a sine
+    is small near 180 degrees too, and the first answer is kept: whichever fits the directions better.
+    """
+    clean, cameras = problem.view_graph.restricted_to(np.flatnonzero(~problem.corrupted))
+    if len(cameras) < len(problem.locations):
+        return np.full_like(problem.locations, np.nan)
+    answers = [locate_least_squares(clean, reweightings=count) for count in (0, 10)]
+
+    def misfit(locations: FloatArray) -> float:
+        return float(np.sum((normalized(differences(locations, clean.edges)) - clean.directions) ** 2))
+
+    return min(answers, key=misfit)
+
+
+METHODS: dict[str, Callable[[GraphProblem], FloatArray]] = {
+    "ShapeFit": lambda one: solve(one.view_graph, tol=_TOL, uniqueness=False).locations,
+    "refined": _refine,
+    "LUD": lambda one: locate_lud(one.view_graph),
+    "least squares": lambda one: locate_least_squares(one.view_graph),
+    "oracle": _oracle,
+}
+"""What the figures compare: each takes the graph of a problem, the oracle more, and returns locations."""
 
 
 @dataclass(frozen=True, order=True)
@@ -42,35 +79,22 @@ class Cell:
     corruption: Corruption = "uniform"
 
 
-class Trial(NamedTuple):
-    """What is recorded of one problem and one method."""
-
-    error: float
-    """The paper's relative error."""
-    worst_camera: int
-    """The camera that is farthest off; -1 where there is no answer."""
-    wrong_share: float
-    """Share of its pairs that are corrupted."""
-    error_of_others: float
-    """The relative error without it."""
-
-
 @dataclass(frozen=True, eq=False)
 class Results:
-    """Trials of cells by methods."""
+    """The relative errors of trials, by cells and methods."""
 
     cells: tuple[Cell, ...]
     methods: tuple[str, ...]
     values: FloatArray
-    """(cells, methods, trials, fields of `Trial`)."""
+    """(cells, methods, trials)."""
 
     def of(self, method: str) -> FloatArray:
-        """Return the trials of a method, (cells, trials, fields of `Trial`)."""
+        """Return the errors of a method, (cells, trials)."""
         return self.values[:, self.methods.index(method)]
 
     def mean_errors(self, method: str) -> FloatArray:
         """Return each cell's mean error, (cells,); an error counts as 1 at most, as in the paper's figure."""
-        return np.asarray(np.minimum(self.of(method)[..., 0], 1.0).mean(axis=1))
+        return np.asarray(np.minimum(self.of(method), 1.0).mean(axis=1))
 
 
 def run_trials(
@@ -104,9 +128,9 @@ def run_trials(
 
 
 def run_batch(cells: Sequence[Cell], methods: Sequence[str], trials: int, seed: int) -> FloatArray:
-    """Return the values of all trials of some cells; what a worker process does."""
+    """Return the errors of all trials of some cells; what a worker process does."""
     values = [
-        [[trial(problem, METHODS[name]) for name in methods] for problem in problems(cell, trials, seed)]
+        [[error_of(problem, name) for name in methods] for problem in problems(cell, trials, seed)]
         for cell in cells
     ]
     return np.swapaxes(values, 1, 2)
@@ -121,20 +145,10 @@ def problems(cell: Cell, trials: int, seed: int) -> Iterator[GraphProblem]:
         )
 
 
-def trial(problem: GraphProblem, method: Callable[[ViewGraph, GraphProblem], FloatArray]) -> Trial:
-    """Solve one problem and compare with its truth."""
-    graph = view_graph(problem)
+def error_of(problem: GraphProblem, method: str) -> float:
+    """Solve one problem and return the paper's relative error."""
     try:
-        found = method(graph, problem)
+        return relative_error(METHODS[method](problem), problem.locations)
     except ShapeFitError:
         # Not rigid, or disconnected: the directions do not determine the locations.
-        return Trial(NOT_RECOVERED, -1, np.nan, NOT_RECOVERED)
-    off = np.linalg.norm(to_unit_norm(found) - to_unit_norm(problem.locations), axis=1)
-    worst = int(np.argmax(off))
-    touching = (problem.edges == worst).any(axis=1)
-    return Trial(
-        relative_error(found, problem.locations),
-        worst,
-        float(problem.corrupted[touching].mean()),
-        relative_error(np.delete(found, worst, axis=0), np.delete(problem.locations, worst, axis=0)),
-    )
+        return NOT_RECOVERED

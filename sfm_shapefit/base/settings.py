@@ -47,6 +47,8 @@ class Settings:
             value, kind = getattr(self, item.name), kinds[item.name]
             if value is not item.default and not _fits(value, kind):  # most are the defaults
                 raise ValueError(f"{item.name} must be {_wanted(kind)}, got {value!r}")
+            if float in (kind, *get_args(kind)) and isinstance(value, numbers.Integral):
+                object.__setattr__(self, item.name, float(value))  # kernels are compiled by types
 
     def check_range(self, name: str, low: float, high: float = float("inf")) -> None:
         """Refuse a field whose value lies outside [low, high].

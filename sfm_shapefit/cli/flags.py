@@ -109,10 +109,6 @@ _GONE = {
 """What to say of options that are no more, by their names."""
 
 
-_PLACE = (
-    *("rotations", "max_rotation_error", "reverse", "objective", "tol", "g2o", "onedsfm", "threads"),
-    *("overwrite", "report", "json", "strict", "quiet", "verbose"),
-)
 _FIRST_SCREEN = {
     "locate": (
         *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
@@ -122,8 +118,6 @@ _FIRST_SCREEN = {
         *("priors", "control_points", "known_distance", "gravity", "without", "min_model_size", "join"),
         *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
-    "place": _PLACE,
-    "solve": _PLACE,
     "synth": (
         *("shape", "num_images", "num_points", "rig", "images", "pixel_noise_px", "wrong_match_fraction"),
         *("corrupted_pair_fraction", "rotation_noise_deg", "repeated_fraction", "model", "database", "seed"),

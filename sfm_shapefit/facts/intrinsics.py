@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import UNREFINED, RefinedLenses
+from sfm_shapefit.adjustment.estimate import UNREFINED, RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.json_types import CameraIntrinsics

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
@@ -24,7 +24,6 @@ from sfm_shapefit.facts.summary import summarize_graph, summarize_model
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
-from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.judged import Judged
@@ -36,6 +35,7 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
 
 if TYPE_CHECKING:
@@ -99,9 +99,9 @@ class LocateResult(Displayed):
     points."""
     gauge: Gauge
     """From the solver's units to the output's."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
-    adjustment: AdjustedPlacement | None
+    adjustment: Estimate | None
     """What became of the placement and of the given rotations, before any bundle adjustment; None if the
     placement stayed as it was found."""
     timings_s: dict[str, float]

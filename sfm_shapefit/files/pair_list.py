@@ -9,9 +9,8 @@ from pathlib import Path
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import lines_of_cells
+from sfm_shapefit.scene.matches import PairNames
 
-PairNames = frozenset[tuple[str, str]]
-"""Pairs of images by their names, the smaller name first."""
 _HEADER = ["name1", "name2"]
 
 

@@ -31,11 +31,11 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.files.colmap.database import MatchDatabase
+from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
-from sfm_shapefit.scene.matches import RayMatches
+from sfm_shapefit.scene.matches import RayMatches, View
 
 RelativeSource = Literal["matches", "stored"]
 
@@ -99,9 +99,7 @@ def estimate_relative_rotations(
     return concatenate(parts)
 
 
-def stored_relative_rotations(
-    database: MatchDatabase, model: PosedModel, min_matches: int = 1
-) -> RelativeRotations:
+def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> RelativeRotations:
     """Return the relative rotations that a database stores; pairs without one are left out.
 
     Nothing says how well they are known. So their information is taken as isotropic, n / (20 px)^2, with
@@ -109,15 +107,14 @@ def stored_relative_rotations(
     middle axis; W is 1.
 
     Args:
-        database: of the model's images.
-        model: whose focal lengths count.
+        view: of images whose focal lengths count.
         min_matches: pairs with fewer inlier matches are left out.
 
     Raises:
         InputError: naming the pair whose pose is damaged.
     """
-    poses = database.relative_poses()
-    noise = _STORED_NOISE_PX / model.focal_lengths_px[poses.pairs].min(axis=1)
+    poses = relative_poses(view)
+    noise = _STORED_NOISE_PX / view.images.focal_lengths_px[poses.pairs].min(axis=1)
     stored = RelativeRotations(
         pairs=poses.pairs,
         rotations=poses.rotations,

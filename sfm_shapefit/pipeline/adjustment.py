@@ -5,19 +5,18 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import PlacingOptions, Rotations
-from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
+from sfm_shapefit.files.colmap.model import PosedModel, turned_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
@@ -27,13 +26,12 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import rigid_parts
-from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
+from sfm_shapefit.pipeline.seed import Located, PosedPart, pose_images, posed_part, read_links
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.matches import MatchBatch
 
 _SAID_OF_MATCHES = (
     "num_inliers",
@@ -60,8 +58,8 @@ def pull_cameras(
         UnsolvableError: if the factor would take more memory than the options allow.
     """
     pulled = pull_to_priors(located.placement, located.gauge, priors, options)
-    frame_ids = model.frame_ids[pulled.placement.nodes[pulled.anchors.indices]]
-    given = located.given._replace(centers=pulled.anchors._replace(indices=frame_ids))
+    frames = model.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
+    given = located.given._replace(centers=pulled.anchors._replace(indices=frames))
     return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 
@@ -74,8 +72,10 @@ class AfterAdjustment(NamedTuple):
     """Measured anew at these, as far as they are usable there too."""
     placement: Placement
     """Moved to the adjusted centers, with those directions."""
-    adjusted: AdjustedPlacement
+    adjusted: Estimate
     """How it went."""
+    part: PosedPart
+    """The images that were adjusted, as they were before."""
 
 
 def adjust_placed(
@@ -92,39 +92,39 @@ def adjust_placed(
         UnsolvableError: if no point can be triangulated.
     """
     model, placement = source.model, located.placement
-    fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    seed = seed_of(source, everyone)
-    tracks = read_tracks(source, everyone, seed, clock.advance)
+    posed = posed_part(pose_images(model, everyone))
+    links = read_links(source, everyone, posed, clock.advance)
     adjusted = adjust_placement(
-        seed, tracks, options.structure, weight, fixed_frames=fixed, given=located.given
+        posed.images, links, options.structure, weight, located.given_of(posed, model)
     )
-    images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
-    centers = np.array([image.projection_center() for image in images])
-    similarity = located.gauge.similarity
-    locations = (centers - similarity.translation) / similarity.scale
+    del links
+    similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
+    centers[posed.rows] = adjusted.images.centers
+    locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
-        corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
-        anew = np.isin(model.frame_ids, corrected)
-        directions = _measure_again(source, directions, anew, options.directions, clock)
+        source = source.at(turned_model(model, adjusted.images))
+        corrected = posed.frames[adjusted.weight.singled_out(len(posed.frames))]
+        is_corrected = np.isin(model.images.frame_of, corrected)
+        directions = _measure_again(source, directions, is_corrected, options.directions, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
             measured = rigid_parts(source.model, located.fixed_images(model)).apply(measured)
         placement = replace(placement, measured=measured)
-    return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted)
+    return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted, posed)
 
 
-def with_uncertainty(placement: Judged, model: PosedModel, uncertainty: Uncertainty, scale: float) -> Judged:
+def with_uncertainty(placement: Judged, model: PosedModel, known: Estimate, scale: float) -> Judged:
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
-    covariances = uncertainty.covariances
-    if not covariances:
+    if known.covariances is None:
         return placement
-    unknown = np.full((3, 3), np.nan)
-    ids = model.image_ids[placement.cameras].tolist()
-    own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
-    return replace(placement, adjusted_covariances=own, scale_sigma=uncertainty.scale_sigma)
+    own = np.full((len(placement.cameras), 3, 3), np.nan)
+    _, rows, there = np.intersect1d(
+        model.image_ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
+    )
+    own[rows] = known.covariances[there] / scale**2
+    return replace(placement, adjusted_covariances=own, scale_sigma=known.scale_sigma)
 
 
 def _measure_again(
@@ -140,7 +140,7 @@ def _measure_again(
     """
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
-    batches = _without_pairs(source.counted(source.batches(), clock.advance), others)
+    batches = source.view.batches(without=others, advance=clock.advance)
     again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
@@ -149,27 +149,6 @@ def _measure_again(
     for name, chosen in taken.items():
         merged[name][usable[chosen]] = getattr(again, name)[chosen]
     return replace(before, **merged)
-
-
-def _without_pairs(batches: Iterator[MatchBatch], pairs: IntArray) -> Iterator[MatchBatch]:
-    """Yield the batches without some pairs (k, 2); those that have no others are left out."""
-    unwanted = {(min(i, j), max(i, j)) for i, j in pairs.tolist()}
-    for batch in batches:
-        dropped: BoolArray = np.array(
-            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
-        )
-        if dropped.all():
-            continue
-        counts = np.diff(batch.offsets)
-        kept = np.repeat(~dropped, counts)
-        yield MatchBatch(
-            pairs=batch.pairs[~dropped],
-            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
-            keypoints=batch.keypoints[kept],
-            rays_i=batch.rays_i[kept],
-            rays_j=batch.rays_j[kept],
-            pixel_angles=batch.pixel_angles[~dropped],
-        )
 
 
 def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:

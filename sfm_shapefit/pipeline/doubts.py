@@ -66,7 +66,8 @@ def ask_pairs(
         return concatenate([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    for batch in source.batches(among):
+    without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
+    for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         likely = None
@@ -141,7 +142,7 @@ def question_focal_lengths(
     model = source.model
     images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
     ids, labels = np.unique([image.camera_id for image in images], return_inverse=True)
-    if source.database is None or not 1 < len(ids) <= _MOST_CAMERAS:
+    if not source.has_database or not 1 < len(ids) <= _MOST_CAMERAS:
         return ()
     kinds = [model.camera(k).model_name for k in range(model.num_images)]
     lenses = Lenses(
@@ -152,7 +153,7 @@ def question_focal_lengths(
     chosen = _pairs_of_cameras(directions, lenses.camera_of)
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
-    for batch in source.batches():
+    for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         parts.append(_thin(model, batch, rows, _FOCAL_MATCHES[1]))
     found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, threads)

@@ -85,7 +85,7 @@ def examine(
         model = read_model(folder)
         inputs = choose_inputs(folder, database)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, inputs, DirectionOptions(), clock)
+        found = examine_source(matches, DirectionOptions(), clock)
     poses = poses_of(model, [row.name for row in found.cameras])
     # The input is what is shown; there is nothing to be compared with it.
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
@@ -98,12 +98,11 @@ def examine(
     return replace(drawing, further=further, points=points), found.facts
 
 
-def examine_source(matches: MatchSource, inputs: Inputs, options: DirectionOptions, clock: Clock) -> Examined:
+def examine_source(matches: MatchSource, options: DirectionOptions, clock: Clock) -> Examined:
     """Return what can be said of a model whose matches are open.
 
     Args:
         matches: of the model, which is not changed.
-        inputs: where they come from.
         options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
@@ -119,7 +118,7 @@ def examine_source(matches: MatchSource, inputs: Inputs, options: DirectionOptio
     cameras = _camera_rows(model, quality, pairs)
     focal_length_px = float(np.median(model.focal_lengths_px))
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
-    facts = _facts(inputs, cameras, pairs, level_deg) | {
+    facts = _facts(matches.inputs, cameras, pairs, level_deg) | {
         "figures": key_figures(cameras, error_deg, focal_length_px, "of the model's units"),
         "sigma_of": "",
         "mean_reprojection_error_px": _mean(quality.point_errors_px),

@@ -25,6 +25,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.pairs.triplets import score_triplets
+from sfm_shapefit.pipeline.adjust import read_bundle
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.pipeline.inspect import inspect
 from sfm_shapefit.pipeline.locate import locate
@@ -219,8 +220,9 @@ def draw_images(folder: Path) -> None:
 
 def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
-    model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
-    adjust_thinly(model, lambda: model)
+    model = read_model(_workspace(folder, WorkspaceOptions(database=False)))
+    images, _, tracks = read_bundle(model.reconstruction)
+    adjust_thinly(images, lambda: tracks)
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     estimate_covariances(adjusted.problem)
     estimate_center_errors(adjusted.problem, AdjustmentOptions())

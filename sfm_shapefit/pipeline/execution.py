@@ -1,9 +1,9 @@
 """Pairs measured by other processes or machines, through any `concurrent.futures` executor.
 
 What is measured of pairs, directions or relative rotations, is a function of a batch of their matches. The
-pairs of a database are cut into parts of some hundred thousand matches. A task names the database file and
-the function, and carries the cameras, without which matches are no rays: names, rotations, intrinsics. Its
-worker opens the file read-only for itself, reads its part, and sends back what it measured. Every pair is
+pairs of a database are cut into parts of some hundred thousand matches. A task has the function and a part,
+which names the file and carries the cameras, without which matches are no rays. Its worker opens the file
+read-only for itself, reads its part, and sends back what it measured. Every pair is
 estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
 of one process, to the bit, whichever worker did what, and however often.
 
@@ -11,7 +11,6 @@ A worker that dies is the executor's business: a pool of processes breaks, which
 task to another one.
 """
 
-import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -19,16 +18,11 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from sfm_shapefit.base.errors import MissingExtraError
 from sfm_shapefit.base.executors import WorkerError, answers
-from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
-from sfm_shapefit.files.colmap.database_pairs import PairRows
-from sfm_shapefit.files.colmap.model import PosedModel, from_posed_cameras, posed_cameras
-from sfm_shapefit.scene.matches import MatchBatch
-from sfm_shapefit.scene.posed_model import PosedModelFile
+from sfm_shapefit.scene.matches import Advance, MatchBatch, MatchPart, View
 
 Measured = TypeVar("Measured")
 
@@ -51,23 +45,14 @@ class PairWork(Generic[Measured]):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PairTask(Generic[Measured]):
-    """Some pairs of a database, and all that is needed to measure them elsewhere."""
+    """Some pairs, and what to measure of them elsewhere."""
 
-    database: Path
-    """Its absolute path, the same for all workers."""
-    rows: PairRows
-    """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
-    cameras: PosedModelFile
-    """Of the whole model: the indices of pairs refer to them."""
+    part: MatchPart
     work: PairWork[Measured]
 
 
 def measure_with_workers(
-    database: MatchDatabase,
-    model: PosedModel,
-    work: PairWork[Measured],
-    executor: Executor,
-    advance: Callable[[int, int], None],
+    view: View[Any], work: PairWork[Measured], executor: Executor, advance: Advance
 ) -> list[Measured]:
     """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
 
@@ -77,23 +62,20 @@ def measure_with_workers(
         WorkerError: if a worker died and the executor does not replace it.
         InputError: as a worker found the database.
     """
-    cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
-    parts = database.parts(work.matches_per_task)
-    tasks = (PairTask(database=path, rows=database.rows(part), cameras=cameras, work=work) for part in parts)
+    tasks = (PairTask(part=part, work=work) for part in view.parts(work.matches_per_task))
     found: list[Measured] = []
-    for (_, stop), (_, measured) in zip(parts, answers(executor, measure_task, tasks), strict=True):
+    done = 0
+    for task, measured in answers(executor, measure_task, tasks):
         found += measured
-        advance(stop, database.num_pairs)
+        done += task.part.num_pairs
+        advance(done, view.num_pairs)
     return found
 
 
 def measure_task(task: PairTask[Measured]) -> list[Measured]:
     """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
-    model = from_posed_cameras(task.cameras)
-    with open_database(task.database, model, rows=task.rows) as database:
-        everything = (0, database.num_pairs)  # whose rays are not kept: each batch is needed once
-        batches = database.iter_matches(task.work.min_matches, part=everything)
-        return [task.work.estimate(batch) for batch in batches]
+    with task.part.open() as view:
+        return [task.work.estimate(batch) for batch in view.batches(task.work.min_matches)]
 
 
 @contextmanager

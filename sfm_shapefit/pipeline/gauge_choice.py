@@ -10,9 +10,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
@@ -43,7 +43,9 @@ PRIORS_OF_DATABASE = "database"
 """In place of a table or folder: the database's own pose priors."""
 
 
-def read_priors(model: PosedModel, inputs: Inputs, asked: Path | str | None) -> PositionPriors | None:
+def read_priors(
+    model: PosedModel, file: DatabaseFile | None, asked: Path | str | None
+) -> PositionPriors | None:
     """Return the position priors of the model's images, if they are asked for.
 
     Raises:
@@ -52,9 +54,9 @@ def read_priors(model: PosedModel, inputs: Inputs, asked: Path | str | None) -> 
     if asked is None:
         return None
     if str(asked) == PRIORS_OF_DATABASE:
-        if inputs.database is None:
+        if file is None:
             raise InputError("there is no database whose priors could be taken; give one with --database")
-        return database_priors(inputs.database, model)
+        return database_priors(file, model)
     return exif_priors(Path(asked), model) if Path(asked).is_dir() else table_priors(Path(asked), model)
 
 

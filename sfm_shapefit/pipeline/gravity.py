@@ -9,6 +9,7 @@ from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.seed import turn_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.seed import Seeded
 from sfm_shapefit.rotations.average import check_pairs
@@ -26,7 +27,7 @@ from sfm_shapefit.scene.given import Gravity
 _NAMED = 3
 
 
-def read_gravity(database: Path, model: PosedModel, source: str) -> Gravity | None:
+def read_gravity(file: DatabaseFile, model: PosedModel, source: str) -> Gravity | None:
     """Return the gravities of a model's images, if they are wanted.
 
     Raises:
@@ -35,7 +36,7 @@ def read_gravity(database: Path, model: PosedModel, source: str) -> Gravity | No
     if not source:
         return None
     if source == GRAVITY_OF_DATABASE:
-        return database_gravity(database, model)
+        return database_gravity(file, model)
     return table_gravity(Path(source), model)
 
 

@@ -1,145 +1,119 @@
 """Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
-from sfm_shapefit.files.colmap.database import (
-    MatchDatabase,
-    find_database,
-    images_with_keypoints,
-    open_database,
-)
-from sfm_shapefit.files.colmap.model import PosedModel, track_matches
+from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
+from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.point_colors import PointColors, read_colors
 from sfm_shapefit.files.colmap.seed import copy_without_keypoints
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
-from sfm_shapefit.scene.matches import KeypointMatches, MatchBatch
+from sfm_shapefit.scene.matches import Matches, View
 
 if TYPE_CHECKING:
     import pycolmap
 
-Batch = TypeVar("Batch", MatchBatch, KeypointMatches)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchSource:
-    """A model with the matches of its images, which can be read again and again."""
+    """The matches of a model's images, and what is given up of all that could be done with them."""
 
-    model: PosedModel
-    database: MatchDatabase | None
-    """The open database; None where the model's own tracks serve."""
+    matches: Matches
+    view: View[PosedModel]
+    """Of these, but for the pairs that are left out."""
+    inputs: Inputs
+    """Where they come from."""
     economy: Economy = ECONOMIES[0]
-    """What is given up for memory."""
 
-    def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
-        """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
-        if self.database is None:
-            return track_matches(self.model)
-        return self.database.iter_matches(1, self.economy.batch, among)
+    @property
+    def model(self) -> PosedModel:
+        """The model."""
+        return self.view.images
 
-    def counted(self, batches: Iterator[Batch], advance: Callable[[int, int], None]) -> Iterator[Batch]:
-        """Report progress while batches are consumed: pairs of a database, or images of a model."""
-        total = self.model.num_images if self.database is None else self.database.num_pairs
-        done = 0
-        for batch in batches:
-            yield batch
-            if len(batch.pairs):
-                done = int(batch.pairs[-1, 0]) + 1 if self.database is None else done + len(batch.pairs)
-            advance(min(done, total), total)
-        advance(total, total)
+    @property
+    def has_database(self) -> bool:
+        """Whether the matches are those of a database; else the model's own tracks serve."""
+        return self.inputs.database is not None
 
-    def num_keypoints(self) -> IntArray:
-        """Return the number of keypoints of each image, (n,), to which matches refer."""
-        model, database = self.model, self.database
-        if database is not None:
-            return np.array([database.count_keypoints(k) for k in range(model.num_images)])
-        images = map(model.reconstruction.image, model.image_ids.tolist())
-        return np.array([image.num_points2D() for image in images])
+    def at(self, model: PosedModel, economy: Economy | None = None) -> "MatchSource":
+        """Return the same matches as another model's images see them, or with more that is given up."""
+        economy = economy or self.economy
+        if model is self.model and economy is self.economy:
+            return self
+        view = self.matches.at(model, self.inputs.left_out, economy.reading)
+        return replace(self, view=view, economy=economy)
 
     def workload(self) -> Workload:
         """Return what is known of the work before any direction is measured."""
-        database, model = self.database, self.model
+        model, view = self.model, self.view
         images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
-        seen = sum(image.num_points2D() for image in images)
-        num_pairs = 0 if database is None else database.num_pairs
         return Workload(
             num_images=model.num_images,
-            num_keypoints=seen if database is None else max(seen, database.num_keypoints()),
-            num_pairs=num_pairs,
-            num_matches=0 if database is None else database.num_matches,
-            num_edges=num_pairs,
+            num_keypoints=max(sum(image.num_points2D() for image in images), self.matches.total_keypoints),
+            num_pairs=view.num_pairs,
+            num_matches=view.num_matches,
+            num_edges=view.num_pairs,
             num_nodes=model.num_images,
         )
 
-    def turned(self, model: PosedModel) -> "MatchSource":
-        """Return the same matches for a model of the same images with other rotations."""
-        database = None if self.database is None else self.database.turned(model)
-        return replace(self, model=model, database=database)
 
-    def with_economy(self, economy: Economy) -> "MatchSource":
-        """Return the same source, which gives up so much for memory."""
-        if self.database is not None:
-            self.database.limit_rays(economy.rays_bytes)
-            if economy.statement:
-                self.database.forget_matches()
-        return replace(self, economy=economy)
+def open_matches(model: PosedModel, inputs: Inputs) -> DatabaseMatches | TrackMatches:
+    """Open the matches that were chosen.
+
+    Raises:
+        InputError: if they cannot be read.
+    """
+    return TrackMatches(model) if inputs.database is None else open_database(inputs.database, model.names)
+
+
+def see_matches(
+    matches: Matches, model: PosedModel, inputs: Inputs, options: PlacingOptions | None = None
+) -> MatchSource:
+    """Return the matches as a model's images see them; without options memory has no limit.
+
+    Raises:
+        InputError: if there is no way to stay below the limit.
+    """
+    source = MatchSource(matches=matches, view=matches.at(model, inputs.left_out), inputs=inputs)
+    if options is None or not options.memory.max_memory_mb or not source.has_database:
+        return source
+    bare = replace(
+        source.workload(),
+        adjusts=options.placement.refines and options.freedom.adjusts_cameras(model.num_images),
+        adjusts_bundle=options.freedom.adjust == "full",
+    )
+    work = replace(bare, has_points=options.nodes.uses_points(model.num_images))
+    return source.at(model, choose_economy(work, bare, options.memory.max_memory_mb))
 
 
 @contextmanager
 def open_source(
-    model: PosedModel,
-    inputs: Inputs,
-    options: PlacingOptions | None = None,
-    opened: MatchDatabase | None = None,
+    model: PosedModel, inputs: Inputs, options: PlacingOptions | None = None
 ) -> Iterator[MatchSource]:
-    """Open the matches that were chosen, and close them in the end; without options memory has no limit.
-
-    A database that is `opened` already stays open, and what was read of it is not read again.
-
-    Raises:
-        InputError: if the matches cannot be read, or there is no way to stay below the limit.
-    """
-    if inputs.database is None:
-        yield MatchSource(model=model, database=None)
-        return
-    with ExitStack() as stack:
-        if opened is None:
-            database = stack.enter_context(open_database(inputs.database, model, inputs.left_out))
-        else:
-            database = opened.among(model, inputs.left_out)
-        source = MatchSource(model=model, database=database)
-        if options is not None and options.memory.max_memory_mb:
-            bare = replace(
-                source.workload(),
-                adjusts=options.placement.refines and options.freedom.adjusts_cameras(model.num_images),
-                adjusts_bundle=options.freedom.adjust == "full",
-            )
-            work = replace(bare, has_points=options.nodes.uses_points(model.num_images))
-            source = source.with_economy(choose_economy(work, bare, options.memory.max_memory_mb))
-        yield source
+    """Open the matches that were chosen, as `see_matches` sees them, and close them in the end."""
+    with closing(open_matches(model, inputs)) as matches:
+        yield see_matches(matches, model, inputs, options)
 
 
-def without_structure(model: PosedModel, inputs: Inputs) -> tuple[PosedModel, PointColors | None]:
+def without_structure(
+    model: PosedModel, matches: DatabaseMatches | TrackMatches
+) -> tuple[PosedModel, PointColors | None]:
     """Return a model without the points and keypoints that its matches make up for, and the points' colors.
 
     With matches of a database nothing else of the points serves, and its keypoints replace the model's. Of
     10,000 images both take 0.5 GB, which would be held to the end. Where tracks serve the model stays whole.
     """
-    if inputs.database is None:
+    if matches.file is None:
         return model, None
-    names = images_with_keypoints(inputs.database)
-    replaced = [i for i, name in zip(model.image_ids.tolist(), model.names, strict=True) if name in names]
-    bare = copy_without_keypoints(model.reconstruction, replaced)
+    bare = copy_without_keypoints(model.reconstruction, model.image_ids[matches.num_keypoints > 0].tolist())
     return replace(model, reconstruction=bare), read_colors(model.reconstruction)
 
 

@@ -2,7 +2,6 @@
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.facts.intrinsics import Intrinsics
-from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.intrinsics import (
     Origin,
     calibrate_view_graph,
@@ -11,36 +10,40 @@ from sfm_shapefit.files.colmap.intrinsics import (
     with_focal_lengths,
 )
 from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.freedom import IntrinsicsFreedom
+from sfm_shapefit.scene.matches import PairNames
 
 # A view graph that wants a focal length further off says more about the graph than about the lens.
 _MOST_OFF = 4.0
 
 
 def settle_intrinsics(
-    model: PosedModel, inputs: Inputs, wanted: IntrinsicsFreedom
+    model: PosedModel,
+    file: DatabaseFile | None,
+    wanted: IntrinsicsFreedom,
+    left_out: PairNames = frozenset(),
 ) -> tuple[PosedModel, Intrinsics]:
     """Return the model to start from, and which intrinsics the adjustments may change.
 
     Args:
         model: as given, of which nothing changes.
-        inputs: whose database, if there is one, says which intrinsics are guesses; pairs that are left out
-            say nothing of focal lengths.
+        file: the database, if there is one, which says which intrinsics are guesses.
         wanted: intrinsics that may change.
+        left_out: pairs that say nothing of focal lengths.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    database = inputs.database
-    guessed = {} if database is None else find_uncalibrated(database, model)
+    guessed = {} if file is None else find_uncalibrated(file, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
     origins |= {i: found.origin for i, found in guessed.items()}
     doubts = {} if wanted == "held" else doubt_lenses(cameras, origins)
     factors = {}
-    if database is not None and guessed and wanted != "held":
+    if file is not None and guessed and wanted != "held":
         asked = [found.database_id for found in guessed.values()]
-        by_database = calibrate_view_graph(database, asked, inputs.left_out)
+        by_database = calibrate_view_graph(file, asked, left_out)
         factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}
         factors = {i: factor for i, factor in factors.items() if 1.0 / _MOST_OFF <= factor <= _MOST_OFF}
     intrinsics = Intrinsics(

@@ -29,12 +29,13 @@ from sfm_shapefit.facts.summary import told_distances, told_verdict
 from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION, CameraRow
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
-from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.pipeline.inputs import choose_inputs, see_matches
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
+from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.matches import Matches, PairNames
 
 if TYPE_CHECKING:
     import pycolmap
@@ -45,6 +46,16 @@ _SIGMA_OF = (
 )
 # What says how large a model is; another scale has no meaning beside that of a known distance.
 _ARBITRARY = ("unit", "input")
+
+
+class ToldOfJoins(NamedTuple):
+    """What the user told of images of several models."""
+
+    priors: PositionPriors | None = None
+    """Of the images; None: those of the database, if it has any."""
+    distances: Sequence[KnownDistance] = ()
+    left_out: PairNames = frozenset()
+    """Pairs of images whose matches say nothing."""
 
 
 class Group(NamedTuple):
@@ -59,8 +70,8 @@ class Group(NamedTuple):
 def tell_group(
     group: Group,
     models: Sequence[MappedModel],
-    known: Sequence[KnownDistance],
-    left_out: PairNames,
+    matches: Matches,
+    told: ToldOfJoins,
     clock: Clock,
 ) -> JoinedModel:
     """Return joined models with what can be said of them.
@@ -68,22 +79,21 @@ def tell_group(
     Args:
         group: the models.
         models: all models of the run, by number.
-        known: distances that were told, between images of any models.
-        left_out: pairs of images whose matches say nothing.
+        matches: of all their images.
+        told: what is known of the images beside.
         clock: what it takes is added to its seconds.
     """
     # Here, since it draws on the report, which the other commands do without.
     from sfm_shapefit.pipeline.examine import examine_source
 
-    located = models[next(iter(group.world_from))].located
+    located, known = models[next(iter(group.world_from))].located, told.distances
     gauge, rescale = _choose_scale(group, located.gauge, known)
     group = _rescaled(group, rescale)
     model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
     inputs = choose_inputs(group.reconstruction, database)
-    inputs = replace(inputs, left_out=left_out)
+    inputs = replace(inputs, left_out=told.left_out)
     own = Clock(clock.progress)
-    with open_source(model, inputs) as matches:
-        found = examine_source(matches, inputs, located.options.directions, own)
+    found = examine_source(see_matches(matches, model, inputs), located.options.directions, own)
     weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
     cameras = list(_camera_rows(found.cameras, group, models))
     verdict = _judge(weak, tuple(found.facts["verdict"]["reasons"]), group, models)

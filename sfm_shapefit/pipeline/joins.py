@@ -1,9 +1,7 @@
 """The models of one database joined where that is safe: by position priors, or by matches between them."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,15 +11,14 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose
 from sfm_shapefit.facts.joins import Joined, JoinedModel
 from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import with_parameters
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import PosedModel, observed_points
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
-from sfm_shapefit.files.pair_list import PairNames
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.joined import Group, tell_group
+from sfm_shapefit.pipeline.joined import Group, ToldOfJoins, tell_group
 from sfm_shapefit.placement.join import (
     ModelJoin,
     PlacedByPriors,
@@ -30,9 +27,8 @@ from sfm_shapefit.placement.join import (
     join_by_priors,
     place_by_priors,
 )
-from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.matches import MatchBatch, View
 
 if TYPE_CHECKING:
     import pycolmap
@@ -53,25 +49,19 @@ class JoinedModels(NamedTuple):
     """What was told and could not be used for it, a sentence each."""
 
 
-class ToldOfJoins(NamedTuple):
-    """What the user told of images of several models."""
-
-    priors: PositionPriors | None = None
-    """Of the images; None: those of the database, if it has any."""
-    distances: Sequence[KnownDistance] = ()
-    left_out: PairNames = frozenset()
-    """Pairs of images whose matches say nothing."""
-
-
 def join_models(
-    models: Sequence[MappedModel], unposed: PosedModel, database: Path, told: ToldOfJoins, clock: Clock
+    models: Sequence[MappedModel],
+    unposed: PosedModel,
+    matches: DatabaseMatches,
+    told: ToldOfJoins,
+    clock: Clock,
 ) -> JoinedModels:
     """Join each model to the first larger one that it can be joined to safely.
 
     Args:
         models: largest first.
         unposed: all images of the database, by index.
-        database: with the matches between the models.
+        matches: of these.
         told: what is known of the images beside.
         clock: whose progress is told.
     """
@@ -80,18 +70,14 @@ def join_models(
     priors, warnings = told.priors, []
     if priors is None:
         try:
-            priors = database_priors(database, unposed)
+            priors = database_priors(matches.file, unposed)
         except MissingPriorsError:
             pass
         except InputError as error:
             warnings.append(f"the position priors of the database join no models: {error}")
-    open_matches = partial(open_database, database, left_out=told.left_out)
-    evidence = _Evidence(models, unposed, priors, open_matches)
+    evidence = _Evidence(models, unposed, priors, partial(matches.at, left_out=told.left_out))
     joins = [evidence.join(number) for number in range(1, len(models))]
-    joined = [
-        tell_group(group, models, told.distances, told.left_out, clock)
-        for group in _merge(models, joins, evidence)
-    ]
+    joined = [tell_group(group, models, matches, told, clock) for group in _merge(models, joins, evidence)]
     return JoinedModels(tuple(joins), tuple(joined), tuple(warnings))
 
 
@@ -121,7 +107,7 @@ class _Evidence:
         models: Sequence[MappedModel],
         unposed: PosedModel,
         priors: PositionPriors | None,
-        open_matches: Callable[..., AbstractContextManager[MatchDatabase]],
+        see: Callable[[PosedModel], View[PosedModel]],
     ) -> None:
         parameters = {
             camera_id: camera.params.tolist()
@@ -142,8 +128,7 @@ class _Evidence:
             self.ids.append(self._observed(image, number) if number >= 0 else np.zeros(0, dtype=np.int64))
         self.by_priors: dict[int, PlacedByPriors | str | None] = {}
         """Of each model that was asked; fitted once, whatever the number of models it is compared with."""
-        with open_matches(model=self.unposed) as source:
-            self.matches = self._read_matches(source)
+        self.matches = self._read_matches(see(self.unposed))
 
     def _observed(self, image: int, number: int) -> IntArray:
         """Return what the keypoints of an image of a model observe, and note its pose."""
@@ -155,10 +140,10 @@ class _Evidence:
         found[keypoints] = points.astype(np.int64)
         return found
 
-    def _read_matches(self, source: MatchDatabase) -> dict[tuple[int, int], "_Between"]:
+    def _read_matches(self, view: View[PosedModel]) -> dict[tuple[int, int], "_Between"]:
         """Return the matches between models, by the two models, and what turns they suggest."""
         parts: dict[tuple[int, int], list[_Between]] = {}
-        for batch in source.iter_matches_between(self.model_of_image):
+        for batch in view.between(self.model_of_image):
             relative = estimate_relative_rotations(batch)
             turns = dict(zip(map(tuple, relative.pairs.tolist()), relative.rotations, strict=True))
             for k, (i, j) in enumerate(batch.pairs.tolist()):

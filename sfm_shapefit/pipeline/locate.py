@@ -4,6 +4,7 @@ Each stage is one function from values to a new value; the input is never change
 """
 
 from concurrent.futures import Executor
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,13 @@ from sfm_shapefit.pipeline.adjustment import weight_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out, without_structure
+from sfm_shapefit.pipeline.inputs import (
+    choose_inputs,
+    open_matches,
+    read_left_out,
+    see_matches,
+    without_structure,
+)
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import Told, settle
@@ -70,28 +77,31 @@ def locate(
     """
     options = merge_options(options, LocateOptions, overrides)
     clock = Clock.of(progress, options.placement.solver, executor)
-    with clock("read"):
-        model = read_model(reconstruction)
-        inputs = choose_inputs(reconstruction, database, options.source.directions)
-        inputs = read_left_out(inputs, model.names, options.directions.without)
-        model, intrinsics = settle_intrinsics(model, inputs, options.freedom.intrinsics)
-        refuse_unknown_names(options.gauge.known_distance, model.names, "the model has no posed image")
-        if options.freedom.rigs == "free" and not model.has_rigs:
-            raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
-        known = read_priors(model, inputs, priors)
-        control = read_control(model, options.gauge.control_points)
-        rigid = find_rigid_parts(model, options.placement, options.fix)
-        model, colors = without_structure(model, inputs)
-    told = Told(
-        inputs,
-        rigid,
-        weight_of_rotations(options.rotations),
-        scale=options.gauge.scale,
-        distances=options.gauge.known_distance,
-        priors=known,
-        control=control,
-        intrinsics=intrinsics,
-        colors=colors,
-    )
-    with open_source(model, inputs, options) as opened:
-        return settle(opened, told, options, clock)
+    with ExitStack() as stack:
+        with clock("read"):
+            model = read_model(reconstruction)
+            inputs = choose_inputs(reconstruction, database, options.source.directions)
+            inputs = read_left_out(inputs, model.names, options.directions.without)
+            refuse_unknown_names(options.gauge.known_distance, model.names, "the model has no posed image")
+            if options.freedom.rigs == "free" and not model.has_rigs:
+                raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
+            matches = stack.enter_context(closing(open_matches(model, inputs)))
+            wanted = options.freedom.intrinsics
+            model, intrinsics = settle_intrinsics(model, matches.file, wanted, inputs.left_out)
+            known = read_priors(model, matches.file, priors)
+            control = read_control(model, options.gauge.control_points)
+            rigid = find_rigid_parts(model, options.placement, options.fix)
+            model, colors = without_structure(model, matches)
+            source = see_matches(matches, model, inputs, options)
+        told = Told(
+            inputs,
+            rigid,
+            weight_of_rotations(options.rotations),
+            scale=options.gauge.scale,
+            distances=options.gauge.known_distance,
+            priors=known,
+            control=control,
+            intrinsics=intrinsics,
+            colors=colors,
+        )
+        return settle(source, told, options, clock)

@@ -8,7 +8,7 @@ Images that the averaging drops form components of their own.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -25,11 +25,11 @@ from sfm_shapefit.facts.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult, Loop
-from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.files.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.files.colmap.model import PosedModel, read_model, sensors_of
-from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
@@ -39,9 +39,10 @@ from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors, refuse_unknown_names
 from sfm_shapefit.pipeline.gravity import read_gravity
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
+from sfm_shapefit.pipeline.inputs import choose_inputs, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.joins import JoinedModels, ToldOfJoins, join_models
+from sfm_shapefit.pipeline.joined import ToldOfJoins
+from sfm_shapefit.pipeline.joins import JoinedModels, join_models
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import Told, settle
@@ -51,6 +52,7 @@ from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+from sfm_shapefit.scene.matches import PairNames, View
 
 # The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
 # again.
@@ -92,15 +94,14 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = database_in(Path(database)), Clock.of(progress, options.placement.solver, executor)
-    run = _start(path, options, clock, priors)
-    with open_database(path, run.unposed, run.without) as opened:
-        return _map_opened(run._replace(opened=opened))
+    clock = Clock.of(progress, options.placement.solver, executor)
+    with closing(DatabaseFile(database_in(Path(database)))) as file:
+        return _map_opened(_start(file, options, clock, priors))
 
 
 def _map_opened(run: "_Run") -> MapResult:
     """Do what `map_database` does, once the matches are open."""
-    options, path, clock = run.options, run.database, run.clock
+    options, path, clock = run.options, run.matches.file.path, run.clock
     relative = run.measure()
     if options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
@@ -118,7 +119,7 @@ def _map_opened(run: "_Run") -> MapResult:
     if options.join == "safe":
         with clock("join"):
             told = ToldOfJoins(run.priors, options.gauge.known_distance, run.without)
-            found = join_models(models, run.unposed, path, told, clock)
+            found = join_models(models, run.unposed, run.matches, told, clock)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(run.unposed.names, run.frame_of_image.tolist(), strict=True)
@@ -157,25 +158,27 @@ def database_in(path: Path) -> Path:
     return path / "database.db"
 
 
-def _start(path: Path, options: MapOptions, clock: Clock, priors: Path | str | None) -> "_Run":
-    """Read what a run works from, but for the matches."""
+def _start(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None) -> "_Run":
+    """Read what a run works from."""
+    path = file.path
     with clock("read"):
-        images = read_images(path)
+        images = read_images(file)
         unposed = read_model(images.reconstruction)
         frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
         if options.freedom.rigs == "free" and len(np.unique(frame_of_image)) == len(frame_of_image):
             raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
         inputs = choose_inputs(images.reconstruction, path)
         inputs = read_left_out(inputs, unposed.names, options.directions.without)
-        unposed, intrinsics = settle_intrinsics(unposed, inputs, options.freedom.intrinsics)
+        unposed, intrinsics = settle_intrinsics(unposed, file, options.freedom.intrinsics, inputs.left_out)
         refuse_unknown_names(options.gauge.known_distance, unposed.names, "the database has no image")
-        positions = read_priors(unposed, inputs, priors)
+        positions = read_priors(unposed, file, priors)
         control = read_control(unposed, options.gauge.control_points)
-        gravity = read_gravity(path, unposed, options.averaging.gravity)
+        gravity = read_gravity(file, unposed, options.averaging.gravity)
+        matches = DatabaseMatches(file, unposed.names)
     return _Run(
         options=options,
         clock=clock,
-        database=path,
+        matches=matches,
         images=images,
         unposed=unposed,
         frame_of_image=frame_of_image,
@@ -193,7 +196,7 @@ class _Run(NamedTuple):
 
     options: MapOptions
     clock: Clock
-    database: Path
+    matches: DatabaseMatches
     images: UnposedImages
     unposed: PosedModel
     """The images as a model."""
@@ -208,8 +211,6 @@ class _Run(NamedTuple):
     gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
-    opened: MatchDatabase | None = None
-    """The open database, which keeps the matches that were read."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
     """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
 
@@ -217,12 +218,11 @@ class _Run(NamedTuple):
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
             sharing = Sharing(self.clock.threads, self.clock.executor, self.clock.advance)
-            return measure_rotations(self.matches(), self.unposed, LEAST_MATCHES, sharing)
+            return measure_rotations(self.view(), LEAST_MATCHES, sharing)
 
-    def matches(self) -> MatchDatabase:
+    def view(self) -> View[PosedModel]:
         """Return the matches of all images, but for the pairs that are left out."""
-        assert self.opened is not None
-        return self.opened.among(self.unposed, self.without)
+        return self.matches.at(self.unposed, self.without)
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
@@ -252,11 +252,11 @@ class _Run(NamedTuple):
         shares: dict[tuple[int, int], float] = {}
         if len(pairs) <= _MOST_SCORED_PAIRS:
             with self.clock("scores of pairs"):
-                matches = self.matches()
-                pixels = [matches.keypoints(k) for k in range(self.unposed.num_images)]
+                view = self.view()
+                pixels = [view.keypoints(k) for k in range(self.unposed.num_images)]
                 sizes = self.unposed.image_sizes()
-                partners = count_partners([len(own) for own in pixels], matches.iter_keypoints(LEAST_MATCHES))
-                for batch in matches.iter_keypoints(LEAST_MATCHES):
+                partners = count_partners([len(own) for own in pixels], view.links(LEAST_MATCHES))
+                for batch in view.links(LEAST_MATCHES):
                     found = matched_shares(pixels, sizes, partners, batch).tolist()
                     shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
         both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
@@ -277,9 +277,9 @@ class _Run(NamedTuple):
         found: dict[int, list[float]] = {}
         for _, members, averaging in self.average_images(relative, {}):
             model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
-            inputs = self.inputs_of(model)
+            source = see_matches(self.matches, model, self.inputs_of(model), self.options)
             rule = GaugeRule(model, find_rigid_parts(model, self.options.placement), "unit")
-            with open_source(model, inputs, self.options, self.opened) as source, suppress(UnsolvableError):
+            with suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
                     first = adjust_first_placement(
@@ -362,29 +362,29 @@ class _Run(NamedTuple):
             _, among = pairs_among(relative, members)
             inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
         rigid = find_rigid_parts(model, self.options.placement)
-        with open_source(model, inputs, self.options, self.opened) as averaged:
-            source, first, intrinsics = averaged, None, self.intrinsics
-            if self.options.freedom.adjust != "none":
-                with self.clock("first placement"):
-                    rule = GaugeRule(model, rigid, "unit")
-                    first = adjust_first_placement(averaged, rule, self.options, self.clock, intrinsics.free)
-                intrinsics = intrinsics.after(first.adjusted.lenses)
-                source = averaged.turned(self._pose_as(image_ids, first))
-                rigid = find_rigid_parts(source.model, self.options.placement)
-            told = Told(
-                inputs,
-                rigid,
-                RotationWeight(),
-                distances=distances,
-                priors=priors,
-                control=control,
-                gravity=gravity,
-                intrinsics=intrinsics,
-                rigs=sensors_of(model.reconstruction),
-                near=first,
-            )
-            with self.clock("locate"):
-                found = settle(source, told, self.options, self.clock.anew())
+        averaged = see_matches(self.matches, model, inputs, self.options)
+        source, first, intrinsics = averaged, None, self.intrinsics
+        if self.options.freedom.adjust != "none":
+            with self.clock("first placement"):
+                rule = GaugeRule(model, rigid, "unit")
+                first = adjust_first_placement(averaged, rule, self.options, self.clock, intrinsics.free)
+            intrinsics = intrinsics.after(first.adjusted.lenses)
+            source = averaged.at(self._pose_as(image_ids, first))
+            rigid = find_rigid_parts(source.model, self.options.placement)
+        told = Told(
+            inputs,
+            rigid,
+            RotationWeight(),
+            distances=distances,
+            priors=priors,
+            control=control,
+            gravity=gravity,
+            intrinsics=intrinsics,
+            rigs=sensors_of(model.reconstruction),
+            near=first,
+        )
+        with self.clock("locate"):
+            found = settle(source, told, self.options, self.clock.anew())
         ends = members[found.directions.pairs].tolist()
         unknown = (np.nan, np.nan)
         scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
@@ -397,12 +397,12 @@ class _Run(NamedTuple):
 
     def inputs_of(self, model: PosedModel) -> Inputs:
         """Return what the images of a component are located from."""
-        inputs = choose_inputs(model.reconstruction, self.database)
+        inputs = choose_inputs(model.reconstruction, self.matches.file.path)
         return replace(inputs, left_out=self.without)
 
     def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
         """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
-        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
         run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
         return run._pose(image_ids, first.rotations, first.parameters())
 

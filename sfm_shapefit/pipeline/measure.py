@@ -70,19 +70,19 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    model, beside = source.model, _Beside(source, options.inlier_threshold_px, wanted)
-    if clock.executor is not None and source.database is not None:
+    beside = _Beside(source, options.inlier_threshold_px, wanted)
+    if clock.executor is not None and source.has_database:
         work = PairWork(estimate=partial(estimate_directions, options=options))
-        parts = measure_with_workers(source.database, model, work, clock.executor, clock.advance)
+        parts = measure_with_workers(source.view, work, clock.executor, clock.advance)
         if parts and any(wanted):
             directions = concatenate(parts)
             row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
-            for batch in source.batches():
+            for batch in source.view.batches():
                 rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
                 beside.add(batch, directions.subset(rows))
     else:
         parts = []
-        for batch in source.counted(source.batches(), clock.advance):
+        for batch in source.view.batches(advance=clock.advance):
             parts.append(estimate_directions(batch, options, clock.threads))
             beside.add(batch, parts[-1])
     if not parts:
@@ -96,12 +96,12 @@ class _Beside:
     """What is made of each batch beside its directions."""
 
     def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
-        database, self._threshold_px, self._num_usable = source.database, threshold_px, 0
+        view = source.view
+        self._threshold_px, self._num_usable = threshold_px, 0
         self.errors: list[FloatArray] | None = [] if wanted.errors else None
         self._joiner = None
         if wanted.tracks:
-            num_matches = 0 if database is None else database.num_matches
-            self._joiner = TrackJoiner(threshold_px, source.num_keypoints(), num_matches)
+            self._joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
 
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Take a batch and its directions."""

@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.database import BATCH, KEPT_MATCHES
-from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_BESIDE_TRACKS, MOST_MATCHES
+from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
@@ -24,6 +23,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.freedom import FreedomOptions
+from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS, PLENTY, Reading
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method
 from sfm_shapefit.solver.splitting.linear import predict_factor
@@ -46,9 +46,7 @@ _OBSERVATION_BYTES = 620.0
 # Unknowns of an adjusted camera, and up to how many of them their system is dense.
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
 
-RAYS_BYTES = 1_000_000_000
-"""Of the rays of keypoints that are kept for the next pair, where memory is no concern."""
-_SMALL_BATCH, _FEW_RAYS_BYTES = 50_000, 50_000_000
+_FRUGAL = Reading(batch=50_000, rays_bytes=50_000_000, keeps=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,10 +82,8 @@ class Economy:
 
     statement: str = ""
     """What that is, for the user; empty for nothing."""
-    batch: int = BATCH
-    """Matches that are read at a time."""
-    rays_bytes: int = RAYS_BYTES
-    """Of the rays of keypoints that are kept for the next pair."""
+    reading: Reading = PLENTY
+    """How matches are read."""
     samples: bool = True
     """Whether the errors of directions are sampled together where keypoints are shared."""
     points: bool = True
@@ -110,7 +106,7 @@ def _list_economies() -> Iterator[Economy]:
     yield economy
     given_up: list[str] = []
     for what, changes in (
-        ("matches are read in small batches", {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
+        ("matches are read in small batches", {"reading": _FRUGAL}),
         ("directions count as independent in standard deviations", {"samples": False}),
         ("no 3D points join the view graph", {"points": False}),
         ("cameras are not adjusted by their matches", {"adjustment": False}),
@@ -231,11 +227,11 @@ def _plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
 
 def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     """Return the bytes that are held at the peak of each stage."""
-    batch = 225.0 * min(economy.batch, work.num_matches)
+    batch = 225.0 * min(economy.reading.batch, work.num_matches)
     model = 30e6 + (_COLOR_BYTES if work.num_matches else _MODEL_BYTES) * work.num_keypoints
-    rays = min(24.0 * work.num_keypoints, economy.rays_bytes)
+    rays = min(24.0 * work.num_keypoints, economy.reading.rays_bytes)
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
-    is_sorted = not economy.statement and work.num_matches <= MOST_MATCHES
+    is_sorted = economy.reading.keeps and work.num_matches <= MOST_MATCHES
     in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
     throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
     peaks = {
@@ -250,7 +246,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     copies = 2.2 if work.needs_factor else 1.2
     factor = copies * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
     moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
-    is_kept = work.num_matches <= KEPT_MATCHES and economy.batch >= min(BATCH, work.num_matches)
+    is_kept = economy.reading.keeps and work.num_matches <= KEPT_MATCHES
     kept = 80.0 * work.num_matches if is_kept else 0.0
     peaks["placing"] = throughout + kept + solving + samples + moved + factor + 0.5 * batch
     tracks = 80.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple, get_args
 
-from sfm_shapefit.files.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
     RelativeSource,
     concatenate,
@@ -19,6 +21,7 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+from sfm_shapefit.scene.matches import View
 from sfm_shapefit.solver.options import SolverOptions
 
 # About a second of work, be they many pairs of few matches or few of many.
@@ -79,30 +82,28 @@ def relative_rotations(
         raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    path, clock = Path(database), Clock.of(progress, SolverOptions(threads=threads), executor)
-    with clock("relative rotations"):
-        model = read_model(read_images(path).reconstruction)
+    clock = Clock.of(progress, SolverOptions(threads=threads), executor)
+    with clock("relative rotations"), closing(DatabaseFile(database)) as file:
+        model = read_model(read_images(file).reconstruction)
+        view = DatabaseMatches(file, model.names).at(model)
         sharing = Sharing(clock.threads, executor, clock.advance)
-        with open_database(path, model) as matches:
-            if source == "stored":
-                found = stored_relative_rotations(matches, model, min_matches)
-            else:
-                found = measure_rotations(matches, model, min_matches, sharing)
+        if source == "stored":
+            found = stored_relative_rotations(view, min_matches)
+        else:
+            found = measure_rotations(view, min_matches, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 
 
 def measure_rotations(
-    database: MatchDatabase,
-    model: PosedModel,
+    view: View[PosedModel],
     min_matches: int = LEAST_MATCHES,
     sharing: Sharing | None = None,
 ) -> RelativeRotations:
     """Return relative rotations estimated from matches; pairs are indices into the model's images.
 
     Args:
-        database: open, of the model.
-        model: all its images, with the identity as their rotation (see `database_images`).
+        view: of images with the identity as their rotation (see `database_images`).
         min_matches: pairs with fewer inlier matches are left out.
         sharing: one thread if None.
 
@@ -112,21 +113,21 @@ def measure_rotations(
     """
     sharing = sharing or Sharing()
     if sharing.executor is None:
-        parts = _estimate_here(database, min_matches, sharing)
+        parts = _estimate_here(view, min_matches, sharing)
     else:
         work = PairWork(
-            estimate=partial(estimate_relative_rotations, num_pairs=database.num_pairs),
+            estimate=partial(estimate_relative_rotations, num_pairs=view.num_pairs),
             min_matches=min_matches,
             matches_per_task=_MATCHES_PER_TASK,
         )
-        parts = measure_with_workers(database, model, work, sharing.executor, sharing.advance)
+        parts = measure_with_workers(view, work, sharing.executor, sharing.advance)
     return concatenate(parts)
 
 
-def _estimate_here(database: MatchDatabase, min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
+def _estimate_here(view: View[PosedModel], min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
     """Return the relative rotations of each batch."""
-    parts, before, total = [], 0, database.num_pairs
-    for batch in database.iter_matches(min_matches):
+    parts, before, total = [], 0, view.num_pairs
+    for batch in view.batches(min_matches):
 
         def advance(done: int, before: int = before) -> None:
             sharing.advance(before + done, total)

@@ -1,24 +1,26 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted
 from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
-from sfm_shapefit.adjustment.filter import filter_in_place
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.adjustment.sources import TrackSource, collect_matches
-from sfm_shapefit.adjustment.structure import triangulate_in_place
+from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
+from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import PlacingOptions
-from sfm_shapefit.files.colmap.database import MatchDatabase
+from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.own_tracks import triangulate_own_tracks
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
+from sfm_shapefit.files.colmap.points import ModelPictures, add_points, points_of
 from sfm_shapefit.files.colmap.seed import build_seed, transform_model, turn_model
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
@@ -33,7 +35,8 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import PULLED
-from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.links import MatchedKeypoints
 
 if TYPE_CHECKING:
     import pycolmap
@@ -55,7 +58,8 @@ class Located(NamedTuple):
     rule: GaugeRule | None = None
     """What sets the gauge, and again after bundle adjustment; "unit" if None."""
     given: GivenPoses = GivenPoses()
-    """The rotations of the input, and position priors that pull at the cameras and hold the gauge by that."""
+    """What is known of the frames of the model: the rotations of the input, and position priors that pull at
+    the cameras and hold the gauge by that."""
 
     @property
     def cameras(self) -> IntArray:
@@ -66,6 +70,13 @@ class Located(NamedTuple):
         """Return which images of the model (n,) keep their poses."""
         return np.zeros(model.num_images, np.bool_) if self.fixed is None else self.fixed
 
+    def given_of(self, posed: "PosedPart", model: PosedModel) -> GivenPoses:
+        """Return what is known of the frames of some posed images of the model."""
+        fixed = np.zeros(len(model.images.frames.ids), dtype=np.bool_)
+        if self.fixed is not None:
+            fixed[model.images.frame_of[self.fixed]] = True
+        return self.given._replace(fixed=fixed).of(posed.frames)
+
 
 class Seeded(NamedTuple):
     """A seeded model."""
@@ -73,7 +84,7 @@ class Seeded(NamedTuple):
     reconstruction: "pycolmap.Reconstruction"
     gauge: Gauge
     """From the solver's units to its own."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
     """By the id of each image that was left out because it sees too few points, or hardly any of those that
@@ -85,8 +96,7 @@ class Seeded(NamedTuple):
 
     def moved(self, reconstruction: "pycolmap.Reconstruction", gauge: Gauge) -> "Seeded":
         """Return the same model in another gauge."""
-        adjusted = self.adjusted and replace(self.adjusted, reconstruction=reconstruction)
-        return self._replace(reconstruction=reconstruction, gauge=gauge, adjusted=adjusted)
+        return self._replace(reconstruction=reconstruction, gauge=gauge)
 
 
 def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
@@ -108,30 +118,16 @@ def build_seeded_model(
     from matches take the colors of the input's, if it had any. An executor shares out the tracks that are
     triangulated where nothing is adjusted.
     """
-    adjusted, gauge = None, located.gauge
+    gauge = located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
-    with clock("structure"):
-        seed = seed_of(source, located)
-        tracks = read_tracks(source, located, seed, clock.advance)
-    if options.freedom.adjust != "full":
-        with clock("triangulation"):
-            triangulate_in_place(seed, tracks, options.structure, clock.advance, clock.executor)
-            del tracks
-            filter_in_place(seed, options.structure)
-            seeded = seed
-    else:  # which triangulates at the seed's poses itself
-        with clock("bundle adjustment"):
-            adjusted = bundle_adjust(
-                seed, tracks, options.structure, fixed_frames=frames, given=located.given
-            )
-            seeded = adjusted.reconstruction
-            del tracks
+    seeded, adjusted = _make_points(source, located, options, clock)
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.structure.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
-    if source.database is not None:  # points of the model's own tracks have their colors already
+    if source.has_database:  # points of the model's own tracks have their colors already
+        batches = source.view.batches()
         counts = count_observations(
-            seeded, source.model, source.batches(), options.structure.max_reprojection_error_px
+            seeded, source.model, batches, options.structure.max_reprojection_error_px
         )
         unsupported = images_without_support(seeded, counts, frames)
         if options.trust.min_trust > 0.0:
@@ -149,9 +145,41 @@ def build_seeded_model(
         seeded, gauge = _set_gauge(seeded, source.model, located)
     elif gauge.axes is not None:
         seeded = turn_model(seeded, gauge.axes)
-    if adjusted is not None:
-        adjusted = replace(adjusted, reconstruction=seeded)
     return Seeded(seeded, gauge, adjusted, poor, frozenset(unsupported), shares)
+
+
+def _make_points(
+    source: MatchSource, located: Located, options: PlacingOptions, clock: Clock
+) -> "tuple[pycolmap.Reconstruction, Estimate | None]":
+    """Return the seed with points, filtered, and how bundle adjustment went, if it was asked for."""
+    model, adjusted, links = source.model, None, None
+    own = None if source.has_database else model.reconstruction
+    limits = options.structure
+    rules = PointRules(
+        limits.max_reprojection_error_px, limits.min_triangulation_angle_deg, limits.min_track_length
+    )
+    with clock("structure"):
+        images = pose_images(model, located)
+        seed = build_seed(model, images, source.view.keypoints if source.has_database else None)
+        posed = posed_part(images)
+        if own is None or options.freedom.adjust == "full":
+            links = read_links(source, located, posed, clock.advance)
+    with clock("bundle adjustment" if options.freedom.adjust == "full" else "triangulation"):
+        if options.freedom.adjust == "full":  # which triangulates at the seed's poses itself
+            assert links is not None
+            adjusted, points = bundle_adjust(posed.images, links, limits, located.given_of(posed, model))
+            put_images(seed, adjusted.images)
+        elif own is not None:
+            points = triangulate_own_tracks(seed, posed.images, own, rules, clock.advance, clock.executor)
+        else:
+            assert isinstance(links, MatchedKeypoints)
+            points = triangulate(posed.images, links, limits, clock.advance, clock.executor)
+        del links
+        add_points(seed, posed.images, points, own)
+        filter_in_place(seed, rules)
+    if adjusted is not None:
+        adjusted = replace(adjusted, final_error_px=seed.compute_mean_reprojection_error())
+    return seed, adjusted
 
 
 def _set_gauge(
@@ -194,42 +222,50 @@ def _state(before: Gauge, after: Gauge) -> str:
     return f"{after.statement}{mark}{pulled}"
 
 
-def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":
-    """Return the model with its cameras moved, without points."""
-    model, placement = source.model, located.placement
-    is_placed = np.zeros(model.num_images, dtype=np.bool_)
-    is_placed[located.cameras] = True
-    centers = np.full((model.num_images, 3), np.nan)
-    centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
-    keypoints = None if source.database is None else source.database.keypoints
-    return build_seed(model, is_placed, centers, keypoints, located.fixed)
+class PosedPart(NamedTuple):
+    """The placed images of a model, in the order of their ids: that of the sums of an adjustment."""
+
+    images: Images
+    rows: IntArray
+    """(i,) their rows in the model."""
+    frames: IntArray
+    """(f,) rows of their frames among those of the model."""
 
 
-def read_tracks(
-    source: MatchSource,
-    located: Located,
-    seed: "pycolmap.Reconstruction",
-    advance: Callable[[int, int], None],
-) -> TrackSource:
-    """Return the tracks to triangulate at the poses of a seed; all rays are forgotten.
+def pose_images(model: PosedModel, located: Located) -> Images:
+    """Return the images of the model where they are placed, fixed ones as they were; NaN where neither."""
+    locations = located.placement.locations[located.kept]
+    placed = model.images.placed(located.cameras, located.gauge.similarity.apply(locations))
+    if located.fixed is None:
+        return placed
+    frames, fixed = placed.frames, np.zeros((len(placed.frames.ids), 1), dtype=np.bool_)
+    fixed[model.images.frame_of[located.fixed]] = True
+    return placed.posed(frames.rotations, np.where(fixed, model.images.frames.centers, frames.centers))
+
+
+def posed_part(images: Images) -> PosedPart:
+    """Return those of a model's images that have a pose."""
+    rows = np.flatnonzero(images.is_posed)
+    rows = rows[np.argsort(images.ids[rows])]
+    return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
+
+
+def read_links(
+    source: MatchSource, located: Located, posed: PosedPart, advance: Callable[[int, int], None]
+) -> Links:
+    """Return what joins the keypoints of placed images; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
-    model, placement = source.model, located.placement
-    if source.database is None:
-        return model.reconstruction
-    source.database.forget_rays()
-    hand_back_memory()
+    model, placement, view = source.model, located.placement, source.view
+    if not source.has_database:
+        pictures = ModelPictures(model.reconstruction, posed.images)
+        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
+    rows = posed.rows.tolist()
+    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: view.keypoints(rows[k]))
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    matches = source.database.iter_keypoints(1, among, placement.rejected_pairs)
-    counted = _clear_after(source.database, source.counted(matches, advance))
-    tracks = collect_matches(seed, model.image_ids, counted, source.database.num_matches)
-    source.database.forget_rays()  # of matches that are too many to be kept, and were read again
-    return tracks
-
-
-def _clear_after(database: MatchDatabase, matches: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
-    """Yield matches, and clear those that the database keeps as soon as all were yielded."""
-    yield from matches
-    database.clear_matches()
+    links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
+    place = np.full(model.num_images, -1)
+    place[posed.rows] = np.arange(len(posed.rows))
+    return collect_matches(posed.images, pictures, place, links, view.num_matches)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.base.arrays import FloatArray
@@ -130,12 +130,12 @@ class Stand(NamedTuple):
     directions: PairDirections
     located: Located
     intrinsics: Intrinsics
-    uncertainty: Uncertainty = Uncertainty()
-    """Of the centers, by the last adjustment."""
+    estimate: Estimate | None = None
+    """Of the last adjustment; None if there was none."""
     scale: float = 1.0
-    """From the solver's units to those of the uncertainty."""
-    adjustment: AdjustedPlacement | None = None
-    """How the placement was adjusted; None if it was not."""
+    """From the solver's units to those of the estimate."""
+    adjustment: Estimate | None = None
+    """How this placement was adjusted; None if it was not."""
 
 
 def settle(opened: MatchSource, told: Told, options: PlacingOptions, clock: Clock) -> LocateResult:
@@ -156,7 +156,7 @@ def settle(opened: MatchSource, told: Told, options: PlacingOptions, clock: Cloc
         work = count_work(opened, directions)
         describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
-        source = opened.with_economy(economy)
+        source = opened.at(opened.model, economy)
         graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
         near = None if told.near is None else told.near.stand
@@ -210,7 +210,7 @@ def finish_piece(
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        judged = with_uncertainty(judged, given, seeded.adjusted.uncertainty, scale)
+        judged = with_uncertainty(judged, given, seeded.adjusted, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
     sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
     for done in (stand.adjustment, seeded.adjusted):
@@ -289,7 +289,7 @@ def _start(
         return stand
     centers = told.near.stand.locations[placement.cameras]
     scale = median_spread(centers) / median_spread(placement.locations)
-    return stand._replace(uncertainty=told.near.adjusted.uncertainty, scale=scale)
+    return stand._replace(estimate=told.near.adjusted, scale=scale)
 
 
 def _pull(model: PosedModel, located: Located, told: Told, options: PlacementOptions) -> Located:
@@ -319,10 +319,10 @@ def _adjust(stand: Stand, told: Told, options: PlacingOptions, clock: Clock) -> 
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
         after = adjust_placed(stand.source, stand.directions, located, options, clock, told.rotations)
         intrinsics = stand.intrinsics.after(after.adjusted.lenses)
+        frames = stand.source.model.images.frames
         given = located.given._replace(
-            weight=after.adjusted.weight,
-            weight_frames=after.adjusted.frame_ids,
-            model=stand.source.model.reconstruction,
+            weight=after.adjusted.weight.among(after.part.frames, len(frames.ids)),
+            rotations=frames.rotations,
             lenses=intrinsics.free,
         )
         return Stand(
@@ -330,7 +330,7 @@ def _adjust(stand: Stand, told: Told, options: PlacingOptions, clock: Clock) -> 
             directions=after.directions,
             located=located._replace(placement=after.placement, given=given),
             intrinsics=intrinsics,
-            uncertainty=after.adjusted.uncertainty,
+            estimate=after.adjusted,
             scale=located.gauge.similarity.scale,
             adjustment=after.adjusted,
         )
@@ -343,8 +343,9 @@ def _judge(stand: Stand, told: Told, options: PlacingOptions, given: PosedModel,
     if not told.believes_rotations:
         among = placement.cameras if placement.piece else None
         relative = ask_pairs(stand.source, stand.directions, clock.threads, among)
-    limited = stand.source.economy.limit(options.placement)
-    judged = with_uncertainty(judge(placement, limited), given, stand.uncertainty, stand.scale)
+    judged = judge(placement, stand.source.economy.limit(options.placement))
+    if stand.estimate is not None:
+        judged = with_uncertainty(judged, given, stand.estimate, stand.scale)
     return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
 
 
@@ -393,6 +394,5 @@ def _structure_warnings(source: MatchSource, num_points: int) -> Iterator[str]:
     """Yield what the user should know of points and of the database."""
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
-    if source.database is not None and source.database.unmatched_names:
-        names = source.database.unmatched_names
+    if names := source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

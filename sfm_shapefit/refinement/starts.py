@@ -51,6 +51,8 @@ _LUD_PAIRS = 1_000_000
 _POINT_WEIGHT = 10.0
 # A relative difference of costs that says nothing where the starts disagree.
 _TIE = 1e-3
+# Length of a pair, as a share of the mean of all, below which its cameras stand in one place.
+_POINT_LENGTH = 1e-6
 OPENING_RAD = 0.1
 """Largest width of the kernel at which unrefined starts are compared."""
 
@@ -166,7 +168,7 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = _choose(starts, costs, apart, options)
+    kept, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _measure_moves(kept)
@@ -243,7 +245,13 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     first = np.cumsum(degree) - degree
     ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
-    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
+    return np.asarray(np.maximum(0.5 * (low + high), _POINT_LENGTH * np.mean(lengths)))
+
+
+def _is_point(graph: ViewGraph, t: FloatArray) -> bool:
+    """Return whether most cameras of a start stand in one point, where angles say nothing any more."""
+    lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
+    return bool(np.median(lengths) <= _POINT_LENGTH * np.mean(lengths))
 
 
 def _refine_start(
@@ -312,7 +320,11 @@ def _common_levels(problem: _Problem, starts: list[Start]) -> FloatArray:
 
 
 def _choose(
-    starts: list[Start], costs: dict[str, float], apart: float | None, options: PlacementOptions
+    graph: ViewGraph,
+    starts: list[Start],
+    costs: dict[str, float],
+    apart: float | None,
+    options: PlacementOptions,
 ) -> tuple[Start, str]:
     """Return the start to keep and the reason."""
     by_name = {start.name: start for start in starts}
@@ -324,6 +336,8 @@ def _choose(
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
     assert apart is not None
+    if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
+        return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
     name = "LUD" if difference < 0.0 else "ShapeFit"
     if apart <= COLLAPSED:

@@ -1,15 +1,40 @@
-"""Matches of image pairs as rays, and stored relative poses.
+"""Matches of image pairs: the file that has them, and what they are for images with rotations.
 
 A match of images i and j is a pair of keypoints that see the same point. With known rotations, all that
-matters of a keypoint is the unit ray of its pixel in world axes.
+matters of a keypoint is the unit ray of its pixel in world axes. So there are two nouns:
+
+    Matches    the file, opened once: which pairs there are, and integers; nothing of any pose
+    View       the same as some images see them: rays, which die with the images they were made for
 """
 
-from collections.abc import Sequence
+import itertools
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, hand_back_memory
+
+PairNames = frozenset[tuple[str, str]]
+"""Pairs of images by their names, the smaller name first."""
+
+Advance = Callable[[int, int], None]
+"""Is told of the work that is done, and of all work."""
+
+KEPT_MATCHES = 1_000_000
+"""So many are kept with their rays, in 80 MB."""
+
+MOST_BESIDE_TRACKS = 16_000_000
+"""Of a database with more, none is kept while points are made of them: to read 30 million again takes a
+twentieth of the time of a run, and to keep them an eighth of its memory."""
+
+
+def nobody(_done: int, _total: int) -> None:
+    """Be told, and tell no one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,7 +83,7 @@ class KeypointMatches:
     """The matches of k image pairs, M in all, one pair after the other, as keypoints; no rays."""
 
     pairs: IntArray
-    """(k, 2) images (i, j), i < j, as indices into `PosedModel.image_ids`."""
+    """(k, 2) images (i, j), i < j."""
     offsets: IntArray
     """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
     keypoints: IntArray
@@ -67,10 +92,26 @@ class KeypointMatches:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MatchBatch(RayMatches):
-    """Matches that know their keypoints; images i < j are indices into `PosedModel.image_ids`."""
+    """Matches that know their keypoints; i < j."""
 
     keypoints: IntArray
     """(M, 2) index of the keypoint in image i and in image j."""
+
+    def without(self, pairs: IntArray) -> "MatchBatch":
+        """Return all pairs but some (m, 2), whatever the order of their images."""
+        kept = ~is_among(self.pairs, pairs)
+        if kept.all():
+            return self
+        counts = np.diff(self.offsets)
+        rows = np.repeat(kept, counts)
+        return MatchBatch(
+            pairs=self.pairs[kept],
+            offsets=np.append(0, np.cumsum(counts[kept])),
+            keypoints=self.keypoints[rows],
+            rays_i=self.rays_i[rows],
+            rays_j=self.rays_j[rows],
+            pixel_angles=self.pixel_angles[kept],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +119,7 @@ class RelativePoses:
     """The relative poses of k image pairs: x_j = rotation x_i + translation in camera axes."""
 
     pairs: IntArray
-    """(k, 2) images (i, j), i < j, as indices into `PosedModel.image_ids`."""
+    """(k, 2) images (i, j), i < j."""
     rotations: FloatArray
     """(k, 3, 3) camera j from camera i."""
     translations: FloatArray
@@ -87,3 +128,341 @@ class RelativePoses:
     """(k,) COLMAP's TwoViewGeometryConfiguration."""
     num_inliers: IntArray
     """(k,) number of inlier matches."""
+
+
+class Reading(NamedTuple):
+    """How much memory may be taken, so that nothing is read or computed twice."""
+
+    batch: int = 250_000
+    """Matches that are put together at a time, beyond which only a single pair goes: 60 MB. The arrays of
+    larger batches come from the system and go back to it each time, and its zeros cost as much as what is
+    written over them."""
+    rays_bytes: int = 1_000_000_000
+    """Of the rays of keypoints that are kept for the next pair."""
+    keeps: bool = True
+    """Whether matches that were read are kept."""
+
+
+PLENTY = Reading()
+"""Where memory is no concern."""
+
+
+class SeeingImages(Protocol):
+    """What matches need to know of n images, which stand in the order of their names."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All different, ascending."""
+
+    @property
+    def focal_lengths_px(self) -> FloatArray:
+        """(n,)"""
+
+    def world_rays(self, image: int, xy: FloatArray) -> FloatArray:
+        """Return the unit rays (k, 3) of an image's pixels (k, 2) in world axes; NaN for those without."""
+
+
+Seeing = TypeVar("Seeing", bound=SeeingImages)
+AnyMatches = TypeVar("AnyMatches", KeypointMatches, MatchBatch)
+
+
+class Matches(ABC):
+    """The matches between some images of an open file, whatever their poses."""
+
+    names: tuple[str, ...]
+    """Of the images, ascending."""
+    missing_names: tuple[str, ...] = ()
+    """Those of them that the file does not have."""
+    pairs: IntArray
+    """(p, 2) images (i, j), i < j, that have matches; ascending."""
+    num_matches: IntArray
+    """(p,) how many they have, at most."""
+    num_keypoints: IntArray
+    """Number of keypoints of each image; 0 where the file does not have it."""
+    total_keypoints: int
+    """Number of keypoints of all images of the file."""
+
+    def at(
+        self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
+    ) -> "View[Seeing]":
+        """Return the matches as other images see them, which is cheap.
+
+        Args:
+            images: some of these, by name, and maybe others.
+            left_out: pairs that are taken for unmatched.
+            reading: how much memory may be taken; where nothing is kept, what earlier views read goes.
+        """
+        if not reading.keeps:
+            self.forget()
+        return View(self, images, left_out, reading)
+
+    @abstractmethod
+    def keypoints(self, name: str) -> FloatArray:
+        """Return the pixels (k, 2) of the keypoints of an image; k = 0 if there are none.
+
+        Raises:
+            InputError: if they are damaged, or a coordinate is not finite.
+        """
+
+    def matched(self, name: str) -> IntArray | slice:  # noqa: ARG002
+        """Return the keypoints of an image to which matches may refer, ascending."""
+        return slice(None)
+
+    @abstractmethod
+    def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
+        """Return the matches of pairs (k,), ascending: how many each has, and the keypoints (M, 2) of all.
+
+        Those of a pair ascend, and each stands once. With `keep` they are not read again.
+
+        Raises:
+            InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
+        """
+
+    def forget(self) -> None:  # noqa: B027  that is all where none is kept
+        """Give back the memory of all matches that were read; they are read again where they are needed."""
+
+    def parts(self, view: "View[Any]", ranges: Sequence[slice]) -> "Sequence[MatchPart]":  # noqa: ARG002
+        """Return ranges of a view's pairs for other processes; nothing where only this one has the file."""
+        return ()
+
+    def close(self) -> None:  # noqa: B027  that is all where no file is open
+        """Close the file; nothing is read after that."""
+
+
+class MatchPart(Protocol):
+    """Some pairs of a view, to be pickled, and opened by another process."""
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs."""
+
+    def open(self) -> AbstractContextManager["View[Any]"]:
+        """Open the file again, for a view of the same images and these pairs, which are read once."""
+
+
+class View(Generic[Seeing]):
+    """Matches between some images, whose indices all that is returned refers to; made by `Matches.at`.
+
+    A pass yields the pairs (i, j), i < j, in their order, and of each those matches whose pixels have rays.
+    """
+
+    def __init__(self, matches: Matches, images: Seeing, left_out: PairNames, reading: Reading) -> None:
+        self.matches, self.images, self.reading = matches, images, reading
+        index = {name: k for k, name in enumerate(images.names)}
+        index_of = np.array([index.get(name, -1) for name in matches.names], dtype=np.int64)
+        assert (np.diff(index_of[index_of >= 0]) > 0).all(), "images must stand in the order of their names"
+        ends = index_of[matches.pairs]
+        kept = (ends >= 0).all(axis=1) & ~is_among(ends, indices_of_pairs(index, left_out))
+        self.rows, self.pairs = np.flatnonzero(kept), ends[kept]
+        """(k,) the pairs by their place in the file, and (k, 2) by the images."""
+        self._counts = matches.num_matches[self.rows]
+        self.num_pairs, self.num_matches = len(self.rows), int(self._counts.sum())
+        count_of = dict(zip(matches.names, matches.num_keypoints.tolist(), strict=True))
+        self.num_keypoints = np.array([count_of.get(name, 0) for name in images.names], dtype=np.int64)
+        """(n,) of each image."""
+        self._rays: OrderedDict[int, FloatArray] = OrderedDict()
+        self._rays_bytes = 0
+        self._kept: dict[int, list[MatchBatch]] = {}
+        self._blind: dict[int, BoolArray | None] = {}
+
+    def keypoints(self, image: int) -> FloatArray:
+        """Return the pixels (k, 2) of the keypoints of an image; errors as of `Matches.keypoints`."""
+        return self.matches.keypoints(self.images.names[image])
+
+    def batches(
+        self, min_matches: int = 1, without: IntArray | None = None, advance: Advance = nobody
+    ) -> Iterator[MatchBatch]:
+        """Yield the matches with rays in world axes, in batches; few matches are kept with these.
+
+        Args:
+            min_matches: pairs with fewer are left out.
+            without: (m, 2) pairs that are left out, too, whatever the order of their images.
+            advance: hears of the pairs that are done, while batches are consumed, and of their number.
+
+        Raises:
+            InputError: as `Matches.read`.
+        """
+        if self.reading.keeps and self.num_matches <= KEPT_MATCHES:
+            if min_matches not in self._kept:
+                self._kept[min_matches] = list(self._batches(self._choose(min_matches), min_matches))
+            found = iter(self._kept[min_matches])
+            if without is not None:
+                some = (batch.without(without) for batch in found)
+                found = (batch for batch in some if len(batch.pairs))
+        else:
+            found = self._batches(self._choose(min_matches, without), min_matches)
+        return self._tell(found, advance)
+
+    def links(
+        self,
+        min_matches: int = 1,
+        without: IntArray | None = None,
+        among: IntArray | None = None,
+        advance: Advance = nobody,
+        *,
+        consume: bool = False,
+    ) -> Iterator[KeypointMatches]:
+        """Yield the matches without their rays, which takes a fraction of the time.
+
+        Args:
+            min_matches: as in `batches`.
+            without: as in `batches`.
+            among: only pairs of these images.
+            advance: as in `batches`.
+            consume: give back the memory of rays, at once and in the end, and then that of very many matches:
+                to make tracks of them takes more memory than anything else.
+
+        Raises:
+            InputError: as `Matches.read`.
+        """
+        found = self._tell(self._links(self._choose(min_matches, without, among), min_matches), advance)
+        if not consume:
+            return found
+        self._forget_rays()
+        hand_back_memory()
+        return self._consumed(found)
+
+    def _consumed(self, links: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
+        """Yield the last matches of these for a while."""
+        yield from links
+        self._forget_rays()  # by which those without a ray are told
+        if self.num_matches > MOST_BESIDE_TRACKS:
+            self.matches.forget()
+
+    def between(self, labels: IntArray) -> Iterator[MatchBatch]:
+        """Yield the matches of pairs whose images have different labels (n,), none of them negative."""
+        ends = labels[self.pairs]
+        return self._batches(np.flatnonzero((ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])), 1)
+
+    def parts(self, max_matches: int) -> Sequence[MatchPart]:
+        """Return all pairs, in their order, in parts of about so many matches; see `Matches.parts`."""
+        totals = np.append(0, np.cumsum(self._counts))
+        count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
+        bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
+        bounds[-1] = len(totals) - 1
+        return self.matches.parts(self, [slice(*ends) for ends in itertools.pairwise(bounds.tolist())])
+
+    def _choose(
+        self, min_matches: int, without: IntArray | None = None, among: IntArray | None = None
+    ) -> IntArray:
+        """Return the pairs that `links` is asked for, by their position."""
+        chosen = self._counts >= min_matches
+        if without is not None:
+            chosen &= ~is_among(self.pairs, without)
+        if among is not None:
+            chosen &= np.isin(self.pairs, among).all(axis=1)
+        return np.flatnonzero(chosen)
+
+    def _tell(self, batches: Iterator[AnyMatches], advance: Advance) -> Iterator[AnyMatches]:
+        """Yield batches, and tell of pairs while they are consumed."""
+        done = 0
+        for batch in batches:
+            yield batch
+            done += len(batch.pairs)
+            advance(done, self.num_pairs)
+        advance(self.num_pairs, self.num_pairs)
+
+    def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
+        """Yield the matches of chosen pairs with their rays."""
+        for found in self._links(chosen, min_matches):
+            rays = np.empty((2, len(found.keypoints), 3))
+            bounds = itertools.pairwise(found.offsets.tolist())
+            for pair, (first, last) in zip(found.pairs.tolist(), bounds, strict=True):
+                for side, image in enumerate(pair):
+                    own = found.keypoints[first:last, side]
+                    self._rays_of(image).take(own, axis=0, out=rays[side, first:last])
+            yield MatchBatch(
+                pairs=found.pairs,
+                offsets=found.offsets,
+                keypoints=found.keypoints,
+                rays_i=rays[0],
+                rays_j=rays[1],
+                pixel_angles=1.0 / self.images.focal_lengths_px[found.pairs].min(axis=1),
+            )
+
+    def _links(self, chosen: IntArray, min_matches: int) -> Iterator[KeypointMatches]:
+        """Yield the matches of chosen pairs whose keypoints have rays, of those pairs that have enough."""
+        for first, last in batch_ranges(self._counts[chosen], self.reading.batch):
+            batch = self._keypoint_batch(chosen[first:last], max(min_matches, 1))
+            if len(batch.pairs):
+                yield batch
+
+    def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
+        """Return the matches of some of the chosen pairs."""
+        pairs = self.pairs[chosen]
+        all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
+        counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
+        if not all_see:
+            has_ray = np.ones(len(keypoints), dtype=np.bool_)
+            ends = itertools.pairwise(np.append(0, np.cumsum(counts)).tolist())
+            for images, (first, last) in zip(pairs.tolist(), ends, strict=True):
+                for side, image in enumerate(images):
+                    blind = self._blind_of(image)
+                    if blind is not None:
+                        has_ray[first:last] &= ~blind[keypoints[first:last, side]]
+            keypoints = keypoints[has_ray]
+            counts = np.bincount(np.repeat(np.arange(len(pairs)), counts)[has_ray], minlength=len(pairs))
+        kept = counts >= min_matches
+        if not kept.all():
+            keypoints = keypoints[np.repeat(kept, counts)]
+        return KeypointMatches(
+            pairs=pairs[kept],
+            offsets=np.append(0, np.cumsum(counts[kept])),
+            keypoints=keypoints.astype(np.int64),
+        )
+
+    def _rays_of(self, image: int) -> FloatArray:
+        """Return the rays (k, 3) of all keypoints of an image, from memory if they were needed lately.
+
+        NaN where a pixel has none, or no match refers to it.
+        """
+        if image in self._rays:
+            self._rays.move_to_end(image)
+            return self._rays[image]
+        xy, matched = self.keypoints(image), self.matches.matched(self.images.names[image])
+        rays, own = np.full((len(xy), 3), np.nan), self.images.world_rays(image, xy[matched])
+        rays[matched] = own
+        self._blind[image] = np.isnan(rays[:, 0]) if np.isnan(own[:, 0]).any() else None
+        self._rays[image] = rays
+        self._rays_bytes += rays.nbytes
+        while self._rays_bytes > self.reading.rays_bytes:
+            self._rays_bytes -= self._rays.popitem(last=False)[1].nbytes
+        return rays
+
+    def _forget_rays(self) -> None:
+        """Give back the memory of the rays that are kept; they are computed again where they are needed."""
+        self._rays.clear()
+        self._rays_bytes = 0
+
+    def _blind_of(self, image: int) -> BoolArray | None:
+        """Return which keypoints of an image have no ray, (k,); None if no match can refer to one."""
+        if image not in self._blind:
+            self._rays_of(image)
+        return self._blind[image]
+
+
+def is_among(pairs: IntArray, others: IntArray) -> BoolArray:
+    """Return which pairs (k, 2) are among others (m, 2), whatever the order of their images."""
+    if len(others) == 0:
+        return np.zeros(len(pairs), dtype=np.bool_)
+    size = 1 + max(int(pairs.max(initial=0)), int(others.max(initial=0)))
+    own, those = (np.sort(ends, axis=1) @ np.array([size, 1]) for ends in (pairs, others))
+    return np.asarray(np.isin(own, those))
+
+
+def indices_of_pairs(index: Mapping[str, int], pairs: PairNames) -> IntArray:
+    """Return pairs (k, 2) by the index of each name; those of images that have none are dropped."""
+    ends = [(index[a], index[b]) for a, b in pairs if a in index and b in index]
+    return np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+
+def batch_ranges(sizes: IntArray, limit: int) -> Iterator[tuple[int, int]]:
+    """Yield ranges [first, last) of consecutive items whose sizes sum to at most `limit`, or of one item."""
+    first, total = 0, 0
+    for item, size in enumerate(sizes.tolist()):
+        if item > first and total + size > limit:
+            yield first, item
+            first, total = item, 0
+        total += size
+    if first < len(sizes):
+        yield first, len(sizes)

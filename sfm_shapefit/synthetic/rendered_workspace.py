@@ -11,6 +11,7 @@ whether it is right (`judge_matches`). The points of the exact model are those s
 right matches. On the CPU and with a seed, all of it is the same on every run, byte by byte.
 """
 
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.graph.viewgraph import connected_components
-from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.matches import MatchBatch, Reading
 from sfm_shapefit.synthetic.models import (
     ModelParts,
     Points,
@@ -105,10 +106,12 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     Raises:
         InputError: if the database cannot be read or has none of the scene's images.
     """
-    with open_database(database, read_model(_parts(scene, None).model(scene.rotations))) as opened:
-        keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
-        batches = opened.iter_matches(min_matches, max_matches_per_batch=opened.num_matches)
-        joined = next(batches, _NO_MATCHES)
+    model = read_model(_parts(scene, None).model(scene.rotations))
+    with closing(open_database(database, model.names)) as matches:
+        in_one = Reading(batch=int(matches.num_matches.sum()))
+        view = matches.at(model, reading=in_one)
+        keypoints = [view.keypoints(k) for k in range(scene.num_images)]
+        joined = next(view.batches(min_matches), _NO_MATCHES)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)

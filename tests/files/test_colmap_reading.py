@@ -1,6 +1,5 @@
 """COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
 
-import dataclasses
 import itertools
 import os
 import shutil
@@ -12,17 +11,18 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.files.colmap import sqlite_file
 from sfm_shapefit.files.colmap.check import check_model_files
-from sfm_shapefit.files.colmap.database import find_database, open_database
+from sfm_shapefit.files.colmap.database import find_database, relative_poses
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.model import PosedModel, camera_rays, read_model, track_matches, world_rays
+from sfm_shapefit.files.colmap.model import PosedModel, camera_rays, read_model
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
-from tests.scenes import edit_database, fingerprint, real_scene
+from sfm_shapefit.scene.matches import PLENTY, Reading
+from tests.scenes import edit_database, fingerprint, real_scene, view_of
 
 EPS = np.finfo(np.float64).eps
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
@@ -140,7 +140,7 @@ def test_the_tiny_model_of_these_tests_is_sound_and_needs_no_points(tmp_path):
         image[4] = []
     model = read_model(write_tiny(tmp_path / "m", records))
     assert model.num_images == 2
-    assert list(track_matches(model)) == []
+    assert track_batches(model) == []
 
 
 def test_binary_files_win_over_text_files_and_poses_in_frames_over_those_in_images(tmp_path):
@@ -167,7 +167,7 @@ def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothin
     before = fingerprint(folder)
     copy = pycolmap.Reconstruction(scene)
     for source in (folder, copy):
-        list(track_matches(read_model(source)))
+        track_batches(read_model(source))
     (tmp_path / "again").mkdir()
     copy.write_binary(tmp_path / "again")
     assert fingerprint(folder) == before == fingerprint(tmp_path / "again")
@@ -417,14 +417,14 @@ def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
     model = read_model(reconstruction)
     xy = rng.uniform([20.0, 20.0], [620.0, 460.0], size=(50, 2))
 
-    rays = world_rays(model, 1, xy)
+    rays = model.world_rays(1, xy)
 
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=8 * EPS)
     back = np.array([camera.img_from_cam(model.rotations[1] @ ray) for ray in rays])
     np.testing.assert_allclose(back, xy, atol=1e-6)  # undistortion iterates to about 1e-10 of f
     focal_px = 640 / (2 * np.pi) if camera_model == "EQUIRECTANGULAR" else 500.0
     assert model.focal_lengths_px[1] == pytest.approx(focal_px)
-    assert world_rays(model, 0, np.zeros((0, 2))).shape == (0, 3)
+    assert model.world_rays(0, np.zeros((0, 2))).shape == (0, 3)
 
 
 def test_rays_that_a_fisheye_folds_back_are_none():
@@ -440,6 +440,11 @@ def test_rays_that_a_fisheye_folds_back_are_none():
     xy = np.array([[240.0 + radius, 240.0] for radius in (100.0, 205.0, 218.0, 230.0)])
     assert np.isfinite(camera.cam_ray_from_img(xy)[:3]).all()  # wrong ones among them
     assert np.isfinite(camera_rays(camera, xy)).all(axis=1).tolist() == [True, True, False, False]
+
+
+def track_batches(model, limit=PLENTY.batch):
+    """Read all matches of a model's own tracks."""
+    return list(TrackMatches(model).at(model, reading=Reading(batch=limit)).batches())
 
 
 def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], set[tuple[int, int]]]:
@@ -487,14 +492,14 @@ def thinned(scene: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def test_track_matches_are_those_of_a_plain_loop_whatever_the_batch_size(scene, limit):
     copy = thinned(scene)
     expected = brute_force_tracks(copy)
-    found = as_sets(track_matches(read_model(copy), limit))
+    found = as_sets(track_batches(read_model(copy), limit))
     assert found == expected
     assert list(found) == sorted(found)
     assert len(expected) == 15
 
 
 def test_track_matches_carry_the_rays_of_their_keypoints(scene, model):
-    (batch,) = track_matches(model)
+    (batch,) = track_batches(model)
     for p, (i, j) in enumerate(batch.pairs.tolist()):
         rows = slice(batch.offsets[p], batch.offsets[p + 1])
         for side, (image, rays) in enumerate(((i, batch.rays_i), (j, batch.rays_j))):
@@ -561,8 +566,8 @@ def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=Non
 
 def read_all(path: Path, model):
     """Read everything a database offers."""
-    with open_database(path, model) as database:
-        return as_sets(database.iter_matches(1)), database.relative_poses()
+    with view_of(path, model) as view:
+        return as_sets(view.batches()), relative_poses(view)
 
 
 ID_ORDERS = {"same ids": lambda i: i, "reversed ids": lambda i: 100 - i, "mixed ids": lambda i: i * 5 % 7}
@@ -574,13 +579,13 @@ def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols
     thin = thinned(scene)
     model = read_model(thin)
     path = write_database(tmp_path / "d.db", thin, ID_ORDERS[order], cols)
-    with open_database(path, model) as database:
-        found = as_sets(database.iter_matches(1))
-        assert database.unmatched_names == ()
-        assert database.num_pairs == len(found)
+    with view_of(path, model) as view:
+        found = as_sets(view.batches())
+        assert view.matches.missing_names == ()
+        assert view.num_pairs == len(found)
         for k, i in enumerate(model.image_ids.tolist()):
             xy = np.array([p.xy for p in thin.image(i).points2D])
-            np.testing.assert_array_equal(database.keypoints(k), xy.astype(np.float32))
+            np.testing.assert_array_equal(view.keypoints(k), xy.astype(np.float32))
     twice = {(i, j) for i, j in found if i == 0}  # image 1 sees one point twice, which a database may say
     expected = brute_force_tracks(thin)
     assert list(found) == sorted(found)
@@ -602,38 +607,13 @@ def test_relative_poses_point_from_camera_j_to_camera_i(scene, model, tmp_path, 
     assert poses.num_inliers.tolist() == [12] * 15
 
 
-@pytest.mark.parametrize("cache_bytes", [0, 10**6])
-def test_rays_of_database_matches_are_those_of_its_keypoints(scene, model, tmp_path, cache_bytes):
-    path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
-    with open_database(path, model) as database:
-        database.limit_rays(cache_bytes)
-        (batch,) = database.iter_matches(1)
-        for p, pair in enumerate(batch.pairs.tolist()):
-            rows = slice(batch.offsets[p], batch.offsets[p + 1])
-            for side, rays in enumerate((batch.rays_i, batch.rays_j)):
-                expected = world_rays(model, pair[side], database.keypoints(pair[side]))
-                np.testing.assert_array_equal(rays[rows], expected[batch.keypoints[rows, side]])
-
-
-def test_batches_of_any_size_join_to_the_same_matches(path, model):
-    with open_database(path, model) as database:
-        (whole,) = database.iter_matches(1)
-        for limit in (1, 12, 30, 10**6):
-            batches = list(database.iter_matches(1, limit))
-            assert all(len(batch.keypoints) <= max(limit, 12) for batch in batches)
-            assert len(batches) == -(-15 // max(limit // 12, 1))
-            for name in ("pairs", "rays_j"):
-                joined = np.concatenate([getattr(batch, name) for batch in batches])
-                np.testing.assert_array_equal(joined, getattr(whole, name))
-
-
 def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
     def change(connection):
         add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
         add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
 
-    with open_database(edit_database(path, change), model) as database:
-        batch = next(database.iter_matches(3))
+    with view_of(edit_database(path, change), model) as view:
+        batch = next(view.batches(3))
     assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
     assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
 
@@ -706,15 +686,15 @@ def assert_poses_point_to_the_first_camera(poses, model):
 
 def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
     edit_database(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
-    with open_database(path, model) as database:
-        assert database.unmatched_names == (model.names[1],)
-        assert database.keypoints(1).shape == (0, 2)
-        assert not any(1 in pair for pair in as_sets(database.iter_matches(1)))
-        assert database.num_pairs == 10
+    with view_of(path, model) as view:
+        assert view.matches.missing_names == (model.names[1],)
+        assert view.keypoints(1).shape == (0, 2)
+        assert not any(1 in pair for pair in as_sets(view.batches()))
+        assert view.num_pairs == 10
     edit_database(path, "UPDATE images SET name = 'other/' || name")
     first = model.names[0]
     message = rf"has 0 of the model's 6 images: the model's {first} .*database's other/.*not in the model"
-    with pytest.raises(InputError, match=message), open_database(path, model):
+    with pytest.raises(InputError, match=message), view_of(path, model):
         pass
 
 
@@ -767,7 +747,7 @@ def test_files_that_are_no_database_are_refused(model, tmp_path):
         ("garbage", "is not a COLMAP database"),
         ("other", "is not a COLMAP database: it has no table images"),
     ):
-        with pytest.raises(InputError, match=message), open_database(tmp_path / name, model):
+        with pytest.raises(InputError, match=message), view_of(tmp_path / name, model):
             pass
     assert sorted(os.listdir(tmp_path)) == ["empty", "garbage", "other"]
 
@@ -784,7 +764,7 @@ def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
     assert 1.0 <= sqlite_file._LOCK_TIMEOUT_S <= 5.0
     monkeypatch.setattr(sqlite_file, "_LOCK_TIMEOUT_S", 0.1)
     writer = begin_writing(path, "BEGIN EXCLUSIVE")
-    with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
+    with pytest.raises(InputError, match="locked by another program"), view_of(path, model):
         pass
     writer.close()
 
@@ -871,72 +851,12 @@ def test_a_real_scene_is_read_in_well_under_ten_seconds():
     folder = real_scene("castle-P30") / "sparse" / "0"
     start = time.process_time()
     model = read_model(folder)
-    with open_database(find_database(folder), model) as database:
-        (batch,) = database.iter_matches(1)
-    (own,) = track_matches(model)
+    with view_of(find_database(folder), model) as view:
+        (batch,) = view.batches()
+    own = track_batches(model)
     # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
     assert time.process_time() - start < 10.0
     assert model.num_images == 30
     assert len(batch.pairs) == 378
     assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
-    assert np.sum(np.diff(own.offsets) >= 15) == 273
-
-
-def test_what_was_read_once_is_not_read_again_by_any_model_of_the_database(path, model, monkeypatch):
-    with open_database(path, model) as database:
-        (whole,) = database.iter_matches(1)
-        monkeypatch.setattr(type(database), "_read_matches", None)  # nothing may be read from here on
-        other = database.among(model).turned(model)
-        few = np.unique(whole.pairs[:3])
-        (again,), (part,) = other.iter_keypoints(1), other.iter_keypoints(1, few)
-        (without,) = other.iter_keypoints(1, without=whole.pairs[:1, ::-1])
-    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
-    np.testing.assert_array_equal(again.offsets, whole.offsets)
-    np.testing.assert_array_equal(without.pairs, whole.pairs[1:])
-    np.testing.assert_array_equal(without.keypoints, whole.keypoints[whole.offsets[1] :])
-    inside = np.isin(whole.pairs, few).all(axis=1)
-    np.testing.assert_array_equal(part.pairs, whole.pairs[inside])
-    rows = np.repeat(inside, np.diff(whole.offsets))
-    np.testing.assert_array_equal(part.keypoints, whole.keypoints[rows])
-
-
-def test_turned_matches_have_the_rays_of_a_database_that_is_opened_with_those_rotations(path, model):
-    axis = np.linspace(0.1, 0.3, 3 * model.num_images).reshape(-1, 3)
-    turned = dataclasses.replace(model, rotations=Rotation.from_rotvec(axis).as_matrix() @ model.rotations)
-    with open_database(path, model) as database, open_database(path, turned) as other:
-        (before,) = database.iter_matches(1)
-        (found,), (expected,) = database.turned(turned).iter_matches(1), other.iter_matches(1)
-    assert not np.array_equal(before.rays_i, expected.rays_i)
-    for name in ("rays_i", "rays_j", "keypoints", "offsets", "pairs"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-
-
-def test_matches_that_are_forgotten_are_read_again(path, model):
-    with open_database(path, model) as database:
-        (whole,) = database.iter_matches(1)
-        database.forget_matches()
-        (again,) = database.iter_matches(1)
-    np.testing.assert_array_equal(again.keypoints, whole.keypoints)
-    np.testing.assert_array_equal(again.rays_i, whole.rays_i)
-
-
-def test_many_matches_are_cleared_and_read_again_for_all_that_share_them_and_few_are_kept(
-    path, model, monkeypatch
-):
-    with open_database(path, model) as database:
-        other = database.turned(model)
-        (whole,) = database.iter_keypoints(1)
-        reads, read = [], type(database)._read_matches
-        monkeypatch.setattr(type(database), "_read_matches", lambda *a: reads.append(a) or read(*a))
-        database.clear_matches()
-        next(database.iter_keypoints(1))
-        assert not reads
-        monkeypatch.setattr("sfm_shapefit.files.colmap.database.MOST_BESIDE_TRACKS", database.num_matches - 1)
-        before = whole.keypoints.copy()
-        database.clear_matches()
-        np.testing.assert_array_equal(whole.keypoints, before)  # what was yielded stays
-        (again,), (shared,) = database.iter_keypoints(1), other.iter_keypoints(1)
-        assert len(reads) == 1
-    for found in (again, shared):
-        np.testing.assert_array_equal(found.keypoints, before)
-        np.testing.assert_array_equal(found.offsets, whole.offsets)
+    assert sum(np.sum(np.diff(batch.offsets) >= 15) for batch in own) == 273

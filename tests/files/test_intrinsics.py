@@ -13,8 +13,8 @@ from sfm_shapefit.files.colmap.intrinsics import (
     with_focal_lengths,
 )
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
-from tests.scenes import RING, copied, edit_database, fingerprint
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 
 MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5}
 
@@ -39,11 +39,11 @@ def database_with(folder, model, params, prior):
 )
 def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, prior, origin):
     path = database_with(tmp_path, model, params, prior)
-    images = read_model(read_images(path).reconstruction)
-    found = {camera: one.origin for camera, one in find_uncalibrated(path, images).items()}
+    images = read_model(read_from(path, read_images).reconstruction)
+    found = {camera: one.origin for camera, one in read_from(path, find_uncalibrated, images).items()}
     assert found == ({} if origin is None else {1: origin})
     # A model whose intrinsics are not the database's got them elsewhere.
-    assert find_uncalibrated(path, read_model(RING / "sparse" / "0")) == {}
+    assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0")) == {}
     doubts = doubt_lenses(images.reconstruction.cameras, found)
     assert set(doubts) == (set() if model == "OPENCV_FISHEYE" else set(found))
 
@@ -62,17 +62,17 @@ def test_a_calibrated_database_is_one_though_some_of_its_cameras_have_no_distort
         "DELETE FROM frame_data",
         f"UPDATE cameras SET params = x'{calibrated}' WHERE camera_id <= {num_calibrated}",
     )
-    found = find_uncalibrated(path, read_model(read_images(path).reconstruction))
+    found = read_from(path, find_uncalibrated, read_model(read_from(path, read_images).reconstruction))
     assert [one.origin for one in found.values()] == [Origin.EXIF] * doubted
 
 
 def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
     path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
     before = fingerprint(tmp_path)
-    factors = calibrate_view_graph(path, [1])
-    assert all(calibrate_view_graph(path, [1]) == factors for _ in range(5))  # to the bit
+    factors = read_from(path, calibrate_view_graph, [1])
+    assert all(read_from(path, calibrate_view_graph, [1]) == factors for _ in range(5))  # to the bit
     assert fingerprint(tmp_path) == before
-    model = read_model(read_images(path).reconstruction)
+    model = read_model(read_from(path, read_images).reconstruction)
     found = with_focal_lengths(model, factors).reconstruction.camera(1).params
     np.testing.assert_allclose(found, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
     assert model.reconstruction.camera(1).params[0] == 1150.0
@@ -86,17 +86,17 @@ def test_pairs_without_depth_say_nothing_of_focal_lengths(tmp_path):
         "UPDATE two_view_geometries SET config = 4 WHERE pair_id NOT IN "
         "(SELECT pair_id FROM two_view_geometries ORDER BY pair_id LIMIT 4)",
     )
-    assert calibrate_view_graph(path, [1]) == {}
+    assert read_from(path, calibrate_view_graph, [1]) == {}
     edit_database(path, "UPDATE two_view_geometries SET config = 3, F = NULL")
-    assert calibrate_view_graph(path, [1]) == {}
+    assert read_from(path, calibrate_view_graph, [1]) == {}
 
 
 def test_pairs_that_are_left_out_say_nothing_of_focal_lengths(tmp_path):
     path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
-    right = calibrate_view_graph(path, [1])
-    ids = {k: image.name for k, image in read_images(path).reconstruction.images.items()}
+    right = read_from(path, calibrate_view_graph, [1])
+    ids = {k: image.name for k, image in read_from(path, read_images).reconstruction.images.items()}
     query = "SELECT pair_id, F FROM two_view_geometries ORDER BY pair_id LIMIT 8"
-    pairs = readonly_rows(path, "two_view_geometries", {("pair_id", "F"): query})
+    pairs = read_from(path, DatabaseFile.rows, "two_view_geometries", {("pair_id", "F"): query})
     # As a lens of twice the focal length would have it, about the same principal point.
     wider = np.array([[0.5, 0.0, 300.0], [0.0, 0.5, 225.0], [0.0, 0.0, 1.0]])
     for pair, blob in pairs:
@@ -104,4 +104,8 @@ def test_pairs_that_are_left_out_say_nothing_of_focal_lengths(tmp_path):
         edit_database(path, f"UPDATE two_view_geometries SET F = x'{wrong}' WHERE pair_id = {pair}")
     names = [[ids[k] for k in divmod(pair, MAX_NUM_IMAGES)] for pair, _ in pairs]
     left_out = frozenset((min(ends), max(ends)) for ends in names)
-    assert calibrate_view_graph(path, [1], left_out) == right != calibrate_view_graph(path, [1])
+    assert (
+        read_from(path, calibrate_view_graph, [1], left_out)
+        == right
+        != read_from(path, calibrate_view_graph, [1])
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg
-from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs import essential as relative_rotations
@@ -16,23 +16,23 @@ from sfm_shapefit.pairs.essential import (
     estimate_relative_rotations,
     stored_relative_rotations,
 )
-from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.matches import MatchBatch, Reading
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.problems import turn
-from tests.scenes import COURTYARD, real_scene
+from tests.scenes import COURTYARD, read_from, real_scene, view_of
 
 MOVE, FORWARD = np.array([1.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def unposed(path):
-    return read_model(read_images(path).reconstruction)
+    return read_model(read_from(path, read_images).reconstruction)
 
 
 def batches(path, max_matches=2_000_000):
     model = unposed(path)
-    with open_database(path, model) as database:
-        return model, list(database.iter_matches(15, max_matches))
+    with view_of(path, model, reading=Reading(batch=max_matches)) as view:
+        return model, list(view.batches(15))
 
 
 def errors_deg(found, truth):
@@ -140,11 +140,11 @@ def test_stored_rotations_count_by_their_matches(tmp_path):
     )
     path = tmp_path / "ring" / "database.db"
     model = unposed(path)
-    with open_database(path, model) as database:
-        every = stored_relative_rotations(database, model)
+    with view_of(path, model) as view:
+        every = stored_relative_rotations(view)
         least = int(np.median(every.num_matches)) + 1
-        few = stored_relative_rotations(database, model, least)
-        poses = database.relative_poses()
+        few = stored_relative_rotations(view, least)
+        poses = relative_poses(view)
     assert 0 < len(few.pairs) < len(every.pairs)
     assert_same_bits(every.subset(every.num_matches >= least), few)
     np.testing.assert_array_equal(every.rotations, poses.rotations)

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.model import from_posed_cameras, posed_cameras, read_model
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
@@ -29,6 +28,7 @@ from sfm_shapefit.pipeline.execution import (
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run_python
+from tests.scenes import view_of
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +48,16 @@ WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()
 
 
 def serial(workspace, model):
-    cameras = posed_cameras(model)
-    with open_database(workspace / "database.db", model) as database:
-        whole = database.rows((0, database.num_pairs))
-    task = PairTask(database=workspace / "database.db", rows=whole, cameras=cameras, work=WORK)
-    (found,) = measure_task(task)
+    with view_of(workspace / "database.db", model) as view:
+        (part,) = view.parts(10**9)
+    (found,) = measure_task(PairTask(part=part, work=WORK))
     return found
 
 
 def shared(workspace, model, executor):
     seen = []
-    with open_database(workspace / "database.db", model) as database:
-        parts = measure_with_workers(database, model, WORK, executor, lambda *done: seen.append(done))
+    with view_of(workspace / "database.db", model) as view:
+        parts = measure_with_workers(view, WORK, executor, lambda *done: seen.append(done))
     return concatenate(parts), seen
 
 
@@ -70,36 +68,6 @@ def assert_same_bits(a, b):
             assert list(ours) == list(theirs)
         else:
             np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
-
-
-def test_parts_cover_all_pairs_once_and_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
-    found = []
-    for one in (model, from_posed_cameras(posed_cameras(model))):
-        with open_database(workspace / "database.db", one) as database:
-            found.append(list(database.iter_matches(1)))
-            whole = np.concatenate([batch.pairs for batch in found[-1]])
-            for size in (1, 700, 10**9):
-                parts = database.parts(size)
-                pieces = [b.pairs for part in parts for b in database.iter_matches(1, part=part)]
-                np.testing.assert_array_equal(np.concatenate(pieces), whole)
-            assert len(database.parts(700)) > 3
-            assert len(database.parts(10**9)) == 1
-    for a, b in zip(*found, strict=True):
-        np.testing.assert_array_equal(a.rays_i, b.rays_i)
-        np.testing.assert_array_equal(a.rays_j, b.rays_j)
-
-
-def test_a_worker_does_not_read_the_table_of_all_pairs(workspace, model, monkeypatch):
-    expected = serial(workspace, model)
-    with open_database(workspace / "database.db", model) as database:
-        halves = [(0, database.num_pairs // 2), (database.num_pairs // 2, database.num_pairs)]
-        rows = [database.rows(half) for half in halves]
-    monkeypatch.delattr("sfm_shapefit.files.colmap.database.read_pairs")
-    tasks = [
-        PairTask(database=workspace / "database.db", rows=own, cameras=posed_cameras(model), work=WORK)
-        for own in rows
-    ]
-    assert_same_bits(concatenate([part for task in tasks for part in measure_task(task)]), expected)
 
 
 def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):

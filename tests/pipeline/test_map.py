@@ -34,7 +34,7 @@ from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.pipeline.test_execution import die_once
 from tests.program import run, run_python
-from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, read_from
 
 PAIR = 2147483647
 FAST = {"points": "never"}
@@ -421,7 +421,7 @@ def test_inlier_matches_are_enough(tmp_path):
         tmp_path,
         "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL",
     )
-    images = read_images(path)
+    images = read_from(path, read_images)
     unposed, truth = read_model(images.reconstruction), read_model(RING / "sparse" / "0")
     found = sfm_shapefit.relative_rotations(path)
     i, j = found.pairs.T

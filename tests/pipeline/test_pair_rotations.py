@@ -16,7 +16,7 @@ from sfm_shapefit.pipeline import relative_rotations as module
 from sfm_shapefit.pipeline.execution import open_executor
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
-from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, read_from
 
 DATABASE = COURTYARD / "database.db"
 
@@ -34,7 +34,7 @@ def assert_same_bits(a, b):
 
 def test_pairs_are_positions_in_the_sorted_names(found):
     before = fingerprint(COURTYARD)
-    images = read_images(DATABASE).reconstruction
+    images = read_from(DATABASE, read_images).reconstruction
     assert found.names == tuple(sorted(image.name for image in images.images.values()))
     i, j = found.pairs.T
     assert (i < j).all()

@@ -32,7 +32,7 @@ from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.program import run
-from tests.scenes import RING, copied, edit_database
+from tests.scenes import RING, copied, edit_database, read_from
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,8 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     centers = 2.0 * (model.centers - model.frame_offsets) + [1.0, 2.0, 3.0] + model.frame_offsets
     placed = model.frame_ids != 5
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
-    seed = build_seed(model, placed, centers)
+    rows = np.flatnonzero(placed)
+    seed = build_seed(model, model.images.placed(rows, centers[rows]))
     ids, found = centers_of(seed)
     expected = model.frame_ids != 5
     assert ids == model.image_ids[expected].tolist()
@@ -531,7 +532,7 @@ def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_p
         copied(workspace, tmp_path) / "database.db",
         "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2",
     )
-    images = read_images(path)
+    images = read_from(path, read_images)
     assert images.rigs.incomplete == (1,)
     assert list(images.rigs.rigs) == [2]
     of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
@@ -552,4 +553,4 @@ def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_p
 def test_a_damaged_rig_of_a_database_is_named(workspace, tmp_path, statement, message):
     path = edit_database(copied(workspace, tmp_path) / "database.db", statement)
     with pytest.raises(InputError, match=message):
-        read_images(path)
+        read_from(path, read_images)

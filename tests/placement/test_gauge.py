@@ -26,7 +26,7 @@ from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angl
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
-from tests.scenes import BUNDLED, RING
+from tests.scenes import BUNDLED, RING, read_from
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -308,7 +308,7 @@ def test_priors_of_a_database_of_any_version_are_read(ring, tmp_path, schema):
         (3, "0002.jpg", [4, 5, 7], np.zeros(9), 1),  # what is not positive definite is not known
     ]
     rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0004.jpg", [np.nan, 0, 0], None, 1)]
-    known = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring).known
+    known = read_from(database_with_priors(tmp_path / "d.db", schema, rows), database_priors, ring).known
     by_name = {
         ring.names[k]: p.tolist() for k, p in zip(known.indices.tolist(), known.positions, strict=True)
     }
@@ -320,10 +320,10 @@ def test_priors_of_a_database_of_any_version_are_read(ring, tmp_path, schema):
 
 def test_a_database_without_usable_priors_is_refused(ring, tmp_path):
     with pytest.raises(InputError, match="no position prior"):
-        database_priors(RING / "database.db", ring)
+        read_from(RING / "database.db", database_priors, ring)
     rows = [(1, "0001.jpg", [1, 2, 3], None, 1), (2, "0002.jpg", [4, 5, 6], None, 0)]
     with pytest.raises(InputError, match="mixes WGS84 and Cartesian"):
-        database_priors(database_with_priors(tmp_path / "d.db", NEW, rows), ring)
+        read_from(database_with_priors(tmp_path / "d.db", NEW, rows), database_priors, ring)
 
 
 def test_locate_turns_the_whole_model_with_its_directions_and_deviations_onto_priors(ring, tmp_path):

@@ -17,7 +17,7 @@ from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.gravity import DOWN, down_of, judge_gravity
 from sfm_shapefit.scene.given import Gravity
 from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
-from tests.scenes import BUNDLED, RING
+from tests.scenes import BUNDLED, RING, read_from
 
 SIGMA_DEG = 0.5
 
@@ -127,18 +127,18 @@ def test_the_gravity_of_pose_priors_is_read(tmp_path):
     path.write_bytes((RING / "database.db").read_bytes())
     model = read_model(RING / "sparse" / "0")
     with pytest.raises(InputError, match="has no gravity of its images; give a table with --gravity"):
-        database_gravity(path, model)
+        read_from(path, database_gravity, model)
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
             prior = pycolmap.PosePrior(gravity=[0.0, 2.0, 0.0], corr_data_id=image.data_id)
             database.write_pose_prior(prior)
-    found = database_gravity(path, model)
+    found = read_from(path, database_gravity, model)
     np.testing.assert_array_equal(found.indices, np.arange(8))
     np.testing.assert_array_equal(found.directions, np.tile([0.0, 1.0, 0.0], (8, 1)))
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE pose_priors SET gravity = x'00'")
     with pytest.raises(InputError, match=r"the gravity of image .* is damaged"):
-        database_gravity(path, model)
+        read_from(path, database_gravity, model)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import pytest
 
 import benchmark
 import sfm_shapefit
-from benchmarks import INDEX, endtoend
-from harness import driver
+from benchmarks import INDEX
+from harness import driver, process
 from harness.driver import RESULTS
 from paper import peers_on_graphs as on_graphs
 from paper import peers_on_scenes as on_scenes
@@ -69,9 +69,9 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
 
 
 def test_a_command_of_a_benchmark_is_run_and_one_that_fails_says_why():
-    assert endtoend.run_command("--version") == f"sfm-shapefit {sfm_shapefit.__version__}\n"
+    assert process.run_command("--version") == f"sfm-shapefit {sfm_shapefit.__version__}\n"
     with pytest.raises(RuntimeError, match=r"inspect ended with code 3: .*nowhere"):
-        endtoend.run_command("inspect", "nowhere")
+        process.run_command("inspect", "nowhere")
 
 
 def test_missing_data_is_a_sentence_per_case_and_no_failure(tmp_path, capsys):

@@ -17,7 +17,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
-from sfm_shapefit.files.colmap.sqlite_file import is_between, readonly_rows
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 
 # No image has a side of so many pixels.
 _LARGEST_SIDE = 2**31
@@ -44,8 +44,8 @@ class UnposedImages:
         return np.array([number[i] for i in frame_ids], dtype=np.int64), np.array(sensors)
 
 
-def read_images(path: Path) -> UnposedImages:
-    """Read cameras and images of a database, which is not changed.
+def read_images(file: DatabaseFile) -> UnposedImages:
+    """Read cameras and images of a database.
 
     Raises:
         InputError: if it is no COLMAP database, has fewer than two images, or a camera or image is damaged.
@@ -53,9 +53,10 @@ def read_images(path: Path) -> UnposedImages:
     camera_columns = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
     image_columns = ("image_id", "name", "camera_id")
     cameras, images = (
-        readonly_rows(path, table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
+        file.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
         for table, columns in (("cameras", camera_columns), ("images", image_columns))
     )
+    path = file.path
     if len(images) < 2:
         raise InputError(
             f"{path} has {len(images)} images, but two or more are needed; extract features first"
@@ -78,7 +79,7 @@ def read_images(path: Path) -> UnposedImages:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    return UnposedImages(reconstruction=model, rigs=read_rigs(path, model))
+    return UnposedImages(reconstruction=model, rigs=read_rigs(file, model))
 
 
 def pose_at_origin(

@@ -1,13 +1,13 @@
 """The tables of a COLMAP database that say which images have matches, checked row by row.
 
-Images of the database and of the model are matched by name, since their ids may differ. A pair of
+Images of the database and of a model are matched by name, since their ids may differ. A pair of
 database images (a, b), a < b, has pair_id = 2147483647 a + b; `cam2_from_cam1` maps camera a to camera b.
 
 Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc`; facts on versions 3.6
 to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
 """
 
-import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +15,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel
-from sfm_shapefit.files.colmap.sqlite_file import columns_of, is_between, refuse_computed
-from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
@@ -36,10 +34,10 @@ _REQUIRED_COLUMNS = {
 
 
 class PairRows(NamedTuple):
-    """The pairs of posed images that have inlier matches, sorted by (i, j)."""
+    """The pairs of some images that have verified inlier matches, sorted by (i, j)."""
 
     pairs: IntArray
-    """(k, 2) model indices, i < j; all else is (k,)."""
+    """(k, 2) images (i, j), i < j, by their place among the names; all else is (k,)."""
     rowids: IntArray
     """Rows of two_view_geometries."""
     swapped: BoolArray
@@ -47,49 +45,30 @@ class PairRows(NamedTuple):
     configs: IntArray
     num_inliers: IntArray
 
-    def without(self, left_out: set[tuple[int, int]]) -> "PairRows":
-        """Return all pairs but some (i, j), i < j."""
-        if not left_out:
-            return self
-        return self.subset(
-            np.flatnonzero([(i, j) not in left_out for i, j in self.pairs.tolist()]).astype(np.int64)
-        )
-
     def subset(self, chosen: IntArray) -> "PairRows":
         """Return the chosen pairs."""
-        return PairRows(
-            pairs=self.pairs[chosen],
-            rowids=self.rowids[chosen],
-            swapped=self.swapped[chosen],
-            configs=self.configs[chosen],
-            num_inliers=self.num_inliers[chosen],
-        )
-
-    @property
-    def has_matches(self) -> BoolArray:
-        """Whether the pair's inlier matches may be used, (k,)."""
-        return np.asarray(~np.isin(self.configs, _CONFIGS_WITHOUT_MATCHES), dtype=np.bool_)
+        return PairRows._make(column[chosen] for column in self)
 
 
-def check_schema(path: Path, connection: sqlite3.Connection) -> None:
+def check_schema(file: DatabaseFile) -> None:
     """Refuse a database without the tables and columns that are read, or that computes what they hold.
 
     A view, a virtual table and a generated column run code of whoever made the database when they are read.
     """
     for table, required in _REQUIRED_COLUMNS.items():
-        refuse_computed(path, connection, table)
-        columns = columns_of(connection, table)
+        file.refuse_computed(table)
+        columns = file.columns(table)
         if missing := [name for name in required if name not in columns]:
             what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
-            raise InputError(f"{path} is not a COLMAP database: it has {what}")
+            raise InputError(f"{file.path} is not a COLMAP database: it has {what}")
 
 
-def match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -> dict[int, int]:
-    """Return for each image id of the database the index of the model's image of that name, or -1."""
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
+    """Return for each image id of the database the place of the image's name in `names`, or -1."""
+    path, index_of_name = file.path, {name: index for index, name in enumerate(names)}
     index_of_id: dict[int, int] = {}
     example, matched = None, set()
-    for image_id, name in connection.execute("SELECT image_id, name FROM images ORDER BY image_id"):
+    for image_id, name in file.query("SELECT image_id, name FROM images ORDER BY image_id"):
         if not (is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
@@ -105,28 +84,26 @@ def match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -
     if not index_of_id:
         raise InputError(f"{path} has no images; run COLMAP's feature extraction and matching first")
     if len(matched) < 2:
-        unmatched = next(name for index, name in enumerate(model.names) if index not in matched)
+        unmatched = next(name for index, name in enumerate(names) if index not in matched)
         there = f", and the database's {example} is not in the model" if example is not None else ""
         raise InputError(
-            f"{path} has {len(matched)} of the model's {model.num_images} images: the model's {unmatched} is "
+            f"{path} has {len(matched)} of the model's {len(names)} images: the model's {unmatched} is "
             f"not in the database{there}; give the database this model was made from"
         )
     return index_of_id
 
 
-def read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> PairRows:
-    """Read which pairs of posed images have inlier matches."""
-    damaged = connection.execute(
+def read_pairs(file: DatabaseFile, index_of_id: dict[int, int]) -> PairRows:
+    """Read which pairs of the images that have an index have verified inlier matches."""
+    damaged = file.query(
         "SELECT pair_id FROM two_view_geometries WHERE typeof(pair_id) != 'integer' "
         "OR typeof(rows) != 'integer' OR typeof(config) != 'integer' OR pair_id < 0 OR rows < 0 LIMIT 1"
-    ).fetchone()
-    if damaged is not None:
-        raise InputError(f"{path}: the two-view geometry of pair {damaged[0]!r} is damaged")
-    rows = connection.execute(
-        "SELECT rowid, pair_id, config, rows FROM two_view_geometries WHERE rows > 0"
-    ).fetchall()
+    )
+    if damaged:
+        raise InputError(f"{file.path}: the two-view geometry of pair {damaged[0][0]!r} is damaged")
+    rows = file.query("SELECT rowid, pair_id, config, rows FROM two_view_geometries WHERE rows > 0")
     rowids, pair_ids, configs, num_inliers = np.array(rows, dtype=np.int64).reshape(-1, 4).T
-    ends = _indices_of_pairs(path, pair_ids, index_of_id)
+    ends = _indices_of_pairs(file.path, pair_ids, index_of_id)
     known = np.logical_and(ends[:, 0] >= 0, ends[:, 1] >= 0)
     swapped = ends[:, 0] > ends[:, 1]
     ends = np.sort(ends, axis=1)
@@ -135,19 +112,13 @@ def read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int
     pairs = ends[order]
     repeated = pair_ids[order[:-1]][(pairs[1:] == pairs[:-1]).all(axis=1)]
     if len(repeated):
-        raise InputError(f"{path}: the two-view geometry of pair {repeated[0]} stands twice")
-    return PairRows(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
-
-
-def indices_of_names(model: PosedModel, pairs: PairNames) -> set[tuple[int, int]]:
-    """Return pairs of names as pairs (i, j) of a model's images, i < j; those of other images are dropped."""
-    index = {name: k for k, name in enumerate(model.names)}
-    ends = [(index[a], index[b]) for a, b in pairs if a in index and b in index]
-    return {(min(pair), max(pair)) for pair in ends}
+        raise InputError(f"{file.path}: the two-view geometry of pair {repeated[0]} stands twice")
+    order = order[~np.isin(configs[order], _CONFIGS_WITHOUT_MATCHES)]
+    return PairRows(ends[order], rowids[order], swapped[order], configs[order], num_inliers[order])
 
 
 def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:
-    """Decode pair ids into model indices (k, 2), first image first; -1: it has no pose."""
+    """Decode pair ids into indices (k, 2), first image first; -1: the image has none."""
     ids = np.stack(np.divmod(pair_ids, MAX_NUM_IMAGES), axis=1)
     known = np.array(sorted(index_of_id), dtype=np.int64)
     position = np.minimum(np.searchsorted(known, ids), len(known) - 1)

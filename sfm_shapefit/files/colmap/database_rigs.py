@@ -19,8 +19,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
-from sfm_shapefit.files.colmap.model import sensors_of
-from sfm_shapefit.files.colmap.sqlite_file import is_between, readonly_rows
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
+from sfm_shapefit.scene.images import Images
 
 _CAMERA = 0
 _POSE_BYTES = 7 * 8
@@ -57,13 +57,16 @@ class DatabaseRigs:
             copy.add_sensor(sensor, pose)
         return copy
 
-    def with_sensors_of(self, model: pycolmap.Reconstruction) -> "DatabaseRigs":
-        """Return the same with the poses that sensors have in a model, where it has them."""
-        poses = sensors_of(model)
+    def with_sensors_of(self, images: Images) -> "DatabaseRigs":
+        """Return the same with the poses that the sensors of images have, all others as they are."""
+        own, row_of = images.sensors, {lens.id: k for k, lens in enumerate(images.lenses)}
         rigs = {rig_id: self.renumbered(rig_id, rig_id) for rig_id in self.rigs}
         for rig in rigs.values():
             for sensor in rig.non_ref_sensors:
-                rig.set_sensor_from_rig(sensor, poses.get(sensor.id, rig.sensor_from_rig(sensor)))
+                if sensor.id in row_of:
+                    k = row_of[sensor.id]
+                    turn = pycolmap.Rotation3d(own.rotations[k])
+                    rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(turn, own.translations[k]))
         return replace(self, rigs=rigs)
 
     def sensor_from_rig(self, image: pycolmap.Image) -> pycolmap.Rigid3d:
@@ -76,20 +79,21 @@ class DatabaseRigs:
         return pose
 
 
-def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
-    """Read the rigs of a database, which is not changed.
+def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRigs:
+    """Read the rigs of a database.
 
     Args:
-        path: the database.
+        file: the database.
         images: its cameras and images.
 
     Raises:
         InputError: if the database cannot be read, or a rig or a frame is damaged.
     """
-    sensors = _rows(path, "rig_sensors", ("rig_id", "sensor_id", "sensor_from_rig"), "sensor_type")
-    references = dict(_rows(path, "rigs", ("rig_id", "ref_sensor_id"), "ref_sensor_type"))
-    rig_of_frame = dict(_rows(path, "frames", ("frame_id", "rig_id")))
-    data = _rows(path, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
+    path = file.path
+    sensors = _rows(file, "rig_sensors", ("rig_id", "sensor_id", "sensor_from_rig"), "sensor_type")
+    references = dict(_rows(file, "rigs", ("rig_id", "ref_sensor_id"), "ref_sensor_type"))
+    rig_of_frame = dict(_rows(file, "frames", ("frame_id", "rig_id")))
+    data = _rows(file, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
     rigs: dict[int, pycolmap.Rig] = {}
     incomplete = {rig_id for rig_id, _, pose in sensors if pose is None}
     for rig_id, camera_id, pose in sensors:
@@ -115,11 +119,11 @@ def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
     )
 
 
-def _rows(path: Path, table: str, columns: tuple[str, ...], kind: str = "") -> list[tuple[Any, ...]]:
+def _rows(file: DatabaseFile, table: str, columns: tuple[str, ...], kind: str = "") -> list[tuple[Any, ...]]:
     """Return rows of a table, of cameras alone where a column says what kind of sensor it is of."""
     of_cameras = f" WHERE {kind} = {_CAMERA}" if kind else ""
     query = f"SELECT {', '.join(columns)} FROM {table}{of_cameras} ORDER BY 1, 2"
-    return readonly_rows(path, table, {(*columns, *([kind] if kind else [])): query})
+    return file.rows(table, {(*columns, *([kind] if kind else [])): query})
 
 
 def _sensor(camera_id: int) -> pycolmap.sensor_t:

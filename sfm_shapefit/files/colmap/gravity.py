@@ -12,7 +12,7 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import PRIORS_OF_IMAGES
-from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Gravity
 
@@ -56,8 +56,8 @@ def table_gravity(path: Path, model: PosedModel) -> Gravity:
     return _gravity(found)
 
 
-def database_gravity(path: Path, model: PosedModel) -> Gravity:
-    """Read the gravity of the pose priors of the model's images, each to 1 degree; nothing is changed.
+def database_gravity(file: DatabaseFile, model: PosedModel) -> Gravity:
+    """Read the gravity of the pose priors of the model's images, each to 1 degree.
 
     Raises:
         InputError: if the database has none of these images, or a damaged one.
@@ -66,18 +66,18 @@ def database_gravity(path: Path, model: PosedModel) -> Gravity:
     index_of_name = {name: index for index, name in enumerate(model.names)}
     found: dict[int, list[float]] = {}
     columns = ("corr_data_id", "corr_sensor_type", "gravity")
-    for name, blob in readonly_rows(path, "pose_priors", {columns: query}):
+    for name, blob in file.rows("pose_priors", {columns: query}):
         if name not in index_of_name or blob is None:
             continue
         if not isinstance(blob, bytes) or len(blob) != 24:
             raise InputError(
-                f"{path}: the gravity of image {name} is damaged; leave it out or write it again"
+                f"{file.path}: the gravity of image {name} is damaged; leave it out or write it again"
             )
         values = np.frombuffer(blob, dtype="<f8")
         if 1.0 / _LARGEST <= float(np.linalg.norm(values)) <= _LARGEST:
             found[index_of_name[name]] = [*values.tolist(), _SIGMA_DEG]
     if not found:
-        raise InputError(f"{path} has no gravity of its images; give a table with --gravity")
+        raise InputError(f"{file.path} has no gravity of its images; give a table with --gravity")
     return _gravity(found)
 
 

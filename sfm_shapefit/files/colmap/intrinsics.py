@@ -14,7 +14,7 @@ nothing else of the user's. Pairs whose matches fit a homography say nothing, so
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from enum import Enum
 from pathlib import Path
@@ -24,12 +24,12 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.lenses import is_adjusted, lens_of
+from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
-from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
-from sfm_shapefit.files.pair_list import PairNames
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.lens import LensDoubt
+from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 
 
 class Origin(Enum):
@@ -64,11 +64,11 @@ class Uncalibrated(NamedTuple):
     """Its id in the database."""
 
 
-def find_uncalibrated(database: Path, model: PosedModel) -> dict[int, Uncalibrated]:
+def find_uncalibrated(database: DatabaseFile, model: PosedModel) -> dict[int, Uncalibrated]:
     """Return the cameras of a model that have the very intrinsics which a database guessed, by their id.
 
     Args:
-        database: which is not changed.
+        database: has them.
         model: whose images are those of the database by name.
 
     Raises:
@@ -76,7 +76,7 @@ def find_uncalibrated(database: Path, model: PosedModel) -> dict[int, Uncalibrat
     """
     columns = ("camera_id", "width", "height", "params", "prior_focal_length")
     query = f"SELECT images.name, {', '.join(columns)} FROM images JOIN cameras USING (camera_id)"
-    rows = {name: row for name, *row in readonly_rows(database, "cameras", {columns: query})}
+    rows = {name: row for name, *row in database.rows("cameras", {columns: query})}
     found: dict[int, Uncalibrated] = {}
     for image_id, name in zip(model.image_ids.tolist(), model.names, strict=True):
         camera = model.reconstruction.camera(model.reconstruction.image(image_id).camera_id)
@@ -109,7 +109,7 @@ def doubt_lenses(
     return {
         camera_id: LensDoubt(lens_of(cameras[camera_id]), _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
         for camera_id, origin in sorted(origins.items())
-        if is_adjusted(cameras[camera_id])
+        if lens_of(cameras[camera_id]).is_adjustable
     }
 
 
@@ -149,12 +149,12 @@ def differ_in_rays(one: PosedModel, other: PosedModel) -> bool:
 
 
 def calibrate_view_graph(
-    database: Path, cameras: Collection[int], left_out: PairNames = frozenset()
+    database: DatabaseFile, cameras: Collection[int], left_out: PairNames = frozenset()
 ) -> dict[int, float]:
     """Return by which factors the fundamental matrices of a database want other focal lengths, by camera.
 
     Args:
-        database: which is not changed.
+        database: has the matrices.
         cameras: that are asked, by their id there; all others are held.
         left_out: pairs of images that say nothing.
 
@@ -189,7 +189,7 @@ def calibrate_view_graph(
 Rows = list[tuple[Any, ...]]
 
 
-def _read_tables(database: Path, left_out: PairNames) -> dict[str, Rows]:
+def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]:
     """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
     cameras = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
     images = ("image_id", "name", "camera_id")
@@ -204,20 +204,11 @@ def _read_tables(database: Path, left_out: PairNames) -> dict[str, Rows]:
             f"SELECT {', '.join(pairs)} FROM two_view_geometries {where} LIMIT {most}",
         ),
     }
-    found = {
-        table: readonly_rows(database, table, {needed: query}) for table, (needed, query) in queries.items()
-    }
+    found = {table: database.rows(table, {needed: query}) for table, (needed, query) in queries.items()}
     ids = {name: image_id for image_id, name, _ in found["images"]}
-    unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in _ends_of(left_out, ids)}
+    unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in indices_of_pairs(ids, left_out).tolist()}
     kept = [row for row in found["two_view_geometries"] if row[0] not in unwanted]
     return found | {"two_view_geometries": kept[:_MOST_PAIRS]}
-
-
-def _ends_of(pairs: PairNames, ids: Mapping[str, int]) -> Iterator[tuple[int, int]]:
-    """Yield the ids of the images of pairs that the database has."""
-    for first, second in pairs:
-        if first in ids and second in ids:
-            yield ids[first], ids[second]
 
 
 def _with_enough_pairs(tables: Mapping[str, Rows], asked: set[int]) -> set[int]:

@@ -11,7 +11,7 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -24,10 +24,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
+from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.posed_model import PosedModelFile
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -54,6 +55,8 @@ class PosedModel:
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
+    images: Images
+    """The same n images as arrays, in the same order."""
     image_ids: IntArray
     """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
@@ -89,6 +92,19 @@ class PosedModel:
         """Return the camera of an image by its index."""
         return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
 
+    def world_rays(self, image: int, xy: FloatArray) -> FloatArray:
+        """Return the unit rays R^T f(xy) of pixels in world axes.
+
+        Args:
+            image: its index.
+            xy: (k, 2) pixels in COLMAP's convention: the center of the first pixel is (0.5, 0.5).
+
+        Returns:
+            (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
+        """
+        rays = camera_rays(self.camera(image), np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2))
+        return normalized(rays @ self.rotations[image])
+
     def image_sizes(self) -> FloatArray:
         """Return width and height of each image in pixels, (n, 2)."""
         cameras = map(self.camera, range(self.num_images))
@@ -101,14 +117,6 @@ def sensors_of(reconstruction: pycolmap.Reconstruction) -> dict[int, pycolmap.Ri
     return {
         sensor.id: pose for rig in rigs for sensor, pose in rig.non_ref_sensors.items() if pose is not None
     }
-
-
-def same_intrinsics(one: PosedModel, other: PosedModel) -> bool:
-    """Return whether two models of the same images take them through the same lenses."""
-    cameras = [
-        {i: camera.params.tolist() for i, camera in m.reconstruction.cameras.items()} for m in (one, other)
-    ]
-    return cameras[0] == cameras[1]
 
 
 def posed_cameras(model: PosedModel) -> PosedModelFile:
@@ -137,6 +145,7 @@ def from_posed_cameras(scene: PosedModelFile) -> PosedModel:
         reconstruction.add_image_with_trivial_frame(image)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_of(reconstruction),
         image_ids=image_ids,
         names=scene.names,
         rotations=scene.rotations,
@@ -173,46 +182,17 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
-    """Return the model with the frames' rotations, the rigs and the intrinsics of another; no input changes.
+def turned_model(model: PosedModel, turned: Images) -> PosedModel:
+    """Return the model with the frames' rotations, the sensors and the lenses of images; no input changes.
 
     Args:
         model: the posed images.
-        turned: with the cameras and some of the frames of it. Frames turn about their own centers; where a
-            rotation is the same, the pose keeps its bits.
+        turned: some of them. Frames turn about their own centers; what is the same keeps its bits.
     """
-    copy = pycolmap.Reconstruction(model.reconstruction)
-    for camera_id, camera in turned.cameras.items():
-        if camera.params.tolist() != copy.camera(camera_id).params.tolist():
-            copy.camera(camera_id).params = camera.params
-    for rig_id, rig in turned.rigs.items():
-        for sensor, sensor_from_rig in rig.non_ref_sensors.items():
-            copy.rig(rig_id).set_sensor_from_rig(sensor, sensor_from_rig)
-    for frame_id in sorted(turned.reg_frame_ids()):
-        frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
-        pose = frame.rig_from_world
-        assert pose is not None  # posed frames of one model are posed in the other
-        assert other is not None
-        rotation = other.rotation
-        if (rotation.quat != pose.rotation.quat).any():
-            center = -(pose.rotation.matrix().T @ pose.translation)
-            frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    own, copy = model.images.frames, pycolmap.Reconstruction(model.reconstruction)
+    rows = np.searchsorted(own.ids, turned.frames.ids)
+    put_images(copy, turned.posed(turned.frames.rotations, own.centers[rows]))
     return read_model(copy)
-
-
-def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
-    """Return the unit rays R^T f(xy) of pixels in world axes.
-
-    Args:
-        model: the posed images.
-        image: index into `model.image_ids`.
-        xy: (k, 2) pixels in COLMAP's convention: the center of the first pixel is (0.5, 0.5).
-
-    Returns:
-        (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
-    """
-    rays = camera_rays(model.camera(image), np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2))
-    return normalized(rays @ model.rotations[image])
 
 
 def camera_rays(camera: pycolmap.Camera, xy: FloatArray) -> FloatArray:
@@ -230,25 +210,6 @@ def camera_rays(camera: pycolmap.Camera, xy: FloatArray) -> FloatArray:
         false = ahead & ~(np.abs(back - xy).max(axis=1) <= _ROUND_TRIP_PX)
     rays[false] = np.nan
     return rays
-
-
-def track_matches(model: PosedModel, max_matches_per_batch: int = 2_000_000) -> Iterator[MatchBatch]:
-    """Yield the pairs of images that share any of the model's own 3D points.
-
-    The keypoints of a match are the `points2D` indices of the two images. An image that observes the
-    same 3D point with several keypoints gives no match for that point: it is unknown which one is right. A
-    batch holds all pairs (i, j > i) of one or more images i; only of a single image it has more matches than
-    `max_matches_per_batch`.
-
-    Raises:
-        InputError: if an observed point of an image is not finite.
-    """
-    tracks = _Observations.of(model)
-    num_matches = np.bincount(tracks.images, tracks.num_following(), model.num_images)
-    for first, last in batch_ranges(num_matches, max_matches_per_batch):
-        batch = _track_batch(tracks, slice(first, last), model.focal_lengths_px)
-        if len(batch.pairs):
-            yield batch
 
 
 # --- reading ---------------------------------------------------------------------------------------
@@ -325,8 +286,10 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
+    images_as_arrays = images_of(reconstruction)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_as_arrays.part(np.flatnonzero(np.isin(images_as_arrays.ids, image_ids))),
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
         names=names,
         rotations=frozen(rotations),
@@ -385,7 +348,7 @@ def _focal_lengths_px(label: str, cameras: list[pycolmap.Camera]) -> FloatArray:
     return np.array(focals, dtype=np.float64)
 
 
-# --- tracks ----------------------------------------------------------------------------------------
+# --- points ----------------------------------------------------------------------------------------
 
 
 def points2d_xy(image: pycolmap.Image) -> FloatArray:
@@ -406,48 +369,6 @@ def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
     return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Observations:
-    """All unambiguous observations of 3D points by posed images, sorted by point, then by image."""
-
-    images: IntArray
-    """(O,) index of the image."""
-    keypoints: IntArray
-    """(O,) index of the point in the image's points2D."""
-    rays: FloatArray
-    """(O, 3) unit rays in world axes."""
-    track_ends: IntArray
-    """(O,) position after the last observation of the same 3D point."""
-    by_image: IntArray
-    """(O,) positions of the observations, image by image."""
-    image_starts: IntArray
-    """(n + 1,) the observations of image i are by_image[image_starts[i]:image_starts[i + 1]]."""
-
-    @classmethod
-    def of(cls, model: PosedModel) -> "_Observations":
-        """Collect the observations of a model."""
-        ids, images, keypoints, rays = sort_observations(
-            [_image_observations(model, image) for image in range(model.num_images)]
-        )
-        same_as_next = (ids[1:] == ids[:-1]) & (images[1:] == images[:-1])
-        ambiguous = np.append(same_as_next, False) | np.insert(same_as_next, 0, False)
-        keep = ~ambiguous & np.isfinite(rays).all(axis=1)
-        ids, images = ids[keep], images[keep]
-        _, track_sizes = np.unique(ids, return_counts=True)
-        return cls(
-            images=images,
-            keypoints=keypoints[keep],
-            rays=rays[keep],
-            track_ends=np.repeat(np.cumsum(track_sizes), track_sizes),
-            by_image=np.argsort(images, kind="stable"),
-            image_starts=np.append(0, np.cumsum(np.bincount(images, minlength=model.num_images))),
-        )
-
-    def num_following(self) -> IntArray:
-        """Return how many observations of the same 3D point come after each one, (O,)."""
-        return self.track_ends - np.arange(len(self.track_ends)) - 1
-
-
 def sort_observations(
     parts: Sequence[tuple[UInt64Array, IntArray, FloatArray]],
 ) -> tuple[UInt64Array, IntArray, IntArray, FloatArray]:
@@ -463,47 +384,3 @@ def sort_observations(
     ids, keypoints, values = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(ids, kind="stable")
     return ids[order], images[order], keypoints[order], values[order]
-
-
-def _image_observations(model: PosedModel, index: int) -> tuple[UInt64Array, IntArray, FloatArray]:
-    """Return point ids, keypoint indices and rays of the observed points of one image."""
-    image = model.reconstruction.image(int(model.image_ids[index]))
-    keypoints, ids = observed_points(image)
-    xy = points2d_xy(image)[keypoints]
-    if not np.isfinite(xy).all():
-        raise InputError(f"image {image.name} has a point whose coordinates are not finite")
-    return ids, keypoints, world_rays(model, index, xy)
-
-
-def batch_ranges(sizes: FloatArray | IntArray, limit: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges [first, last) of consecutive items whose sizes sum to at most `limit`, or of one item."""
-    first, total = 0, 0.0
-    for item, size in enumerate(sizes.tolist()):
-        if item > first and total + size > limit:
-            yield first, item
-            first, total = item, 0.0
-        total += size
-    if first < len(sizes):
-        yield first, len(sizes)
-
-
-def _track_batch(tracks: _Observations, images: slice, focal_lengths_px: FloatArray) -> MatchBatch:
-    """Return the matches of all pairs (i, j > i) with i among the images."""
-    num_images = len(focal_lengths_px)
-    own = tracks.by_image[tracks.image_starts[images.start] : tracks.image_starts[images.stop]]
-    follows = tracks.num_following()[own]
-    left = np.repeat(own, follows)
-    right = left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)
-    pair = tracks.images[left] * num_images + tracks.images[right]
-    order = np.lexsort((tracks.keypoints[left], pair))
-    left, right, pair = left[order], right[order], pair[order]
-    keys, counts = np.unique(pair, return_counts=True)
-    pairs = np.stack(np.divmod(keys, num_images), axis=1)
-    return MatchBatch(
-        pairs=pairs,
-        offsets=np.append(0, np.cumsum(counts)),
-        keypoints=np.stack([tracks.keypoints[left], tracks.keypoints[right]], axis=1),
-        rays_i=tracks.rays[left],
-        rays_j=tracks.rays[right],
-        pixel_angles=1.0 / focal_lengths_px[pairs].min(axis=1),
-    )

@@ -16,7 +16,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel
-from sfm_shapefit.files.colmap.sqlite_file import readonly_rows
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -36,14 +36,14 @@ class MissingPriorsError(InputError):
     """A database that has no position prior of a model's images."""
 
 
-def database_priors(path: Path, model: PosedModel) -> PositionPriors:
-    """Read the pose priors of the model's images, matched by name, from a database, which is not changed.
+def database_priors(file: DatabaseFile, model: PosedModel) -> PositionPriors:
+    """Read the pose priors of the model's images, matched by name, from a database.
 
     Raises:
         MissingPriorsError: if the database has no prior of these images.
         InputError: if it mixes coordinate systems, or is damaged.
     """
-    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    path, found = file.path, dict[int, tuple[FloatArray, FloatArray]]()
     systems: set[int] = set()
     index_of_name = {name: index for index, name in enumerate(model.names)}
     selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
@@ -54,7 +54,7 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
         ("image_id", covariances): selected.format(covariances, by_image),
         ("image_id", "position"): selected.format("NULL", by_image),
     }
-    for name, position, covariance, system in readonly_rows(path, "pose_priors", queries):
+    for name, position, covariance, system in file.rows("pose_priors", queries):
         index = index_of_name.get(name)
         xyz = _numbers(path, name, position, 3)
         if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():

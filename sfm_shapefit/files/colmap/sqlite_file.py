@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,30 +51,74 @@ def is_between(value: object, least: int, bound: int) -> bool:
     return isinstance(value, int) and least <= value < bound
 
 
-def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
-    """Return the rows of the first query whose columns `table` has; none if it fits none of them.
+class DatabaseFile:
+    """An open database; neither the file nor its folder is changed."""
 
-    Args:
-        path: the database; it is not changed.
-        table: whose columns decide, for schemas differ from version to version.
-        queries: what to select, by the columns of `table` that it needs.
+    def __init__(self, path: Path | str) -> None:
+        """Open a database.
 
-    Raises:
-        InputError: if the file is missing, is no sqlite database, is locked or damaged, or if the rows of
-            the table, or of images, which queries join, are computed.
-    """
-    with sqlite_errors(path), readonly_connection(path) as connection:
+        Raises:
+            InputError: if the file is missing, is no sqlite database, or is locked or damaged.
+        """
+        self.path, self._stack = Path(path), ExitStack()
+        with _sqlite_errors(self.path):
+            self.connection = self._stack.enter_context(_readonly_connection(self.path))
+
+    def close(self) -> None:
+        """Close the database; nothing is read after that."""
+        self._stack.close()
+
+    def query(self, statement: str, *values: int | str) -> list[tuple[Any, ...]]:
+        """Return the rows of a statement.
+
+        Raises:
+            InputError: if the file is locked or damaged.
+        """
+        with _sqlite_errors(self.path):
+            return self.connection.execute(statement, values).fetchall()
+
+    def look_up(self, statement: str, values: Iterable[int]) -> list[tuple[Any, ...]]:
+        """Return the row of a statement for each value; errors as of `query`."""
+        with _sqlite_errors(self.path):
+            return [self.connection.execute(statement, (value,)).fetchone() for value in values]
+
+    def rows(self, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
+        """Return the rows of the first query whose columns `table` has; none if it fits none of them.
+
+        Args:
+            table: whose columns decide, for schemas differ from version to version.
+            queries: what to select, by the columns of `table` that it needs.
+
+        Raises:
+            InputError: as `query`, and if rows of the table, or of images, which queries join, are computed.
+        """
         for stored in (table, "images"):
-            refuse_computed(path, connection, stored)
-        columns = columns_of(connection, table)
-        for needed, query in queries.items():
-            if columns.issuperset(needed):
-                return connection.execute(query).fetchall()
-    return []
+            self.refuse_computed(stored)
+        columns = self.columns(table)
+        return next(
+            (self.query(query) for needed, query in queries.items() if columns.issuperset(needed)), []
+        )
+
+    def columns(self, table: str) -> set[str]:
+        """Return the names of a table's columns, none if there is no such table."""
+        return {row[0] for row in self.query("SELECT name FROM pragma_table_info(?)", table)}
+
+    def refuse_computed(self, table: str) -> None:
+        """Refuse a table that is none, or whose rows are computed."""
+        kinds = self.query(
+            "SELECT type, rootpage FROM sqlite_master WHERE type IN ('table', 'view') AND lower(name) = ?",
+            table,
+        )
+        what = f"{self.path} is not a COLMAP database: its {table}"
+        if any(kind != "table" or not page for kind, page in kinds):  # a virtual table has no page of its own
+            raise InputError(f"{what} is a view or a virtual table, not a table")
+        hidden = self.query("SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", table)
+        if hidden:
+            raise InputError(f"{what} has a computed column {hidden[0][0]!r}")
 
 
 @contextmanager
-def sqlite_errors(path: Path) -> Iterator[None]:
+def _sqlite_errors(path: Path) -> Iterator[None]:
     """Turn sqlite's errors into one sentence that names the database."""
     try:
         yield
@@ -85,7 +129,7 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
+def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
     """Connect to a database so that no file of it changes and none appears; see the module's header."""
     header = _read_header(path)
     with ExitStack() as stack:
@@ -106,28 +150,6 @@ def readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
         connection.execute("PRAGMA cell_size_check = ON")
         connection.execute("PRAGMA query_only = ON")
         yield connection
-
-
-def columns_of(connection: sqlite3.Connection, table: str) -> set[str]:
-    """Return the names of a table's columns, none if there is no such table."""
-    return {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
-
-
-def refuse_computed(path: Path, connection: sqlite3.Connection, table: str) -> None:
-    """Refuse a table that is none, or whose rows are computed."""
-    kinds = connection.execute(
-        "SELECT type, rootpage FROM sqlite_master WHERE type IN ('table', 'view') AND lower(name) = ?",
-        (table,),
-    )
-    if any(kind != "table" or not page for kind, page in kinds):  # a virtual table has no page of its own
-        raise InputError(
-            f"{path} is not a COLMAP database: its {table} is a view or a virtual table, not a table"
-        )
-    hidden = connection.execute(
-        "SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", (table,)
-    ).fetchone()
-    if hidden is not None:
-        raise InputError(f"{path} is not a COLMAP database: its {table} has a computed column {hidden[0]!r}")
 
 
 def is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:

@@ -1,17 +1,16 @@
-"""What an adjustment of a model gives back, and how well it knows that."""
+"""What an adjustment gives back: images where they stand, and how well that is known."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import pycolmap
-
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.adjustment.free_sensors import SensorSigma
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.wording import counted
+from sfm_shapefit.scene.images import Images
 
 
 class RefinedLenses(NamedTuple):
@@ -29,55 +28,33 @@ UNREFINED = RefinedLenses({}, ())
 """Where no lens was free."""
 
 
-class Uncertainty(NamedTuple):
-    """How well an adjustment knows centers and scale, see `adjustment.shared_errors`."""
-
-    covariances: Mapping[int, FloatArray] = {}
-    """(3, 3) of the center of each image by its id, in squared units of the seed; an image of a rig has its
-    frame's. Empty where they are not known."""
-    scale_sigma: float | None = None
-    """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Adjusted:
-    """A bundle adjustment's answer and how it went."""
+class Estimate:
+    """Where images stand after an adjustment, how well that is known, and how it went."""
 
-    reconstruction: pycolmap.Reconstruction
-    """New poses and points, filtered; point errors updated."""
-    initial_error_px: float
-    """Mean reprojection error at the seed's poses, of the points triangulated and filtered there."""
-    final_error_px: float
-    """Mean reprojection error of the filtered points of the answer."""
-    converged: bool
-    """Whether the last solve met its tolerance within its limit of 100 steps."""
-    iterations: int
-    """Steps of all solves together."""
-    uncertainty: Uncertainty
-    """Empty for models of more frames than are worth the time."""
-    lenses: RefinedLenses = UNREFINED
-    """What became of lenses that were free."""
-    sensors: Mapping[int, SensorSigma] = field(default_factory=dict)
-    """Of the sensors that were free in their rigs, by the ids of their cameras."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AdjustedPlacement:
-    """Placed cameras after adjustment, and what became of their rotations."""
-
-    reconstruction: pycolmap.Reconstruction
-    """The adjusted poses, without points."""
+    images: Images
+    """All posed."""
     weight: RotationWeight
     """How the given rotations were treated."""
-    frame_ids: tuple[int, ...]
-    """The frames, in the order of its standard deviations."""
-    errors: RotationErrors | None
+    errors: RotationErrors | None = None
     """What the matches said of them, if they were asked."""
-    uncertainty: Uncertainty
+    covariances: FloatArray | None = None
+    """(i, 3, 3) of the centers, an image of a rig having its frame's, in squared units of the images; see
+    `shared_errors`. None where they are not known, as of models of more frames than are worth the time."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
     sensors: Mapping[int, SensorSigma] = field(default_factory=dict)
     """Of the sensors that were free in their rigs, by the ids of their cameras."""
+    initial_error_px: float = math.nan
+    """Mean reprojection error at the poses of the start, of the points triangulated there."""
+    final_error_px: float = math.nan
+    """Mean reprojection error of the points of the answer."""
+    converged: bool = True
+    """Whether the last solve met its tolerance within its limit of 100 steps."""
+    iterations: int = 0
+    """Steps of all solves together."""
 
     @property
     def statement(self) -> str:
