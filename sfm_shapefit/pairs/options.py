@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from sfm_shapefit.base.settings import Settings, explained, option
 
+LEAST_MATCHES = 15
+"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
+
 
 @explained
 @dataclass(frozen=True, kw_only=True)

@@ -51,7 +51,3 @@ class RelativeRotations:
 
 AGREEMENT_DEG = 5.0
 """Pairs agree with averaged rotations up to here."""
-
-
-LEAST_MATCHES = 15
-"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""

@@ -31,7 +31,8 @@ from sfm_shapefit.files.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.files.colmap.model import PosedModel, read_model, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
-from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
+from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.components import ComponentAveraging, pairs_among

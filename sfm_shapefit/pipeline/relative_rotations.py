@@ -18,7 +18,8 @@ from sfm_shapefit.pairs.essential import (
     estimate_relative_rotations,
     stored_relative_rotations,
 )
-from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
+from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.scene.matches import View

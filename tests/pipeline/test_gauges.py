@@ -108,13 +108,14 @@ def test_priors_fit_best_as_they_are(ring, adjusted, tmp_path, pulled):
         # What is pulled fits better than any similarity of what was placed.
         assert np.median(np.linalg.norm(centers - positions, axis=1)) < 1.538 * 0.02
         return
-    information = np.tile(0.02**-2 * np.eye(3), (len(positions), 1, 1))
+    information = np.full((len(positions), 3, 3), np.nan)
     known = KnownPositions(np.arange(len(positions)), positions, information)
     priors = PositionPriors(known=known, statement="")
     again = prior_gauge(centers, priors)
-    assert again.similarity.scale == pytest.approx(1.0, abs=EXACT)
-    np.testing.assert_allclose(again.axes, np.eye(3), atol=EXACT)
-    np.testing.assert_allclose(again.similarity.translation, 0.0, atol=1e3 * EXACT)
+    # Weights by the level of the residuals are no fixed point after twenty rounds.
+    assert again.similarity.scale == pytest.approx(1.0, abs=1e-4)
+    np.testing.assert_allclose(again.axes, np.eye(3), atol=1e-4)
+    np.testing.assert_allclose(again.similarity.translation, 0.0, atol=0.1)
     np.testing.assert_allclose(found.gauge.axes, turn, atol=0.02)
     assert_in_the_axes_of(found.model, rotations @ found.gauge.axes)
     assert_says_where(found, centers)
