@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from paper.trials import Cell, Results, run_trials
-from sfm_shapefit.synthetic.graphs import Corruption
+from sfm_shapefit.synthetic.graphs import CorruptionKind
 
 SEED = 0
 EXACT = 1e-9
@@ -34,7 +34,7 @@ class Panel:
     sigma: float = 0.0
     p: float = 0.5
     d: int = 3
-    corruption: Corruption = "uniform"
+    corruption: CorruptionKind = "uniform"
 
     def cells(self) -> list[Cell]:
         return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
@@ -63,7 +63,7 @@ FIGURES: dict[str, list[Panel]] = {
     "methods": [_coarse(f"{m}, {words}", m, sigma=s) for s, words in NOISES for m in METHODS_SHOWN],
     "corruption": [
         _coarse(f"{m}, {kind}", m, corruption=kind)
-        for kind in get_args(Corruption)
+        for kind in get_args(CorruptionKind)
         for m in METHODS_SHOWN[:3]
     ],
     "density": [_coarse(f"ShapeFit, p = {p}", "ShapeFit", p=p) for p in (0.25, 0.5, 0.75)],

@@ -22,7 +22,7 @@ from sfm_shapefit import ShapeFitError, UnsolvableError, place, solve
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.synthetic.graphs import Corruption, GraphProblem, random_graph_problem
+from sfm_shapefit.synthetic.graphs import CorruptionKind, GraphProblem, random_graph_problem
 
 NOT_RECOVERED = 1.0
 """The error of a problem that has no unique answer, as in the paper's black cells."""
@@ -76,7 +76,7 @@ class Cell:
     sigma: float = 0.0
     p: float = 0.5
     d: int = 3
-    corruption: Corruption = "uniform"
+    corruption: CorruptionKind = "uniform"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,15 +1,13 @@
 """Folders that appear whole or not at all: written in a private folder beside their place, then renamed.
 
 A rename inside one file system is atomic: nobody ever sees a folder that is half written. With `overwrite`
-old and new change places in one step where the system can do that (Linux: renameat2); elsewhere the old one
-is moved aside first.
+old and new change places in one step where the system can (Linux: renameat2); elsewhere the old one is moved
+aside first.
 
-The private folder `.shapefit-<hash of the name>.partial` is also the claim on a place: the run that made it
-holds a lock on it (flock) as long as it lives. So a second run into the same place is told so, and what a
-killed run left behind is known by its free lock, and removed by the next run that writes to the same parent.
-
-The folder of a `locate` run is known by its `locate.json`, that of `map` by its `map.json`; nothing else
-that holds files is ever replaced.
+The private folder `.shapefit-<hash of the name>.partial` is also the claim on a place: its run holds a lock
+on it (flock) as long as it lives. A second run into the same place is told so, and a folder whose lock is
+free was left by a killed run: the next one that writes to the same parent removes it. A folder that holds
+files is replaced only if it has a `locate.json` or `map.json`, as runs leave them.
 """
 
 import ctypes
@@ -33,16 +31,12 @@ MAP_MARKER = "map.json"
 
 
 def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:
-    """Refuse an output folder that cannot or must not be written.
+    """Raise InputError, one sentence that says what to do instead, if an output folder may not be written.
 
     Args:
         out: the folder to be made; missing parents are fine.
         overwrite: accept an existing folder if it is empty or an earlier output (it has a marker).
-        protect: files and folders that must survive, such as the input model and its database: `out` may
-            neither be one of them nor contain one.
-
-    Raises:
-        InputError: one sentence that names the folder and says what to do instead.
+        protect: files and folders, such as the input, that `out` may neither be nor contain.
     """
     folder = Path(out)
     _refuse_protected(folder, protect)
@@ -62,14 +56,7 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 def claimed_output(
     out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
 ) -> Iterator[None]:
-    """Hold the place of an output folder while the block works; `atomic_folder` inside it writes there.
-
-    Args:
-        out, overwrite, protect: see `check_output`, which is called first.
-
-    Raises:
-        InputError: from `check_output`, or if another run holds the place.
-    """
+    """Hold the place of an output folder, as `check_output` has it, while `atomic_folder` inside writes."""
     check_output(out, overwrite=overwrite, protect=protect)
     with _claim(Path(os.path.abspath(out))) as private:
         token = _claimed.set(private)
@@ -85,16 +72,12 @@ def atomic_folder(
 ) -> Iterator[Path]:
     """Yield a new empty folder that becomes `out` when the block ends, and vanishes if it raises.
 
-    The block should only write: an OSError inside it is reported as "cannot be written".
-
-    Args:
-        out, overwrite, protect: see `check_output`, which is called first.
+    Arguments as of `check_output`, which is called first. The block should only write.
 
     Raises:
         InputError: from `check_output`, if another run holds the place, if writing fails (permissions, full
-            disk), or if `out` came into being meanwhile. Any other exception of the block,
-            KeyboardInterrupt included, passes through; in all of these cases neither `out` nor its parents
-            have changed.
+            disk: any OSError of the block), or if `out` came into being meanwhile. Any other exception,
+            KeyboardInterrupt included, passes through. Neither `out` nor its parents have changed then.
     """
     check_output(out, overwrite=overwrite, protect=protect)
     folder = Path(os.path.abspath(out))
@@ -105,7 +88,7 @@ def atomic_folder(
                 partial.mkdir()
                 yield partial
                 _move_into_place(partial, folder, overwrite=overwrite)
-            except InputError as error:  # of a writer, which names the place where it writes
+            except InputError as error:  # raised by a writer, which names the place where it writes
                 raise InputError(str(error).replace(str(partial), str(out))) from error
             finally:
                 shutil.rmtree(partial, ignore_errors=True)
@@ -113,8 +96,8 @@ def atomic_folder(
         raise InputError(f"{out} cannot be written ({error.strerror}); choose another place") from error
 
 
-_PRIVATE_MODE = 0o700
-_CLAIM_ATTEMPTS = 100  # each fails only if somebody removed the folder in the same instant
+_PRIVATE_MODE = 0o700  # permission bits; nobody else may look into a result that is half written
+_CLAIM_ATTEMPTS = 100  # attempts; each fails only if somebody removed the folder in the same instant
 _claimed: ContextVar[Path | None] = ContextVar("_claimed", default=None)
 """The private folder that `claimed_output` holds around the running code."""
 
@@ -155,9 +138,7 @@ def _remove_empty(folder: Path) -> None:
 def locked_folder(path: Path) -> Iterator[Path]:
     """Make a folder that only this user may enter, hold its lock, and remove it with all it holds.
 
-    Raises:
-        FileExistsError: if somebody alive holds it, or its lock cannot tell.
-        OSError: if it cannot be made.
+    Raises FileExistsError if somebody alive holds it, or if a lock cannot show that nobody does.
     """
     try:
         descriptor = _lock(path)
@@ -261,7 +242,7 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
         )
 
 
-_AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # of Linux's renameat2
+_AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # arguments of renameat2; see Linux's fcntl.h and fs.h
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 
@@ -288,11 +269,7 @@ def _move_into_place(partial: Path, folder: Path, *, overwrite: bool) -> None:
 
 
 def _renamed_at_once(source: Path, target: Path, how: int) -> bool:
-    """Rename by Linux's renameat2; False, and nothing is done, where system or file system cannot.
-
-    Raises:
-        OSError: if it can, but fails.
-    """
+    """Rename by Linux's renameat2; False, and nothing is done, where system or file system cannot."""
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if renameat2 is None:
         return False

@@ -10,8 +10,7 @@ from sfm_shapefit.base.errors import ShapeFitError
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
-# So many tasks are on their way at once, which bounds the memory that they take.
-_TASKS_AT_ONCE = 32
+_TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory that they take
 
 
 class WorkerError(ShapeFitError):
@@ -25,12 +24,11 @@ def answers(
 
     Args:
         executor: submits tasks, a few ahead of the answers; it is not shut down. None: all is done here.
-        work: a function of a module, so that other processes find it.
+        work: a function of a module, so that other processes find it; what it raises is raised.
         tasks: its arguments, which are pickled on the way to other processes.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
-        ShapeFitError: as a worker raised it.
     """
     if executor is None:
         for task in tasks:

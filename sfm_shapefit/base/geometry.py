@@ -1,34 +1,30 @@
-"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: geometry that others share.
-
-Everything here works on plain float64 arrays and imports nothing but numpy.
-"""
+"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: float64 arrays."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.record import Record
 
 SIGMA_PER_MEDIAN = 1.4826
-"""Standard deviation of a normal x over the median of |x|."""
+"""Standard deviation of a normal x over the median of |x|: 1 / Phi^-1(3 / 4)."""
 
 MEDIAN_NORMAL_LENGTH = 1.538
-"""Median length of a vector of three normal components of variance 1."""
+"""Median length of a vector of three normal components of variance 1: root of the median of chi2(3)."""
 
 METRIC_SIGMA = 0.1
-"""Relative standard deviation up to which a scale counts as known."""
+"""Relative standard deviation up to which a scale counts as known; a rough one is told with a warning."""
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
-"""From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
+"""Turn of camera axes about x, its own inverse: y up, looking along -z (OpenGL, NeRF), to COLMAP's."""
 
-# Where half of the points are good, so is 1 draw of 3 in 8: none in 256 has odds 1e-15.
-_NUM_SAMPLES = 256
-_NUM_REFINED_SAMPLES = 4
-# Reweighting stops earlier once nothing changes.
-_MAX_REWEIGHTINGS = 200
+_NUM_SAMPLES = 256  # draws of 3 points; if half are good so is 1 draw of 8, none in 256 has odds 1e-15
+_NUM_REFINED_SAMPLES = 4  # draws; only the best are refined, as each takes many reweightings
+_MAX_REWEIGHTINGS = 200  # steps, a bound: reweighting stops once nothing changes
 
-# Rounding of distances, as a share of the largest.
-_ROUNDING = 1e-14
+_ROUNDING = 1e-14  # share of the largest distance; a smaller distance is 0
 
 
 def normalized(vectors: FloatArray) -> FloatArray:
@@ -53,14 +49,9 @@ def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def tangent_bases(directions: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the complement of each unit vector.
+    """Return orthonormal bases (m, d, d - 1), in columns, of the complements of unit vectors (m, d).
 
-    Args:
-        directions: (m, d) unit vectors.
-
-    Returns:
-        (m, d, d - 1); the columns of slice e are orthonormal and orthogonal to `directions[e]`. They
-        are the last columns of the Householder reflection that maps the first axis to -+ `directions[e]`.
+    They are the last columns of the Householder reflection that maps the first axis to -+ `directions[e]`.
     """
     m, d = directions.shape
     sign = np.where(directions[:, 0] < 0.0, -1.0, 1.0)
@@ -85,6 +76,20 @@ class Similarity:
         """Map points of shape (n, d)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
+    @property
+    def facts(self) -> "Alignment":
+        """The map in plain values."""
+        rotation, translation = self.rotation.tolist(), self.translation.tolist()
+        return Alignment(scale=self.scale, rotation=rotation, translation=translation)
+
+
+class Alignment(Record):
+    """A similarity of the world: scale * rotation @ center + translation."""
+
+    scale: Annotated[float, "Units of the one world in one of the other."]
+    rotation: Annotated[list[list[float]], "3 rows."]
+    translation: Annotated[list[float], "In units of the world that is mapped to."]
+
 
 def invert(similarity: Similarity) -> Similarity:
     """Return the inverse map."""
@@ -106,16 +111,16 @@ def fit_similarity(
 ) -> Similarity:
     """Return the similarity that maps `source` onto `target` with least weighted squares.
 
-    The scale is never negative: a mirrored source, which would fit best turned inside out, gets scale 0.
-    A source whose points coincide leaves the scale open and gets 1.
+    The scale is never negative: a mirrored source, which would fit best turned inside out, gets scale 0. A
+    source whose points coincide leaves the scale open and gets 1.
 
     Args:
         source, target: (n, d) corresponding points.
         weights: (n,) non-negative weights, not all 0; equal if None.
         rotate: False keeps the axes and fits scale and translation only.
 
-    Source: Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 1991, eqs. 40-42.
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI
+    1991.
     """
     w = np.full(len(source), 1.0 / len(source)) if weights is None else weights / weights.sum()
     source_mean, target_mean = w @ source, w @ target
@@ -151,14 +156,13 @@ def fit_similarity_l1(
 ) -> Similarity:
     """Return the similarity that minimizes the sum of unsquared distances min(distance, cap).
 
-    Without a cap, a few bad targets hardly matter, but one source point that is far enough away shrinks
-    the scale towards 0: it costs its distance at the true scale, and nearly nothing at scale 0. A finite
-    cap closes that hole; half of the points may then be anywhere.
+    Without a cap, a few bad targets hardly matter, but one source point that is far enough away shrinks the
+    scale towards 0: it costs its distance at the true scale, and nearly nothing at scale 0. With a finite
+    cap, half of the points may be anywhere.
 
     Iteratively reweighted least squares (weight 1 / distance, 0 beyond the cap) from the equal-weight
-    solution and from the best fits of a few points drawn with a fixed seed; the lowest sum is kept. The
-    floor of the distances in the weights is 1e-9 of the target's spread, so that points which fit exactly
-    do not stop the iteration.
+    solution and from the best fits of a few points drawn with a fixed seed; the lowest sum is kept. Distances
+    in the weights are at least 1e-9 of the target's spread, so that exact fits do not stop the iteration.
 
     Args:
         source, target: (n, d) corresponding points, n >= 1.
@@ -198,10 +202,7 @@ def fit_similarity_l1(
 def fits_of_few_points(
     source: FloatArray, target: FloatArray, *, rotate: bool, count: int = _NUM_SAMPLES
 ) -> list[Similarity]:
-    """Return similarities that each fit as few points as determine one, drawn with a fixed seed.
-
-    They are what `fit_similarity` returns for each few, all at once.
-    """
+    """Return similarities that each fit as few points as determine one, drawn with a fixed seed."""
     size = min(len(source), source.shape[1] if rotate else 2)
     rng = np.random.default_rng(0)
     few = np.array([rng.choice(len(source), size, replace=False) for _ in range(count)])
@@ -220,10 +221,7 @@ def fits_of_few_points(
 
 
 def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
-    """Return the angles of rotations (..., 3, 3) in degrees, in [0, 180].
-
-    By atan2 of the sine (skew part) and the cosine (trace): exact to rounding at 0 and at 180 degrees.
-    """
+    """Return the angles of rotations (..., 3, 3) in degrees, [0, 180], by atan2: exact at both ends."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
     cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0
@@ -232,19 +230,16 @@ def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
 
 
 def mean_rotation_l1(rotations: FloatArray) -> FloatArray:
-    """Return the rotation with the least sum of chordal distances |R_i - R|_F: a robust mean.
+    """Return the rotation with the least sum of chordal distances |R_i - R|_F to rotations (n, d, d), n >= 1.
 
-    Weiszfeld's iteration, started from the chordal mean of the half of the rotations that is closest to
-    the best single one (out of at most 100, drawn with a fixed seed). Chordal distances are bounded, so
-    that any majority that agrees wins.
+    A robust mean: chordal distances are bounded, so that any majority that agrees wins. Weiszfeld's iteration
+    starts from the chordal mean of the half of the rotations closest to the best single one (out of at most
+    100, drawn with a fixed seed).
 
-    Args:
-        rotations: (n, d, d), n >= 1.
-
-    Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011;
-    the chordal instead of the geodesic distance.
+    Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011; the
+    chordal instead of the geodesic distance.
     """
-    floor = 1e-9  # of the distances in the weights; chordal distances are at most 2 sqrt(2) for d = 3
+    floor = 1e-9  # in the weights; chordal distances are at most 2 sqrt(2) for d = 3
 
     def distances(rotation: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.norm(rotations - rotation, axis=(1, 2)))

@@ -1,13 +1,11 @@
 """The door to numba: kernels that are compiled once, cached on disk, and release the GIL.
 
-Kernels take and return plain arrays and numbers. Their arithmetic is that of IEEE 754 in the order in which
-it is written: no sum is reassociated, no product fused with a sum. So a kernel gives the same bits on every
-processor, and a copy of it inside another kernel gives the same bits as the kernel itself; which copy runs
-depends on what was compiled, and what loaded from the cache, in this process.
+Kernels take and return plain arrays and numbers. Their arithmetic is that of IEEE 754 in the written order:
+no sum is reassociated, no product fused with a sum. So a kernel gives the same bits on every processor, and
+as a copy inside another kernel; which copy runs depends on what was compiled and loaded in this process.
 
-C functions of other libraries are called by address. The address of a function changes from process
-to process, so it must not be a constant of the compiled code, or the code cached on disk would be
-useless (numba then refuses to cache it). `call_address` takes the address as an ordinary argument.
+C functions of other libraries are called by address. An address changes from process to process, so it must
+not be a constant of compiled code (numba would not cache it): `call_address` takes it as an argument.
 
 What compiling costs. A kernel with eight arrays takes about 0.15 s, and every kernel that calls it compiles a
 copy of it again, so chains of calls are kept short. An assignment of one array to another (`a[:] = b`),
@@ -58,9 +56,8 @@ _LANE_BYTES = 32
 def kernel(function: Kernel) -> Kernel:
     """Compile a function with numba on its first call; the machine code is cached on disk.
 
-    Raises:
-        TypeError: if the function closes over a value. What a closure holds is part of the key of the cache,
-            and the key of another kernel changes with every process: nothing would ever be found there.
+    TypeError if the function closes over a value: that would be part of the cache's key, and change with
+    every process.
     """
     if getattr(function, "__closure__", None):
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
@@ -96,7 +93,7 @@ def on_compilation(begun: Callable[[], None]) -> Iterator[None]:
 
 
 def function_address(module: str, name: str) -> int:
-    """Return the address of a C function that a Cython module exports, valid in this process only.
+    """Return the address, valid in this process only, of a C function that a Cython module exports.
 
     Args:
         module: such as "scipy.linalg.cython_blas".

@@ -43,7 +43,7 @@ from sfm_shapefit.base.kernel_code import pack, unpack
 
 PACKAGE = Path(__file__).parents[1]
 SHIPPED = PACKAGE / "_kernels"
-"""Of a wheel that carries its kernels; absent in a checkout."""
+"""Kernels that a wheel carries; absent in a checkout."""
 
 RUNTIME = f"py{sys.version_info[0]}{sys.version_info[1]}-numba{'.'.join(numba.__version__.split('.')[:2])}"
 """What machine code and its wrapping are made for, beside the processor."""
@@ -66,10 +66,7 @@ _measuring: "list[CompileTime]" = []
 
 
 def choose_target() -> str:
-    """Return the name of the processor that kernels are compiled for; set it, if no other code did before.
-
-    numba has one target in a process. Once something was compiled for another, it stays.
-    """
+    """Return, and set unless it is set, numba's one target: the processor that kernels are compiled for."""
     is_chosen = "_toplevel_target_context" in vars(cpu_target)
     if not is_chosen and config.CPU_NAME == "host":
         config.CPU_NAME = config.CPU_FEATURES = None
@@ -255,11 +252,7 @@ def own_folders(source_folder: Path) -> list[Path]:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step, and its folder if there is none.
-
-    Raises:
-        OSError: if that cannot be done; nothing stays behind.
-    """
+    """Write a file in one step, and its folder if there is none; after an OSError nothing stays behind."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, unfinished = tempfile.mkstemp(dir=path.parent)
     try:

@@ -1,9 +1,8 @@
 """Compiled code as it is kept on disk: packed into bytes, and made ready to run again.
 
-numba's own way to load a kernel first sets up all that is needed to compile one, and reads the kernel's LLVM
-code, which is of use to other kernels only, when they are compiled. Here both wait until something is
-compiled: that takes a quarter of the time. It rests on parts of numba that are not public. Where they are
-not as expected, numba loads the kernel its own way.
+numba's own loader first sets up all that is needed to compile a kernel, and reads the kernel's LLVM code, of
+use to other kernels only. Here both wait until something is compiled: that takes a quarter of the time. It
+rests on parts of numba that are not public; where they are not as expected, numba loads the kernel its way.
 """
 
 import io
@@ -20,7 +19,7 @@ from numba.core.environment import Environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
-# Of strings in sets and dictionaries: numba defines these symbols when it is ready to compile.
+# Symbols of string hashes in sets and dictionaries: numba defines them when it is ready to compile.
 _NEEDS_COMPILER = b"_numba_hashsecret"
 
 
@@ -52,10 +51,7 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _Reader(pickle.Unpickler):
-    """Reads what `pack` writes, and leaves the modules alone that functions of numba come from.
-
-    Compiled code does not look into them, and importing them takes as long as loading all kernels of a run.
-    """
+    """Reads what `pack` writes; modules of numba's functions, which code does not need, are not imported."""
 
     def find_class(self, module_name: str, name: str) -> Any:
         """Return an object of a module."""
@@ -82,11 +78,7 @@ def pack(compiled: Any) -> bytes:
 
 
 def unpack(content: bytes, target_context: Any) -> Any:
-    """Return compiled code that is ready to run.
-
-    Raises:
-        Exception: of any type, if the content is damaged or of another version.
-    """
+    """Return compiled code that is ready to run; raises anything if it is damaged or of another version."""
     reduced = _Reader(io.BytesIO(content)).load()
     try:
         return _load(target_context, reduced)
@@ -96,11 +88,7 @@ def unpack(content: bytes, target_context: Any) -> Any:
 
 
 def _load(target_context: Any, reduced: tuple[Any, ...]) -> Any:
-    """Do what `CompileResult._rebuild` does.
-
-    Raises:
-        ValueError: if the code needs more than is set up here.
-    """
+    """Do what `CompileResult._rebuild` does; ValueError if the code needs more than is set up here."""
     (
         (name, kind, (machine_code, llvm_code)),
         description,

@@ -23,17 +23,11 @@ from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origi
 
 S = TypeVar("S", bound="Settings")
 
-_HELP_WIDTH = 88
+_HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a terminal
 
 
 def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and the sentence that explains it.
-
-    Args:
-        default: what holds where the user says nothing.
-        help: the sentence.
-        also: an earlier name of the field, which the command line still takes.
-    """
+    """Return a field with its default and its sentence; `also` is an earlier name that flags still take."""
     return field(default=default, metadata={"help": help, "also": also})
 
 
@@ -51,11 +45,7 @@ class Settings:
                 object.__setattr__(self, item.name, float(value))  # kernels are compiled by types
 
     def check_range(self, name: str, low: float, high: float = float("inf")) -> None:
-        """Refuse a field whose value lies outside [low, high].
-
-        Raises:
-            ValueError: a sentence that names the field.
-        """
+        """Raise ValueError, which names the field, if its value lies outside [low, high]."""
         value = getattr(self, name)
         if not low <= value <= high:
             limits = f"be at least {low:g}" if high == float("inf") else f"lie in [{low:g}, {high:g}]"
@@ -122,7 +112,7 @@ class Group(NamedTuple):
     options: tuple[Option, ...]
 
 
-def groups_of(settings: type[S], defaults: S | None = None) -> Iterator[Group]:
+def setting_groups(settings: type[S], defaults: S | None = None) -> Iterator[Group]:
     """Yield the options of a settings class: its own first, then those of its groups.
 
     The title of a group is the first sentence of its class.
@@ -138,7 +128,7 @@ def groups_of(settings: type[S], defaults: S | None = None) -> Iterator[Group]:
     if own:
         yield Group((settings.__doc__ or settings.__name__).split("\n")[0].rstrip("."), tuple(own))
     for value in inside:
-        yield from groups_of(type(value), value)
+        yield from setting_groups(type(value), value)
 
 
 def homes_of(settings: type[Settings]) -> dict[str, str]:
@@ -168,7 +158,7 @@ def flat_values(settings: Settings) -> dict[str, Any]:
 def explained(settings: type[S]) -> type[S]:
     """Add the options of a settings class, with defaults and sentences, to its docstring."""
     lines = [(settings.__doc__ or "").rstrip(), "", "Options:"]
-    for one in groups_of(settings):
+    for one in setting_groups(settings):
         for item in one.options:
             sentence = textwrap.wrap(item.help, _HELP_WIDTH)
             lines += [f"    {item.name} = {item.default!r}", *(f"        {line}" for line in sentence)]
@@ -185,9 +175,7 @@ def hint(name: str, known: Iterable[str]) -> str:
 def merge_options(given: S | None, settings: type[S], overrides: Mapping[str, Any]) -> S:
     """Return the settings of a call: those given, or the defaults, with single options set by keyword.
 
-    Raises:
-        TypeError: if what is given are no such settings, or a keyword is no option; the message says what is.
-        ValueError: if a value is refused.
+    TypeError for other settings, or a keyword that is no option; ValueError for a value that is refused.
     """
     if given is not None and not isinstance(given, settings):
         kind, wanted = type(given).__name__, settings.__name__

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-_NAMED = 3
+_NAMED = 3  # names; a longer list is counted, so that a sentence stays one
 
 
 def first_of(names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.base.settings import Settings, groups_of, hint, homes_of, option
+from sfm_shapefit.base.settings import Settings, hint, homes_of, option, setting_groups
 
 Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -203,7 +203,7 @@ class GroupedCommand(TyperCommand):
     def _refuse_unknown(self, ctx: Any, args: Sequence[str], known: set[str]) -> None:
         """Refuse flags that are keys of --config now, or are no more; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
-        groups = () if settings is None else groups_of(settings)
+        groups = () if settings is None else setting_groups(settings)
         keys = {name: item.name for one in groups for item in one.options for name in (item.also, item.name)}
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]
@@ -256,7 +256,7 @@ def takes(
 def flags_of(settings: type[Settings], *names: str) -> list[inspect.Parameter]:
     """Return a keyword parameter with a typer option for each option of a class, or those that are named."""
     parameters = []
-    for group in groups_of(settings):
+    for group in setting_groups(settings):
         for item in group.options:
             if names and item.name not in names:
                 continue
@@ -353,7 +353,7 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
-    earlier = {item.also: item.name for one in groups_of(settings) for item in one.options if item.also}
+    earlier = {item.also: item.name for one in setting_groups(settings) for item in one.options if item.also}
     values = {earlier.get(name, name): value for name, value in read.items()}
     for name in values.keys() - {*homes, *homes.values()}:
         reason = f"is gone: {_GONE[name]}" if name in _GONE else f"is no option; {hint(name, sorted(homes))}"

@@ -5,9 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.joins import JoinedModel
-from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.scene_words import describe_repeated_pairs, describe_rival_pairs
+from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.placement.options import KnownDistance
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:

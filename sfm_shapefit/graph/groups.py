@@ -23,8 +23,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen, su
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.images import Images
 
-# An offset within its group smaller than this, relative to the largest offset, counts as none.
-_COINCIDENT = 1e-12
+_COINCIDENT = 1e-12  # share of the largest offset; a smaller offset within a group is rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,10 +81,7 @@ class RigidGroups:
         return sum_by(self.group_of, values, self.num_groups)
 
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
-        """Return the x whose A x is nearest to locations (n, d), and its largest distance from them.
-
-        s is 0 if every group stands at a single point.
-        """
+        """Return x with A x nearest to locations (n, d), and its largest distance; s is 0 without offsets."""
         centered = self.center()
         spread = float(np.sum(centered.offsets**2))
         sizes = np.bincount(self.group_of)[:, None]
@@ -133,8 +129,7 @@ class RigidGroups:
 
         Args:
             fixed: (n,) the nodes that keep their centers relative to each other.
-            centers: (n, d) in the unit of the offsets; those of nodes that share no group with a fixed one
-                are not read.
+            centers: (n, d) in the unit of the offsets; read for nodes that share a group with a fixed one.
         """
         whole = np.zeros(self.num_groups, dtype=np.bool_)
         whole[self.group_of[fixed]] = True

@@ -33,7 +33,7 @@ class Evidence:
         Args:
             rows: indices of the edges that are kept, in their new order.
             nodes: indices of the nodes that are kept, in their new order.
-            num_nodes: of the graph that this evidence belongs to.
+            num_nodes: nodes of the graph that this evidence belongs to.
         """
         new = np.full(num_nodes, -1, dtype=np.int64)
         new[nodes] = np.arange(len(nodes))
@@ -55,7 +55,7 @@ class MeasuredGraph:
     """Cameras first, then 3D points, which are joined to cameras only."""
     _: KW_ONLY
     covariance: FloatArray | None = None
-    """(m, d - 1, d - 1) of each direction, rad^2, in `tangent_bases(graph.directions)`; NaN where it is
+    """(m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
     unknown, None where all are."""
     evidence: Evidence | None = None
     """Support of the edges, and pairs whose matches contradict the given rotations; None if unknown."""
@@ -101,10 +101,8 @@ class MeasuredGraph:
     def part(self, rows: IntArray) -> tuple["MeasuredGraph", IntArray]:
         """Return what was measured of the edges `rows` and of their nodes, renumbered.
 
-        A fixed group of which no node is left is fixed no more.
-
-        Returns:
-            The smaller value, and (n',) the index in this graph of each of its nodes, ascending.
+        The second value is (n',) the index in this graph of each of its nodes, ascending. A fixed group of
+        which no node is left is fixed no more.
         """
         if len(rows) == self.graph.num_edges and np.array_equal(rows, np.arange(len(rows))):
             graph, nodes = self.graph, np.unique(self.graph.edges)

@@ -15,10 +15,10 @@ from scipy.sparse import coo_array, csgraph
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 
-# A direction printed with 7 digits still passes; a wrong one does not.
-_UNIT_NORM_TOLERANCE = 1e-6
-# A norm that is off by no more is 1: dividing by it again would only change last bits.
-_ROUNDING = 8.0 * np.finfo(np.float64).eps
+_UNIT_NORM_TOLERANCE = 1e-6  # absolute; a direction printed with 7 digits passes, a wrong one does not
+_ROUNDING = (
+    8.0 * np.finfo(np.float64).eps
+)  # rounding of a norm; dividing by 1 to rounding only changes last bits
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -106,14 +106,7 @@ class ViewGraph:
         )
 
     def restricted_to(self, edge_indices: npt.NDArray[np.integer]) -> tuple["ViewGraph", IntArray]:
-        """Return the graph of the given edges and their cameras, renumbered.
-
-        Args:
-            edge_indices: (k,) indices into `edges`.
-
-        Returns:
-            The smaller graph, and (n',) the index in this graph of each of its cameras, ascending.
-        """
+        """Return the graph of some edges and their cameras, renumbered, and their indices here, ascending."""
         cameras, renumbered = np.unique(self.edges[edge_indices], return_inverse=True)
         names = None if self.names is None else [self.names[c] for c in cameras]
         graph = ViewGraph(
@@ -140,12 +133,12 @@ def _check_arrays(
     """Return the inputs as arrays of the right type and shape, or raise InputError."""
     if not isinstance(num_nodes, numbers.Integral) or num_nodes < 0:
         raise InputError(f"num_nodes must be a whole number >= 0, got {num_nodes}")
-    given = np.asarray(edges)
-    if given.size and not np.issubdtype(given.dtype, np.integer):
-        raise InputError(f"edges must be integers, got {given.dtype}; give camera indices in [0, n)")
-    if given.size and given.shape[1:] != (2,):
-        raise InputError(f"edges have shape {given.shape}; give one row (i, j) per pair, shape (m, 2)")
-    i = given.astype(np.int64).reshape(-1, 2)
+    raw_edges = np.asarray(edges)
+    if raw_edges.size and not np.issubdtype(raw_edges.dtype, np.integer):
+        raise InputError(f"edges must be integers, got {raw_edges.dtype}; give camera indices in [0, n)")
+    if raw_edges.size and raw_edges.shape[1:] != (2,):
+        raise InputError(f"edges have shape {raw_edges.shape}; give one row (i, j) per pair, shape (m, 2)")
+    i = raw_edges.astype(np.int64).reshape(-1, 2)
     v = np.array(directions, dtype=np.float64)
     if v.ndim != 2 or len(v) != len(i) or v.shape[1] < 2:
         raise InputError(
@@ -185,18 +178,18 @@ def _merge_duplicates(
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     target = rank[group.ravel()]
-    kept = first[order]
+    first_rows = first[order]
 
-    flipped = edges[:, 0] != edges[kept][target][:, 0]
+    flipped = edges[:, 0] != edges[first_rows][target][:, 0]
     signed = np.where(flipped, -1.0, 1.0)[:, None] * directions * weights[:, None]
-    total = np.zeros((len(kept), directions.shape[1]))
+    total = np.zeros((len(first_rows), directions.shape[1]))
     np.add.at(total, target, signed)
-    weight = np.bincount(target, weights=weights, minlength=len(kept))
+    weight = np.bincount(target, weights=weights, minlength=len(first_rows))
     length = np.linalg.norm(total, axis=1)
     cancelled = np.zeros(len(edges), dtype=np.bool_)
-    cancelled[kept] = length < 1e-9 * weight
+    cancelled[first_rows] = length < 1e-9 * weight
     _refuse(cancelled, edges, "is given several times with directions that cancel; keep one")
     # A pair given once keeps its direction to the last bit.
-    single = np.bincount(target, minlength=len(kept)) == 1
-    merged = np.where(single[:, None], directions[kept], total / length[:, None])
-    return edges[kept], np.asarray(merged, dtype=np.float64), weight.astype(np.float64)
+    single = np.bincount(target, minlength=len(first_rows)) == 1
+    merged = np.where(single[:, None], directions[first_rows], total / length[:, None])
+    return edges[first_rows], np.asarray(merged, dtype=np.float64), weight.astype(np.float64)

@@ -15,10 +15,8 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 def find_bodies(num_nodes: int, pairs: IntArray, weights: FloatArray) -> IntArray:
     """Return the body of each node, (n,): 0 for the largest, that of the first node among equals, and so on.
 
-    Args:
-        num_nodes: n.
-        pairs: (m, 2) node indices; repeated pairs add up.
-        weights: (m,) positive where the two nodes belong together, negative where they do not.
+    The weights (m,) of node pairs (m, 2) are positive where two nodes belong together, negative where they do
+    not; repeated pairs add up.
     """
     ties: list[dict[int, float]] = [{} for _ in range(num_nodes)]
     for (i, j), weight in zip(pairs.tolist(), weights.tolist(), strict=True):

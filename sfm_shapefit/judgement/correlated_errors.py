@@ -24,9 +24,8 @@ from sfm_shapefit.base.jit import cross, inner_kernel, kernel, mix_bits
 from sfm_shapefit.scene.matches import MatchBatch
 
 NUM_SAMPLES = 96
-"""Standard deviations from so many samples are right to 7 %."""
-# Two of the 64 bits of a hash make one sample.
-_SIGNS_PER_HASH = 32
+"""Samples of the directions' errors; standard deviations from them are right to 7 %."""
+_SIGNS_PER_HASH = 32  # samples per hash of 64 bits; each takes two of them
 
 
 def sample_direction_errors(
@@ -36,9 +35,10 @@ def sample_direction_errors(
     noise_px: FloatArray,
     threshold_px: float,
 ) -> FloatArray:
-    """Return samples of the errors of directions whose pairs share keypoints.
+    """Return samples (k, NUM_SAMPLES, 2) of tangential errors of directions that share keypoints, radians.
 
     The samples of one keypoint are the same in every call, so batches of pairs may be sampled one by one.
+    Pairs without a direction have errors 0.
 
     Args:
         matches: those of k pairs.
@@ -46,17 +46,14 @@ def sample_direction_errors(
         covariances: (k, 2, 2) in `tangent_bases(directions)`, rad^2.
         noise_px: (k,) standard deviation of the Sampson errors behind the covariances.
         threshold_px: largest Sampson error of an inlier.
-
-    Returns:
-        (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
     scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
-    known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
-    v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
+    has_direction: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
+    v = np.where(has_direction[:, None], directions, [1.0, 0.0, 0.0])
     keypoints = np.ascontiguousarray(matches.keypoints)
     rays_i, rays_j = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
-    given = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
-    _add_scores(*given, known, v, threshold_px, scores)
+    arrays = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
+    _add_scores(*arrays, has_direction, v, threshold_px, scores)
     bases = tangent_bases(v)
     gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
     return np.asarray(scores @ gain.transpose(0, 2, 1))
@@ -70,7 +67,7 @@ def _add_scores(
     rays_i: Any,
     rays_j: Any,
     pixel_angles: Any,
-    known: Any,
+    has_direction: Any,
     directions: Any,
     threshold_px: float,
     scores: Any,
@@ -80,7 +77,7 @@ def _add_scores(
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
     terms = np.empty((16, 3))
     for p in range(len(pairs)):
-        if not known[p]:
+        if not has_direction[p]:
             continue
         v = directions[p]
         for k in range(offsets[p], offsets[p + 1]):
@@ -128,10 +125,7 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
 
 @inner_kernel
 def _add_samples(pair: Any, match: Any, factors: Any, score: Any, terms: Any, scores: Any) -> None:
-    """Add the score of one match times its residual in each sample.
-
-    Two signs of either keypoint make sixteen residuals, and `terms` (16, 3) holds what each of them adds.
-    """
+    """Add a match's score times its residual in each sample; `terms` (16, 3), for the signs of both ends."""
     one, two, four = np.uint64(1), np.uint64(2), np.uint64(4)
     for signs in range(16):
         residual = factors[0] if signs & 1 else -factors[0]

@@ -29,24 +29,19 @@ from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE
 from sfm_shapefit.judgement.turns import RIGHT_SHARE, TURNED_SHARE, Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment
 
-_PRIOR = 30.0
-_USUAL_SHARE = 0.75
-_AMBIGUOUS = (0.62, 0.72)
-_UNSUPPORTED = 0.1
+_PRIOR = 30.0  # matches that every camera has beforehand; half of them for it
+_USUAL_SHARE = 0.75  # share of a camera's matches; with that many for it, it loses nothing
+_AMBIGUOUS = (0.62, 0.72)  # range of f; kept by default, but below the trust that goes without reasons
+_UNSUPPORTED = 0.1  # f; low, as no pair speaks for the camera
 
 
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
-    """Return an assessment whose trust, and the reasons for a low one, follow the doubts of its cameras.
-
-    Args:
-        assessment: of k cameras.
-        doubts: of the same cameras, in the same order.
-    """
+    """Return an assessment whose trust and reasons follow the doubts of the same cameras."""
     factors = _factors(doubts)
-    known = np.isfinite(factors)
-    trust = np.where(known, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
+    finite = np.isfinite(factors)
+    trust = np.where(finite, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
     reasons = list(assessment.reasons)
-    for camera in np.flatnonzero(known).tolist():
+    for camera in np.flatnonzero(finite).tolist():
         found = [_reason(doubts, camera), assessment.loose_reasons[camera]]
         if trust[camera] < LOW_TRUST:
             reasons[camera] = "; ".join(filter(None, found)) or SOMEWHAT_LOOSE

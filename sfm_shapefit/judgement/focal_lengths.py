@@ -6,20 +6,17 @@ robust weight W of the matches says which factor fits best:
 
     gain(pair, factor) = W(factor) - W(1)
 
-Rotations held. The direction of each pair is estimated for its given relative rotation. Two views without
-their rotation hardly tell focal lengths where the optical axes meet, as on a ring about an object, or where
-the picture is flat: a rotation of its own makes up for most of a wrong focal length in each pair. One
-rotation for all pairs of an image does not.
+Rotations held. The direction of each pair is estimated for its given relative rotation. With a rotation of
+its own each pair would make up for most of a wrong focal length where the optical axes meet, as on a ring
+about an object, or where the picture is flat. One rotation for all pairs of an image does not.
 
 Rotations free. Where the given rotations are as wrong as the focal length, because they were found with it,
 that says nothing. If no camera is named with rotations held, the relative pose of each pair is refined for
 each factor (`rotations.two_view_poses`).
 
-Residuals are in pixels of each image, as it was taken,
+Residuals are in pixels of each image, as it was taken, lest a factor gain by making the noise of one smaller:
 
     r = e / sqrt(|de/dpixel_i|^2 + |de/dpixel_j|^2),    e = t . (R a x b)
-
-The pixels are what is observed, and a factor must not gain by making the noise of one image smaller.
 
 A camera is doubted if the mean gain of its best factor over all of its pairs is large, if the pairs that
 gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if the pairs
@@ -27,13 +24,10 @@ of its own images do not lose as clearly, and if the factor differs from 1 by 5 
 held, it must have two images, and three quarters of its images must gain: the pairs of a single one gain by a
 factor if its rotation is wrong, too.
 
-One wrong camera makes others seem wrong, those that have pairs with it, but their own pairs lose what these
-gain: the camera that gains most in all is named first, gets that focal length, and those that were doubted
-with it are asked again. If another one gains nearly as much, and is cleared by that correction, nothing tells
-which of the two is wrong, and neither is named.
-
-Chosen on fountain-P11, Herz-Jesus-P8, castle-P19, lego100, a beach from a drone, a hall with robots and
-`photographed`, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
+One wrong camera makes others seem wrong that have pairs with it, but their own pairs lose what these gain:
+the camera that gains most in all is named first, gets that focal length, and those that were doubted with it
+are examined again. If another one gains nearly as much, and is cleared by that correction, neither is named.
+Chosen on seven scenes: `scripts/results/notes.md#focal-lengths`.
 """
 
 from dataclasses import replace
@@ -48,19 +42,18 @@ from sfm_shapefit.pairs.pair_directions import is_usable
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches
 
-_COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
-_FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)
-_WIDTH_PX = 1.5
-# Of all pairs on average, with rotations held and free: a rotation of its own lets each pair gain by chance.
+_COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)  # factors; one lies in the reach of any true one
+_FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)  # factors on the best coarse one; as close as a gain shows
+_WIDTH_PX = 1.5  # pixels; width of the robust weights
+# Mean gain over all pairs, with rotations held and free; a rotation of its own lets each pair gain by chance.
 _LEAST_GAINS = {True: 0.01, False: 0.03}
-_NOTICED, _LEAST_SIGMAS = 0.01, 3.0
-_LEAST_CHANGE = 0.05
-# With rotations held: images of a camera, and the share of them that gain.
+_NOTICED, _LEAST_SIGMAS = 0.01, 3.0  # gain of a pair, and deviations of a fair coin; see the header
+_LEAST_CHANGE = 0.05  # relative change of the focal length; a smaller one is not worth a name
+# Images of a camera, and the share of them that gain, with rotations held; see the header.
 _FEWEST_IMAGES, _LEAST_SHARE_OF_IMAGES = 2, 0.75
-# A rival gains nearly as much from this share on.
-_RIVAL = 0.8
-_FEWEST_PAIRS = 5
-_MOST_NAMED = 5
+_RIVAL = 0.8  # share of the largest gain; from here on a rival gains nearly as much
+_FEWEST_PAIRS = 5  # pairs of a camera; fewer are chance
+_MOST_NAMED = 5  # cameras named; each takes a round of trials
 
 
 class Lenses(NamedTuple):
@@ -83,7 +76,7 @@ class FocalDoubt(NamedTuple):
     factor: float
     """The preferred focal length over the given one."""
     gain: float
-    """By what the mean robust weight of its matches grows."""
+    """Growth of the mean robust weight of its matches."""
     num_pairs: int
     """Pairs that were asked."""
 
@@ -96,7 +89,7 @@ def doubt_focal_lengths(
     Args:
         rays: matches of some pairs, in camera axes.
         rotations: (n, 3, 3) the given ones, cam_from_world, from which the poses are refined.
-        lenses: of the n images.
+        lenses: lenses of the n images.
         threads: number of threads to share the pairs among.
     """
     asked = _Asked(rays, rotations, lenses, threads)
@@ -152,8 +145,8 @@ def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -
         return _weight_shares(asked._replace(rays=_subset(asked.rays, rows[chosen])), tried, hold=hold)
 
     everyone = np.arange(len(rows))
-    given = fit(everyone, 1.0)
-    coarse = {factor: fit(everyone, factor) - given for factor in _COARSE}
+    held = fit(everyone, 1.0)
+    coarse = {factor: fit(everyone, factor) - held for factor in _COARSE}
     doubts = []
     for camera in cameras[enough].tolist():
         chosen = np.flatnonzero(asking == camera)
@@ -164,7 +157,7 @@ def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -
         if not _is_doubtful(gains[best], images, hold=hold):
             continue
         for step in _FINE_STEPS:
-            gains[best * step] = fit(chosen, best * step) - given[chosen]
+            gains[best * step] = fit(chosen, best * step) - held[chosen]
         best = _best(gains)
         if abs(best - 1.0) >= _LEAST_CHANGE and _is_doubtful(gains[best], images, hold=hold):
             doubts.append(FocalDoubt(camera, best, float(gains[best].mean()), len(chosen)))
@@ -177,13 +170,7 @@ def _best(gains: dict[float, FloatArray]) -> float:
 
 
 def _is_doubtful(gains: FloatArray, images: IntArray, *, hold: bool) -> bool:
-    """Return whether the gains (k,) of a camera's pairs speak against it.
-
-    Args:
-        gains: of its best factor.
-        images: (k, 2) those of the pair that the camera took, -1 for others.
-        hold: whether with rotations held.
-    """
+    """Return whether a camera's gains (k,) speak against it; `images` (k, 2) are its own, -1 for others."""
     least, inner = _LEAST_GAINS[hold], (images >= 0).all(axis=1)
     if not _is_clear(gains, least) or _is_clear(-gains[inner], least):
         return False

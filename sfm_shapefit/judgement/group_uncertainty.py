@@ -12,14 +12,13 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.judgement.uncertainty import Uncertainty, inform, scatter
+from sfm_shapefit.judgement.uncertainty import CameraUncertainty, inform, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.program import adjoint
 
-# Share of each block's trace that is added.
-_RIDGE = 1e-12
+_RIDGE = 1e-12  # share of each block's trace that is added; keeps the inverse finite
 
 
 class GroupGauge(NamedTuple):
@@ -37,39 +36,35 @@ def propagate_groups(
     gauge: GroupGauge,
     errors: FloatArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-) -> Uncertainty | None:
-    """Return the uncertainty of groups from the information of the directions between them.
+) -> CameraUncertainty | None:
+    """Return the uncertainty of groups from that of the directions; None if the factor is too large.
 
     Args:
         locations: (n, d) at the solution.
         edges: (m, 2) pairs that tie the groups, each between two of them.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
         gauge: the groups of the nodes, and what of them is held fixed.
-        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
-            information if None.
-        max_bytes: that the factor may take.
-
-    Returns:
-        None if the factor would take more.
+        errors: (m, s, d) samples of the errors of the directions in radians; independent ones if None.
+        max_bytes: limit of the factor.
 
     Raises:
         UnsolvableError: if the groups hang loose.
     """
     groups, share = gauge
-    known = inform(locations, edges, information)
+    tied = inform(locations, edges, information)
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyze(groups.num_groups, ends)
     if plan.num_bytes(locations.shape[1]) > max_bytes:
         return None
-    factor = factorize(plan, known.ridged(_RIDGE))
+    factor = factorize(plan, tied.ridged(_RIDGE))
     inverse = selected_inverse(factor, ends)
     covariances = _with_fixed_mean(factor, inverse.nodes, share)
     if errors is not None:
-        forces = (known.across @ errors.transpose(0, 2, 1)) / known.lengths[:, None, None]
+        forces = (tied.across @ errors.transpose(0, 2, 1)) / tied.lengths[:, None, None]
         covariances = scatter(_moved(factor, ends, forces, share))
-    return Uncertainty(
+    return CameraUncertainty(
         covariances=covariances[groups.group_of],
-        leverages=known.leverages(inverse, ends),
+        leverages=tied.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,
     )
 

@@ -40,10 +40,9 @@ class Judged(Placement):
 def judge(placement: Placement, options: PlacementOptions) -> Judged:
     """Return a placement with what its directions say of its pairs and cameras.
 
-    Raises:
-        UnsolvableError: if the factor for standard deviations would take more memory than allowed.
+    UnsolvableError if the factor for standard deviations would take more memory than allowed.
     """
-    hand_back_memory()  # of the solve, before the samples are propagated
+    hand_back_memory()  # what the solve took, before the samples are propagated
     part, agreement = placement.measured_part(), placement.agreement
     assessment = assess(
         part,

@@ -1,8 +1,8 @@
-"""Turns that no pair can tell alone: one correction of each camera's rotation, from all pairs at once.
+"""Turns too small for a single pair: one correction of each camera's rotation, from all pairs at once.
 
-Where scenes are dense, or baselines short, the matches of a pair tell its relative rotation to two degrees or
-so. A camera that is turned by less contradicts none of its pairs. All of them together tell it: with
-corrections x in world axes, one of each camera, the turn E of a pair (see `turns`) is to first order
+In dense scenes, or with short baselines, a pair knows its relative rotation to two degrees or so. A camera
+that is turned by less contradicts none of its pairs, but all of them together. With corrections x in world
+axes, one of each camera, the turn E of a pair (see `turns`) is to first order
 
     log E_ij = x_i - x_j + noise,
 
@@ -11,19 +11,17 @@ and the x that fit best are found jointly, so that the cameras of a turned group
     min_x  sum_ij w_ij |log E_ij - x_i + x_j|^2 / sigma_ij^2  +  sum_i u_i |x_i|^2 / tau^2
 
 The weights are those of Geman and McClure, w = 1 / (1 + (r / 3.5 sigma)^2)^2, anew in every round: a pair of
-repeated structure soon has none. The prior says that rotations are right to tau = 0.2 degrees. As it is of
-Cauchy's form, u = 1 / (1 + (x / 0.6 deg)^2), it says little against a camera whose rotation is not. The same
-matrix, inverted, says how well each x is known. It is no test of large turns: from x = 0 a pair that
-contradicts has little weight. These are found, and mended, before.
+repeated structure soon has none. The prior, rotations right to tau = 0.2 degrees, is of Cauchy's form,
+u = 1 / (1 + (x / 0.6 deg)^2), and hardly holds a camera whose rotation is not. The inverse of the same matrix
+is the covariance of x. Large turns are mended before: from x = 0 a pair that contradicts has little weight.
 
 How exact pairs are is seen from those that agree best, and may be several times better than each can be sure
 of. Rounds begin with the larger standard deviations, so that no turn falls between the two tests, and come
 down to the smaller ones.
 
-Measured on made rings of 200 and 900 images and a made facade of 400, with cameras turned by 2 degrees, alone
-and five together: their corrections are 1.7 to 3.3 degrees and 15 standard deviations or more. Those of right
-cameras are 0.6 degrees at most, 0.4 on lego100, castle-P19, castle-P30, and 8 standard deviations at most:
-what matches have in common, this does not know.
+Turns of 2 degrees are corrected by 1.7 to 3.3 degrees and 15 standard deviations or more, right cameras by
+0.6 degrees and 8 standard deviations at most, since errors that matches share are not modelled:
+`scripts/results/notes.md#small-turns`.
 """
 
 from typing import NamedTuple
@@ -34,12 +32,10 @@ from scipy.sparse.linalg import splu
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 
-_ROBUST_SIGMAS = 3.5
-_PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)
-# Of the standard deviations, from one round to the next; a bound of the rounds: seven scenes took 8 to 16.
-_COOLING, _MOST_ROUNDS = 0.8, 30
-# Weights change no more once no correction moves by so much.
-_SETTLED_RAD = np.radians(0.002)
+_ROBUST_SIGMAS = 3.5  # standard deviations at which a weight is a quarter; beyond, a pair hardly counts
+_PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)  # radians, tau and width; see the header
+_COOLING, _MOST_ROUNDS = 0.8, 30  # factor on the standard deviations per round; seven scenes took 8 to 16
+_SETTLED_RAD = np.radians(0.002)  # radians; once no correction moves farther, weights change no more
 
 
 class Corrections(NamedTuple):
@@ -69,8 +65,8 @@ def solve_corrections(
         turns: (k, 3) rotation vectors of the turns of pairs, in world axes, radians.
         sigmas_rad: (k,) their standard deviations, finite.
         count: the number of cameras, n.
-        level: what the standard deviations are to be multiplied by, at most 1.
-        larger_than_rad: standard deviations are returned of the corrections larger than that.
+        level: factor on the standard deviations, at most 1.
+        larger_than_rad: size of the corrections whose standard deviations are returned.
     """
     x, k = np.zeros((count, 3)), len(pairs)
     rows, signs = np.tile(np.arange(k), 2), np.repeat([1.0, -1.0], k)

@@ -4,16 +4,12 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 
-# All but a few directions lie within this angle of the line.
-_MOST_DEG, _SHARE = 1.0, 0.95
-_FEWEST_DIRECTIONS = 3
+_MOST_DEG, _SHARE = 1.0, 0.95  # degrees from the line, and share of directions within; a few may be wrong
+_FEWEST_DIRECTIONS = 3  # directions; fewer lie on a line by chance
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:
-    """Return the line, (d,), within a degree of which the unit directions (m, d) lie; None if there is none.
-
-    One in twenty may be off, as wrong directions are.
-    """
+    """Return the line (d,) within a degree of 19 in 20 unit directions (m, d); None if there is none."""
     if len(directions) < _FEWEST_DIRECTIONS:
         return None
     _, _, axes = np.linalg.svd(directions, full_matrices=False)
@@ -28,16 +24,10 @@ def find_line(directions: FloatArray) -> FloatArray | None:
 
 
 def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:
-    """Return the median standard deviation along a line, as a share of the cameras' extent along it.
-
-    Args:
-        line: (d,) unit.
-        locations: (n, d)
-        covariances: (n, d, d) of the locations, NaN where not known.
-    """
+    """Return the median known standard deviation along a unit line (d,), over the cameras' extent."""
     variances = np.einsum("a,kab,b->k", line, covariances, line)
-    known = np.isfinite(variances) & (variances >= 0.0)
+    valid = np.isfinite(variances) & (variances >= 0.0)
     extent = float(np.ptp(locations @ line)) if len(locations) else 0.0
-    if not known.any() or extent == 0.0:
+    if not valid.any() or extent == 0.0:
         return float("nan")
-    return float(np.median(np.sqrt(variances[known]))) / extent
+    return float(np.median(np.sqrt(variances[valid]))) / extent

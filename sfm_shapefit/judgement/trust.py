@@ -15,18 +15,17 @@ hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, t
              distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
              leave 10 % open.
 
-So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. Where there is no
-evidence either way, trust is 2/3 in a clean scene, and 2/3 of the median share where pairs are wrong: what
-nothing checks is right as often as the rest. In a clean scene a camera whose matches speak against it as much
-as for it has 1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
+So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. In a clean scene
 
-Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
-symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
-they stand to the rest. Only the pairs with the consensus count. It is found by correlation clustering: two
-sets of cameras join while the agreeing matches between them outweigh the contradicting ones, the strongest
-first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of image and mesh graphs
-by lifted multicuts", section 4). So each set is judged by all its pairs with the rest together. Sets are
-about who agrees with whom, not about evidence: leverages do not count there.
+    no evidence either way       2/3 (2/3 of the median share where pairs are wrong)
+    as much for it as against    1/2 to 2/3
+    more against it, or loose    below 1/2
+
+Several cameras whose rotations are wrong in the same way, as the symmetry of an object makes them, agree with
+one another in thousands of matches, which say nothing of how they stand to the rest. So only the pairs with
+the consensus count, which correlation clustering finds (`bodies`): two sets of cameras join while the
+agreeing matches between them outweigh the contradicting ones, the strongest first, so that each set is judged
+by all its pairs with the rest together. Leverages do not count there: who agrees is no question of evidence.
 
 Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
 together they count at most half as much as all agreements.
@@ -44,26 +43,18 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Looseness
 
-# A pair agrees within this angle, or within so many of its standard deviations.
-_AGREEING_ANGLE_RAD = np.radians(3.0)
-_AGREEING_SIGMAS = 5.0
-# Beyond so many pairs, which take ten seconds, all cameras count as the consensus.
-_MAX_CLUSTERED_PAIRS = 1_000_000
-# Largest weight of all contradictions over that of all agreements.
-_LARGEST_CONTRADICTION = 0.5
-# Matches that every camera has beforehand, half of them for it in a clean scene.
-_PRIOR = 30.0
-_LEAST_MEDIAN = 0.5
-# Matches of one pair that count at most: hundreds of them are no independent witnesses.
-_MAX_SUPPORT = 200.0
-# Matches of a pair that does not say how many it has.
-_UNKNOWN_SUPPORT = 50.0
-# Share of the median agreement of all cameras: a camera with that much loses nothing.
-_USUAL_SHARE = 0.75
-# The standard deviation tau that halves trust, as a share of the cameras' spread.
-_HOLD_SHARE = 0.1
+_AGREEING_ANGLE_RAD = np.radians(3.0)  # radians; a pair agrees within this angle, or ...
+_AGREEING_SIGMAS = 5.0  # ... within this, in its standard deviations; a far point's direction is inexact
+_MAX_CLUSTERED_PAIRS = 1_000_000  # pairs; more take over ten seconds, and all cameras are the consensus
+_LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements; see the header
+_PRIOR = 30.0  # matches that every camera has beforehand; half of them for it in a clean scene
+_LEAST_MEDIAN = 0.5  # median share of agreement; hardly anything agrees with a collapsed answer
+_MAX_SUPPORT = 200.0  # matches of a pair that count; hundreds are no independent witnesses
+_UNKNOWN_SUPPORT = 50.0  # matches of a pair that has no number of them; a usual pair's
+_USUAL_SHARE = 0.75  # share of the median agreement of all cameras; with that much a camera loses nothing
+_HOLD_SHARE = 0.1  # standard deviation tau that halves trust, in spreads; a tenth of the scene is loose
 LOW_TRUST = 0.75
-"""Trust below which reasons are given."""
+"""Trust below which reasons are given; usual cameras have more."""
 SOMEWHAT_LOOSE = "its pairs leave it somewhat loose"
 _CONTRADICTED = "more of its matches contradict it than usual here: its rotation may be wrong"
 
@@ -113,7 +104,7 @@ def judge_cameras(
     Args:
         measured: the solved graph.
         locations: (n, d) its solution.
-        fit: of its directions.
+        fit: agreement of its directions.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
         conditioning: how well the pairs hold its k cameras.
     """

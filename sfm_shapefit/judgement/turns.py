@@ -26,9 +26,9 @@ Bodies are found by contraction (`bodies`) from pairs that agree and pairs that 
 relative: of all bodies the one whose turn mends most is turned first, the smallest of equals, and none that
 has more than half of all cameras; its pairs then agree, and bodies are found anew.
 
-Turns that are smaller than a pair can tell are looked for at last, in all pairs together (`small_turns`). Of
-a camera whose correction is larger than a degree, and than five of its standard deviations, `turned` are the
-pairs that fit better with it, `placed` those that fit only without.
+Turns too small for a single pair are looked for at last, in all pairs together (`small_turns`). For a camera
+whose correction is larger than a degree, and than five of its standard deviations, `turned` are the pairs
+that fit better with it, `placed` those that fit only without.
 
 How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
 and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
@@ -36,9 +36,9 @@ degrees are added for the given rotations, and where the quarter of pairs that a
 than that, all standard deviations are as much larger. Chosen on fourteen scenes of good rotations: 4 to 12 %
 of their sound pairs seem turned, and 98 % of those of cameras that were turned by 2 degrees.
 
-How well the matches of a pair fit the given rotations, with the best direction, against how well they fit the
-best rotation: the ratio of the mean robust weights, of which the former is estimated from share and median
-residual of the inliers. It is 1 or more for all but 5 % of the right pairs.
+Support of the given rotations is the ratio of the mean robust weights of a pair's matches with the best
+direction there and with the best rotation, the first estimated from share and median residual of the inliers.
+It is 1 or more for all but 5 % of the right pairs.
 """
 
 import enum
@@ -54,38 +54,25 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
 
-# Matches of a pair that count as independent, for its turn and for its vote.
-_INDEPENDENT_MATCHES = 20.0
-_MOST_WEIGHT = 200.0
-_FLOOR_RAD = np.radians(0.1)
-# Turns that are below both count as none; in standard deviations of the least certain axis.
-_LEAST_TURN_RAD = np.radians(1.0)
-_AGREEING_SIGMAS = 3.5
-# By so many standard deviations a pair has to fit one explanation better than the other, to prefer it.
-_PREFERENCE = 0.5
-# An agreement says nothing where the turn could as well be larger than this.
-_LARGEST_SIGMA_RAD = np.radians(3.0)
-# The level of errors is taken from pairs with smaller turns: the quantile, and what it is of normal errors.
-_NEAR_RAD = np.radians(10.0)
-_LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1
-# Ratio of robust weights from which matches do not fit the given rotations, and from which they fully do.
-_UNEXPLAINED, _EXPLAINED = 0.7, 0.95
-# Median residual of a robust fit over that of all of its matches.
-_MEAN_OF_MEDIAN = 0.8
-# Support of a pair whose direction agrees while its own rotation does not.
-_DIRECTION_ALONE = 0.5
+_INDEPENDENT_MATCHES = 20.0  # matches of a pair that count for its turn; their errors are in part the same
+_MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are no independent witnesses
+_FLOOR_RAD = np.radians(0.1)  # radians; added for the errors of the given rotations
+_LEAST_TURN_RAD = np.radians(1.0)  # radians; a turn below this and ...
+_AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
+_PREFERENCE = 0.5  # standard deviations; a pair that fits an explanation better by less prefers none
+_LARGEST_SIGMA_RAD = np.radians(3.0)  # radians; agreement says nothing where a turn could as well be larger
+_NEAR_RAD = np.radians(10.0)  # radians; the level of errors is that of pairs with smaller turns
+_LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
+_UNEXPLAINED, _EXPLAINED = 0.7, 0.95  # ratio of robust weights; given rotations fit not at all, and fully
+_MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
+_DIRECTION_ALONE = 0.5  # support of a pair whose direction agrees; its own rotation does not
 RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
-"""Shares s from which a camera is right, and below which it is turned."""
-# Turns of a body that are compared with one another; those of most weight.
-_MOST_VOTES = 300
-# Bodies that are turned, one after the other: each time all others are looked at again. What is left is
-# judged as it stands, and by all pairs together.
-_MOST_TURNED = 50
-_AVERAGING_STEPS = 4
-# Standard deviations from which a correction is no chance, however few and inexact the pairs are.
-_CERTAIN_SIGMAS = 5.0
-# For all pairs together, standard deviations are what the pairs that agree best show, and this at least.
-_LEAST_LEVEL = 0.2
+"""Shares s: from the first a camera is right, below the second it is turned."""
+_MOST_VOTES = 300  # turns of a body that are compared with one another; those of most weight decide
+_MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
+_AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
+_CERTAIN_SIGMAS = 5.0  # standard deviations; such a correction is no chance, however few its pairs are
+_LEAST_LEVEL = 0.2  # least level of errors for all pairs together; else that of those that agree best
 
 
 class Doubt(enum.Enum):
@@ -163,19 +150,23 @@ def weigh_pairs(
     """Return what pairs say of rotations, from their directions and from their own relative rotations.
 
     Args:
-        directions: of k pairs.
-        agreements: (k,) 1 where the direction agrees with the solved baseline, 0 where it does not; NaN where
-            that is not known.
-        relative: of some of these pairs, in any order; a pair without is taken as its direction says.
+        directions: directions of k pairs.
+        agreements: (k,) 1 where the direction agrees with the solved baseline, 0 where not; NaN where
+            unknown.
+        relative: relative rotations of some of these pairs, in any order; a pair without counts by direction.
         rotations: (n, 3, 3) the given ones, cam_from_world.
     """
     k, n = len(directions.pairs), len(rotations)
     codes = directions.pairs[:, 0] * n + directions.pairs[:, 1]
     order = np.argsort(codes, kind="stable")
-    own = relative.pairs[:, 0] * n + relative.pairs[:, 1]
-    row = order[np.minimum(np.searchsorted(codes[order], own), k - 1)] if k else np.zeros(0, dtype=np.int64)
-    found = codes[row] == own if k else np.zeros(0, dtype=np.bool_)
-    relative, row = relative.subset(found), row[found]
+    codes_of_relative = relative.pairs[:, 0] * n + relative.pairs[:, 1]
+    row = (
+        order[np.minimum(np.searchsorted(codes[order], codes_of_relative), k - 1)]
+        if k
+        else np.zeros(0, dtype=np.int64)
+    )
+    has_rotation = codes[row] == codes_of_relative if k else np.zeros(0, dtype=np.bool_)
+    relative, row = relative.subset(has_rotation), row[has_rotation]
 
     i, j = relative.pairs.T
     turns, sigmas = np.tile(np.eye(3), (k, 1, 1)), np.full(k, np.inf)
@@ -193,31 +184,29 @@ def weigh_pairs(
     )
     usable = is_usable(directions.status)
     small = _angles(turns) <= np.maximum(_AGREEING_SIGMAS * sigmas, _LEAST_TURN_RAD)
-    known = np.isfinite(sigmas)
+    finite = np.isfinite(sigmas)
     judged = usable & np.isfinite(agreements)
     support = np.where(judged, np.nan_to_num(agreements) * explained, 0.0)
     asked = np.zeros(k, dtype=np.bool_)
     asked[row] = True
-    support = np.where(asked & ~(known & small), _DIRECTION_ALONE * support, support)
+    support = np.where(asked & ~(finite & small), _DIRECTION_ALONE * support, support)
     # A pair without a direction that could be compared speaks for the rotation all the same.
-    support = np.where(~judged & known & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
-    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (known & small))
+    support = np.where(~judged & finite & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
+    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (finite & small))
     weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)
     weights[row] = np.minimum(counts, _MOST_WEIGHT)
     return PairTurns(directions.pairs, turns, sigmas, weights, support, astray.astype(np.float64))
 
 
 def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
-    """Return what the pairs say of the rotation of each camera.
+    """Return what the pairs between cameras say of the rotation of each.
 
-    Args:
-        pairs: between cameras.
-        labels: (n,) the rigid group, such as the frame, of each camera; cameras of a group turn as one.
+    Cameras of a rigid group, such as a frame, turn as one: `labels` (n,) has the group of each.
     """
     count = int(labels.max(initial=-1)) + 1
     ends = labels[pairs.pairs]
-    kept = ends[:, 0] != ends[:, 1]
-    case = pairs.subset(kept)._replace(pairs=ends[kept])
+    between = ends[:, 0] != ends[:, 1]
+    case = pairs.subset(between)._replace(pairs=ends[between])
     level = _level(case)
     inflation = max(1.0, level)
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
@@ -323,9 +312,9 @@ def _level(pairs: PairTurns) -> float:
 
 def _contradicts(pairs: PairTurns) -> BoolArray:
     """Return which pairs say that one of their cameras is turned, (k,)."""
-    known = np.isfinite(pairs.sigmas_rad)
-    limits = np.maximum(_AGREEING_SIGMAS * np.where(known, pairs.sigmas_rad, 0.0), _LEAST_TURN_RAD)
-    return np.asarray(known & (_angles(pairs.turns) > limits))
+    finite = np.isfinite(pairs.sigmas_rad)
+    limits = np.maximum(_AGREEING_SIGMAS * np.where(finite, pairs.sigmas_rad, 0.0), _LEAST_TURN_RAD)
+    return np.asarray(finite & (_angles(pairs.turns) > limits))
 
 
 def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
@@ -372,7 +361,7 @@ def _worst_body(
     pairs: PairTurns, touching: _Touching, bodies: IntArray, done: BoolArray, least_rad: float
 ) -> tuple[BoolArray, _Judged] | None:
     """Return the body whose turn mends most, the smallest of equals, and what is said of it."""
-    found = []
+    candidates = []
     for label in range(int(bodies.max(initial=-1)) + 1):
         body = (bodies == label) & ~done
         if not body.any() or 2 * body.sum() > len(body):
@@ -380,11 +369,11 @@ def _worst_body(
         own = pairs.subset(touching.rows_of(np.flatnonzero(body)))
         judged = _judge(own, body, ~body, least_rad)
         if judged.kind is Doubt.TURNED:
-            found.append((body, judged))
-    if not found:
+            candidates.append((body, judged))
+    if not candidates:
         return None
-    most = max(judged.turned - judged.placed for _, judged in found)
-    equal = [one for one in found if one[1].turned - one[1].placed >= 0.9 * most]
+    most = max(judged.turned - judged.placed for _, judged in candidates)
+    equal = [one for one in candidates if one[1].turned - one[1].placed >= 0.9 * most]
     return min(equal, key=lambda one: int(one[0].sum()))
 
 
@@ -407,10 +396,10 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
     turn = _common_turn(votes, sigmas, weights * (1.0 - support), contradict)
     if turn is None or _angles(turn[None])[0] <= least_rad:
         return judged
-    known = np.isfinite(sigmas)
-    scale = np.where(known, sigmas, 1.0)
-    off_turned = np.where(known, _angles(votes @ turn.T) / scale, np.inf)
-    off_placed = np.where(known, _angles(votes) / scale, np.inf)
+    finite = np.isfinite(sigmas)
+    scale = np.where(finite, sigmas, 1.0)
+    off_turned = np.where(finite, _angles(votes @ turn.T) / scale, np.inf)
+    off_placed = np.where(finite, _angles(votes) / scale, np.inf)
     turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned + _PREFERENCE < off_placed)
     # What fits as placed, within the accuracy of its own rotation, is no evidence for the turn.
     fit_both = np.where(off_placed <= _AGREEING_SIGMAS, support, 0.0)
@@ -423,10 +412,7 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
 
 
 def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: float) -> dict[int, _Judged]:
-    """Return the groups that all pairs together say are turned, by more than `least_rad`.
-
-    Turns near 0 are `level` times as large as the standard deviations say.
-    """
+    """Return the groups that all pairs say are turned, by more than `least_rad`, at an error `level`."""
     # Here, since it takes long to import, and where no pair is asked it is not used.
     from scipy.spatial.transform import Rotation
 
@@ -465,11 +451,8 @@ def _common_turn(
 ) -> FloatArray | None:
     """Return the turn that votes of most weight agree on, averaged over those; None without candidates.
 
-    Args:
-        votes: (k, 3, 3) turns.
-        sigmas: (k,) their standard deviations, radians.
-        weights: (k,) what they count.
-        candidates: (k,) the votes that may be the turn.
+    The votes (k, 3, 3) have standard deviations (k,) in radians; `candidates` (k,) are those that may be the
+    turn.
     """
     voting = np.flatnonzero(np.isfinite(sigmas))
     voting = voting[np.argsort(-weights[voting], kind="stable")][:_MOST_VOTES]

@@ -40,19 +40,19 @@ from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
 
-# Shares of each block's trace that are added: what nothing holds becomes large, not singular.
-_RIDGES = (1e-12, 1e-10, 1e-8)
-# A camera may not decide the gauge with a larger standard deviation, in spreads, ...
-_LOOSE = 0.2
-# ... nor if it stands farther from the cameras' median, in spreads.
-_FAR = 10.0
-_LOOSENING_ROUNDS = 20
-# Share of the longest baseline below which a baseline counts as that long.
-_SHORTEST = 1e-12
+_RIDGES = (
+    1e-12,
+    1e-10,
+    1e-8,
+)  # shares of each block's trace, added in turn; loose nodes become large, finite
+_LOOSE = 0.2  # spreads; a camera of larger standard deviation may not decide the gauge, ...
+_FAR = 10.0  # ... spreads from the cameras' median; nor may one that stands farther away
+_LOOSENING_ROUNDS = 20  # rounds in which cameras leave the gauge; a bound
+_SHORTEST = 1e-12  # share of the longest baseline; a shorter one counts as that long
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Uncertainty:
+class CameraUncertainty:
     """Covariances of the locations and leverages of the directions of a rigid graph."""
 
     covariances: FloatArray
@@ -75,7 +75,7 @@ class Information(NamedTuple):
     units: FloatArray
     """(m, d) directions of the baselines."""
     lengths: FloatArray
-    """(m,) of the baselines."""
+    """(m,) lengths of the baselines."""
     across: FloatArray
     """(m, d, d) P Lambda P with P = I - u u^T, rad^-2: the scale stays exactly free."""
     blocks: FloatArray
@@ -112,8 +112,11 @@ def propagate(
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-) -> Uncertainty | None:
+) -> CameraUncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
+
+    None if the factor would take more than `max_bytes`; 2 GB from about a hundred thousand cameras in space
+    on.
 
     Args:
         locations: (n, d) at the solution; nodes beyond `num_cameras` are points.
@@ -122,27 +125,24 @@ def propagate(
         num_cameras: the first so many nodes may decide the gauge; all if None.
         errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
             only one is held at a time; independent errors of that information if None.
-        max_bytes: of the factor.
-
-    Returns:
-        None if the factor would take more: than 2 GB from about a hundred thousand cameras in space on.
+        max_bytes: limit of the factor.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
     """
     n, d = locations.shape
-    known = inform(locations, edges, information)
+    terms = inform(locations, edges, information)
     plan = analyze(n, edges)
     if plan.num_bytes(d) > max_bytes:
         return None
-    factor = _grounded_factor(plan, known)
+    factor = _grounded_factor(plan, terms)
     inverse = selected_inverse(factor, edges)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
-        pulls = known.across / known.lengths[:, None, None]
+        pulls = terms.across / terms.lengths[:, None, None]
         covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
-    return Uncertainty(covariances=covariances, leverages=known.leverages(inverse, edges), gauge=gauge)
+    return CameraUncertainty(covariances=covariances, leverages=terms.leverages(inverse, edges), gauge=gauge)
 
 
 def scatter(samples: FloatArray) -> FloatArray:
@@ -178,12 +178,12 @@ def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gau
     return moved
 
 
-def _grounded_factor(plan: SymbolicFactor, known: Information) -> CholeskyFactor:
+def _grounded_factor(plan: SymbolicFactor, terms: Information) -> CholeskyFactor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
-    longest = int(np.argmax(known.lengths))
-    held = np.trace(known.blocks[longest]) * np.outer(known.units[longest], known.units[longest])
+    longest = int(np.argmax(terms.lengths))
+    held = np.trace(terms.blocks[longest]) * np.outer(terms.units[longest], terms.units[longest])
     for ridge in _RIDGES:
-        regular = known.ridged(ridge)
+        regular = terms.ridged(ridge)
         regular[longest] += held
         try:
             return factorize(plan, regular)

@@ -21,21 +21,17 @@ from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.placement.conditioning import LooseGroup, condition
-from sfm_shapefit.refinement.agreement import Agreement, find_agreement, own_covariances
+from sfm_shapefit.placement.conditioning import LooseCameras, condition
+from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# Cameras; two have no shape, so nothing in it is uncertain.
-_SMALLEST_RIGID = 3
-# Directions whose error samples are worked on at a time.
-_PART = 2_000
-# Noise for which it is asked at least which nodes are loose: with none, none would be.
-_LOOSENING_RAD = 1e-4
-# Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
-# stands beyond the last does not say how large the scene is.
+_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
+_PART = 2_000  # directions whose error samples are worked on at a time; bounds the memory
+_LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nodes; with none, none would be
+# Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
+# not say how large the scene is.
 _REACHES = (np.inf, 1e3, 30.0)
-# Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size.
-_UNCHECKED_LEVERAGE = 0.99
+_UNCHECKED_LEVERAGE = 0.99  # leverage; from here on agreement means nothing, 1 % of an error shows
 
 
 class Verdict(enum.Enum):
@@ -63,14 +59,14 @@ class Assessment:
     excess_deg: float
     """The part of it, per axis, that the pairs' own covariances do not explain."""
     trust: FloatArray
-    """(k,) of each camera, in [0, 1], see `trust.judge_cameras`."""
+    """(k,) trust of each camera, in [0, 1], see `trust.judge_cameras`."""
     reasons: tuple[str, ...]
     """k sentences that say why a trust is low; empty where it is not."""
     hold: FloatArray
     """(k,) the factor of trust that says how well the pairs hold each camera."""
     loose_reasons: tuple[str, ...]
     """k sentences that say what the pairs leave open; empty where they hold the camera."""
-    loose_groups: tuple[LooseGroup, ...]
+    loose_groups: tuple[LooseCameras, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     covariances: FloatArray
     """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
@@ -98,18 +94,18 @@ def assess(
     *,
     undetermined_nodes: IntArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
-    agreement: Agreement | None = None,
+    agreement: AngularAgreement | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
     Args:
-        measured: the solved graph, with what is known of it; with rigid groups each pair joins two of them.
-            What it has fixed stays where it is; else the mean of the cameras does.
+        measured: the solved graph; with rigid groups each pair joins two of them. What it has fixed stays
+            where it is; else the mean of the cameras does.
         locations: (n, d) its locations.
         undetermined_nodes: nodes whose position is a placeholder, such as those that the refinement reset:
             their standard deviations are infinite, and they hold no others; none if None.
-        max_bytes: that the factor for standard deviations may take.
-        agreement: of the same graph with the same locations; found anew if None.
+        max_bytes: limit of the factor for standard deviations.
+        agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     graph, groups, k = measured.graph, measured.groups, measured.num_cameras
     freedom, own = graph.dimension - 1, own_covariances(measured)

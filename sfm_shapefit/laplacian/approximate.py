@@ -18,12 +18,11 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
-from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
+from sfm_shapefit.laplacian.operators import Adjacency
 
-# A residual so many times the least so far shows that rounding leads, and no longer the system.
-_DIVERGED = 1e6
+_DIVERGED = 1e6  # residual over the least so far; such a one shows that rounding leads, no longer the system
 
 Operator = Callable[[FloatArray], FloatArray]
 
@@ -76,12 +75,9 @@ class ApproximateCholesky:
 
 
 def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> ApproximateCholesky:
-    """Return a sampled Cholesky factor of the graph Laplacian.
+    """Return a sampled Cholesky factor of a graph Laplacian; `seed`, any integer, fixes its draws.
 
-    Args:
-        graph: the neighbors of each node.
-        weights: (m,) non-negative edge weights; edges of weight 0 do not count.
-        seed: of the draws; any integer.
+    The weights (m,) are non-negative; edges of weight 0 do not count.
     """
     w = np.ascontiguousarray(weights, dtype=np.float64)
     if not (np.isfinite(w).all() and (w >= 0.0).all()):

@@ -29,19 +29,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel, multiply_in_lanes
 from sfm_shapefit.laplacian.dense import Blas, Block, blas_of, gemm, one_blas_thread, potrf, syrk, trsm
-from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
+from sfm_shapefit.laplacian.operators import Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
 
 PIVOT_TOLERANCE = 64.0
-"""Pivots below this many rounding units of their diagonal entry count as zero."""
+"""Rounding units of the diagonal entry; smaller pivots count as zero."""
 
-# A front above the tasks of so many rows or more is factored by strips of so many columns.
-_LARGE_FRONT, _STRIP = 768, 256
+_LARGE_FRONT, _STRIP = (
+    768,
+    256,
+)  # rows of a front above the tasks, and columns of its strips; threads share it
 
 # What is done with a front, one after the other.
 _ASSEMBLE, _FACTOR, _PASS_ON = range(3)
@@ -103,9 +105,9 @@ class CholeskyFactor:
             ground: added to the last pivot (times the identity); the mean diagonal weight if None.
 
         Raises:
-            UnsolvableError: if a pivot is not positive to working precision: the graph is disconnected,
-                or (b > 1) not rigid under these weights, or a weight is negative or not finite. Use
-                nothing of the factor then.
+            UnsolvableError: if a pivot is not positive to working precision: the graph is disconnected, or (b
+                > 1) not rigid under these weights, or a weight is negative or not finite. The factor is
+                unusable then.
         """
         plan, b = self.symbolic, self.block
         shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
@@ -125,13 +127,12 @@ class CholeskyFactor:
     def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
         """Factor a symmetric matrix with blocks of its own at the nodes and edges, in place.
 
+        Returns whether it is positive definite to working precision; the factor is unusable if not.
+
         Args:
             edges: (m, 2) those that the factor was planned for.
             diagonal: (n, b, b) symmetric blocks of the nodes.
             off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j).
-
-        Returns:
-            Whether it is positive definite to working precision; use nothing of the factor if not.
         """
         plan, b = self.symbolic, self.block
         self._diagonal[:] = diagonal[plan.permutation].reshape(-1, b * b)
@@ -159,14 +160,10 @@ class CholeskyFactor:
         return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        """Return x with L x = rhs, with x = 0 at the grounded node.
+        """Return x with L x = rhs, with x = 0 at the grounded node, in float64.
 
-        Args:
-            rhs: (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be
-                orthogonal to the constants (of each of the b components).
-
-        Returns:
-            Float64 of the shape of `rhs`, accurate to the precision of the factor.
+        `rhs` is (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be orthogonal
+        to the constants (of each of the b components).
         """
         plan, b = self.symbolic, self.block
         n = plan.num_nodes
@@ -187,17 +184,14 @@ class CholeskyFactor:
 def analyze(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray = "auto") -> SymbolicFactor:
     """Plan the factorization of the Laplacians of a graph, whatever their weights, block size and precision.
 
+    `num_nonzeros`, `flops` and `num_bytes` of the plan say what a factorization would cost; still earlier,
+    and cheaper, the elimination tree of `best_order` does.
+
     Args:
         num_nodes: n >= 1.
-        edges: (m, 2) node indices; repeated edges add up.
+        edges: (m, 2) node indices; repeated edges add up. InputError for an index out of range or a
+            self-loop.
         ordering: a method of `ordering.best_order`, or an order of elimination (n,) itself.
-
-    Returns:
-        The plan. `num_nonzeros`, `flops` and `num_bytes` tell what a factorization would cost. To know that
-        still earlier, and cheaper, ask `best_order` for the elimination tree alone.
-
-    Raises:
-        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
     pairs = check_edges(num_nodes, edges)
     graph = adjacency(num_nodes, pairs)
@@ -359,7 +353,7 @@ def _subtract_strip(
     """Subtract a strip of columns of a a^T from the lower triangle of a matrix, or store it negated.
 
     Args:
-        blas: what BLAS needs.
+        blas: addresses of BLAS.
         left: `a` from a row on; it has `depth` columns.
         depth: see `left`.
         target: the matrix from a row and a column on.

@@ -74,7 +74,7 @@ class Blas(NamedTuple):
     """What the kernels below need to call BLAS and LAPACK; one per thread, for the integers are scratch."""
 
     addresses: IntArray
-    """Of the routines for one type, float32 or float64, and of their constant arguments."""
+    """Addresses of the routines for one type, float32 or float64, and of their constant arguments."""
     integers: npt.NDArray[np.int32]
     """(8,) scratch that passes integers by reference."""
 

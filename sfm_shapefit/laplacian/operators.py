@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import bsr_array
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
-
-Int32Array = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +39,7 @@ class Adjacency:
 
 
 def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
-    """Return `edges` as a contiguous (m, 2) int64 array.
-
-    Raises:
-        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
-    """
+    """Return `edges` as a contiguous (m, 2) int64 array; InputError for a bad index or a self-loop."""
     checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
     bad = ((checked < 0) | (checked >= num_nodes)).any(axis=1) | (checked[:, 0] == checked[:, 1])
     if bad.any():
@@ -58,12 +52,7 @@ def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
 
 
 def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
-    """Return the neighbors of each node; a repeated edge stands repeatedly.
-
-    Args:
-        num_nodes: n.
-        edges: (m, 2) int64, checked.
-    """
+    """Return the neighbors of each of n nodes by checked edges (m, 2); a repeated edge stands repeatedly."""
     ends = frozen(edges.ravel())
     pointers, entries = group_by(ends, num_nodes)
     neighbors = ends[entries ^ 1].astype(np.int32)  # the other end of the same edge
@@ -90,10 +79,8 @@ def group_by(labels: Any, count: int) -> Any:
 def block_matrix(diagonal: FloatArray, coupling: FloatArray, edges: IntArray) -> bsr_array:
     """Return the symmetric matrix (nb, nb) of blocks.
 
-    Args:
-        diagonal: (n, b, b) the block of each node.
-        coupling: (m, b, b) block (i, j) of each edge; its transpose is block (j, i).
-        edges: (m, 2) node indices.
+    Nodes have the blocks `diagonal` (n, b, b); edge (i, j) of `edges` (m, 2) has `coupling` (m, b, b) as its
+    block (i, j), and the transpose as block (j, i).
     """
     n, b, (i, j) = len(diagonal), diagonal.shape[1], edges.T
     rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
@@ -157,10 +144,8 @@ class Workers:
             raise failures[min(failures)]
 
 
-_ROW_BLOCKS = 8
-
-# On fewer entries, handing work to a thread costs more than the work.
-_ENTRIES_WORTH_A_THREAD = 50_000
+_ROW_BLOCKS = 8  # blocks of rows, whatever the threads; sums have one order
+_ENTRIES_WORTH_A_THREAD = 50_000  # entries; on fewer, handing work to a thread costs more than the work
 
 
 class LaplacianOperator:

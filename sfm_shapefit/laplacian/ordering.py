@@ -22,12 +22,9 @@ from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 
 Ordering = Literal["auto", "metis", "minimum-degree"]
 
-# Minimum degree takes longer than it can save on graphs of more edges than this.
-_MINIMUM_DEGREE_LIMIT = 400_000
+_MINIMUM_DEGREE_LIMIT = 400_000  # edges; on more, minimum degree takes longer than it can save
 
-# A graph on which METIS's order takes more operations per edge than this is no band, and minimum degree found
-# a better order on no box or community.
-_BAND_FLOPS = 600
+_BAND_FLOPS = 600  # operations per edge in METIS's order; with more a graph is no band, and METIS was best
 
 # METIS refines a cut so often per level; its own 10 take half as long again and save at most 5 % of the work.
 _METIS_REFINEMENTS = 1
@@ -36,10 +33,8 @@ _METIS_REFINEMENTS = 1
 def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
     """Return the elimination tree of the order with the least work.
 
-    Args:
-        graph: the neighbors of each node.
-        method: one method, or "auto": METIS, and minimum degree as well on graphs of up to 400,000 edges
-            where it can be better; the one whose factorization takes fewer operations is kept.
+    The method "auto" tries METIS, and minimum degree as well on graphs of up to 400,000 edges where it can be
+    better; the one whose factorization takes fewer operations is kept.
     """
     trees = [] if method == "minimum-degree" else [elimination_tree(graph, metis_order(graph))]
     edges = len(graph.neighbors) // 2

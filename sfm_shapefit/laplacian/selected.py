@@ -36,12 +36,8 @@ class SelectedInverse:
 def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse:
     """Return the blocks of the inverse at the nodes and edges of the graph.
 
-    Args:
-        factor: a float64 factor whose `refactor` succeeded.
-        edges: (m, 2) the edges it was planned for, which say how each block is to be turned.
-
-    Raises:
-        ValueError: if the factor is not float64, or the edges are not as many as it was planned for.
+    The float64 factor's `refactor` succeeded; `edges` (m, 2) are those it was planned for, and say how each
+    block is to be turned. ValueError if it is not float64, or the edges are not as many.
     """
     plan, b = factor.symbolic, factor.block
     if factor.dtype != np.float64 or len(edges) != plan.num_edges:

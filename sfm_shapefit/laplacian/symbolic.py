@@ -23,23 +23,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.laplacian.operators import Adjacency, Int32Array, group_by
+from sfm_shapefit.laplacian.operators import Adjacency, group_by
 
 DEFAULT_FACTOR_BYTES = 2_000_000_000
-"""What one factor may take if the caller says nothing."""
+"""Bytes of one factor, unless the caller says otherwise; that of a dense matrix of 16,000 unknowns."""
 
-# A child joins its parent if the merged panel has at most this share of zeros, or the share that the limits
-# give while it has at most so many columns.
-_MERGE_ALWAYS = 0.03
-_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))
-# Subtrees with more than the first share of all entries are divided; with less than the second they are left
-# to the part above, with what cannot be divided.
-_LARGEST_TASK = 1 / 6
-_SMALLEST_TASK = 1 / 40
-# With fewer entries in the panels, handing out work costs more than the work.
-_WORTH_TASKS = 500_000
+_MERGE_ALWAYS = 0.03  # share of zeros in the merged panel; up to it a child joins its parent in any case
+_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # columns and share of zeros; small panels may have more
+_LARGEST_TASK = 1 / 6  # share of all entries; subtrees with more are divided, so that threads end together
+_SMALLEST_TASK = 1 / 40  # share of all entries; subtrees with less are left to the part above
+_WORTH_TASKS = 500_000  # entries of the panels; with fewer, handing out work costs more than the work
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,8 +93,8 @@ class SymbolicFactor:
     """(r, 2) the runs of supernodes that are in no task; ascending. Their descendants may be tasks. Between
     two runs the tasks can be worked on at the same time."""
     update_offsets: IntArray
-    """(S,) start of each update matrix in the stack, in units of one (block) entry. Those inside a task,
-    but for its root's, count from the start of the arena in which the task runs."""
+    """(S,) start of each update matrix in the stack, in units of one (block) entry. Inside a task, but for
+    its root's, they count from the start of the arena in which the task runs."""
     stack_size: int
     """(Block) entries of the stack of update matrices, without arenas."""
     arena_size: int
@@ -141,14 +136,9 @@ class SymbolicFactor:
 
 
 def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> EliminationTree:
-    """Return the elimination tree and the column counts of L for a fill-reducing order.
+    """Return the elimination tree and the column counts of L for a fill-reducing order (n,).
 
-    Args:
-        graph: the neighbors of each node.
-        order: (n,) a permutation of the nodes, the first eliminated first.
-
-    Returns:
-        The tree for an equivalent order (same L up to renumbering) in which subtrees are contiguous.
+    The tree is for an equivalent order (same L up to renumbering) in which subtrees are contiguous.
     """
     permutation = np.ascontiguousarray(order, dtype=np.int64)
     inverse = _inverse(permutation)
@@ -166,10 +156,7 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
 def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
     """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
 
-    Args:
-        graph: the neighbors of each node.
-        edges: (m, 2) int64, the edges of `graph`.
-        tree: from `elimination_tree` on the same graph.
+    The edges (m, 2) are those of `graph`; `tree` is from `elimination_tree` on the same graph.
     """
     order, first, parent, below = _supernodes(tree.parent, tree.counts)
     permutation = tree.permutation[order]
@@ -309,7 +296,9 @@ def _column_counts(pointers: Any, neighbors: Any, permutation: Any, inverse: Any
 def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Return the merged supernodes: column order, first columns (S + 1,), parents (S,), rows below (S,)."""
     nested = (parent[:-1] == np.arange(1, len(parent))) & (counts[:-1] == counts[1:] + 1)
-    head = np.concatenate([[0], np.flatnonzero(~nested) + 1])[: len(parent)]  # of runs of nested columns
+    head = np.concatenate([[0], np.flatnonzero(~nested) + 1])[
+        : len(parent)
+    ]  # start of runs of nested columns
     width, height = np.diff(head, append=len(parent)), counts[head]
     label = np.repeat(np.arange(len(head)), width)
     above = parent[head + width - 1]

@@ -6,14 +6,9 @@ else. So the relative pose of a pair is estimated anew:
     a few robust trials of pycolmap's essential matrix, on at most 60 matches, taken evenly from the list
     Gauss-Newton on the Sampson error of all of them, see `rotations.two_view_poses`
 
-Few trials suffice, because the inlier matches agree on a pose already; whether it is the true one, the
-averaging tells. Pairs within 5 degrees of the truth, 25 % and 50 % quantile of the error in degrees, and
-milliseconds of CPU per pair, beside COLMAP's two-view estimator (essential matrix against homography):
-
-                  two-view estimator         estimated here             of pairs
-    castle-P30    229   .16   .81  14.6      232   .09   .39   1.0        378
-    lego100       633   .63  5.6    3.7      729   .39  2.4     .8       1313
-
+Few trials suffice, because the inlier matches agree on a pose already; whether it is the true one is for the
+averaging to find. Compared with COLMAP's two-view estimator, more pairs come within 5 degrees of the truth,
+at a tenth of the time: `scripts/results/notes.md#relative-rotations-of-pairs`.
 The estimator takes pixels. What is at hand are rays, of any camera model: they are given as pixels of an
 ideal camera that sees all around, one pixel per radian. A pair without parallax has a rotation too: for
 averaging, cameras that only turn are as good as others.
@@ -39,23 +34,21 @@ from sfm_shapefit.scene.matches import RayMatches, View
 
 RelativeSource = Literal["matches", "stored"]
 
-_TRIAL_MATCHES = 60
-_LEAST_TRIALS = 10
-_MOST_TRIALS = 50
-# Of databases with more pairs than these: the confidence of the trials, and what multiplies their number.
-# Others have the defaults of pycolmap (0.9999 and 3), which try nearly every pair 50 times. So many pairs
-# have images of many pairs each, and can do without the one right pair of 30 to 60 that is then missed
-# (lego100: 715 pairs within 5 degrees instead of 727; liberty-calibrated 449 instead of 464; a facade of
-# 2,500 images, a fifth of the matches wrong: 280 of 280, both, in 0.56 ms a pair instead of 1.29).
+_TRIAL_MATCHES = 60  # matches per trial; the essential matrix is a start, all matches refine it
+_LEAST_TRIALS = 10  # trials of a pair; matches in agreement need no more
+_MOST_TRIALS = 50  # trials of a pair; bounds the time where no pose fits
 MANY_PAIRS = 20_000
+"""Pairs of a database above which each has fewer trials.
+
+Images then have many pairs each, and the averaging can do without the one right pair of 30 to 60 that is
+missed: scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's own confidence and multiplier
+(0.9999 and 3) try nearly every pair 50 times.
+"""
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
-# Mean robust weight of its matches from which a pose that was likely is taken without a trial.
-_LIKELY_SHARE = 0.6
-# Of the trials. At 4 px, 36 pairs of lego100 that are right at 2 px are not; 1 px is as good as 2.
-_INLIER_PX = 2.0
-# Between two slices Python can be interrupted: about 50 ms.
-_PAIRS_PER_SLICE = 64
-_STORED_NOISE_PX = 20.0
+_LIKELY_SHARE = 0.6  # mean robust weight; a pose known beforehand that fits as well needs no trial
+_INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
+_PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
+_STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
 
 
 class LikelyPoses(NamedTuple):
@@ -77,13 +70,13 @@ def estimate_relative_rotations(
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that has one, in the order of pairs.
 
-    Left out are pairs on whose matches no trial finds a pose: fewer than five different ones.
+    Pairs are left out on whose matches no trial finds a pose: fewer than five different ones.
 
     Args:
         batch: rays in camera axes, that is, of a model whose rotations are the identity.
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
-        num_pairs: all that there are, of which these are a part: of many, each is tried less often.
+        num_pairs: pairs of the whole database; if many, each is tried less often.
         likely: poses of the batch's pairs. Where most matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
@@ -96,7 +89,7 @@ def estimate_relative_rotations(
             parts.append(part)
             if advance is not None:
                 advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
-    return concatenate(parts)
+    return concatenate_rotations(parts)
 
 
 def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> RelativeRotations:
@@ -107,7 +100,7 @@ def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> R
     middle axis; W is 1.
 
     Args:
-        view: of images whose focal lengths count.
+        view: view of the images, whose focal lengths count.
         min_matches: pairs with fewer inlier matches are left out.
 
     Raises:
@@ -125,7 +118,7 @@ def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> R
     return stored.subset(poses.num_inliers >= min_matches)
 
 
-def concatenate(parts: Sequence[RelativeRotations]) -> RelativeRotations:
+def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotations:
     """Return the pairs of all parts, in order; there may be no parts."""
     nothing = RelativeRotations(
         pairs=np.zeros((0, 2), dtype=np.int64),
@@ -144,18 +137,20 @@ def _estimate_slice(
 ) -> RelativeRotations:
     """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
     pairs = np.arange(first, min(first + _PAIRS_PER_SLICE, len(batch.pairs)))
-    found, places = [], []
+    estimates, places = [], []
     if likely is not None:
-        known = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
-        near = _refine(batch.rays_of(known), likely.rotations[known], likely.translations[known])
+        likely_pairs = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
+        near = _refine(
+            batch.rays_of(likely_pairs), likely.rotations[likely_pairs], likely.translations[likely_pairs]
+        )
         fits = near.weight_shares >= _LIKELY_SHARE
-        found, places = [near.subset(fits)], [known[fits]]
-        pairs = np.setdiff1d(pairs, known[fits])
+        estimates, places = [near.subset(fits)], [likely_pairs[fits]]
+        pairs = np.setdiff1d(pairs, likely_pairs[fits])
     matches = batch.rays_of(pairs)
     has_pose, rotations, translations = _start_by_trials(matches, num_pairs)
-    found.append(_refine(matches, rotations, translations).subset(has_pose))
+    estimates.append(_refine(matches, rotations, translations).subset(has_pose))
     places.append(pairs[has_pose])
-    return concatenate(found).subset(np.argsort(np.concatenate(places)))
+    return concatenate_rotations(estimates).subset(np.argsort(np.concatenate(places)))
 
 
 def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:
@@ -171,9 +166,7 @@ def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray
 
 
 def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return which pairs, of so many in all, got a pose, (k,), their rotations (k, 3, 3) and unit
-    translations (k, 3).
-    """
+    """Return which pairs got a pose, (k,), their rotations (k, 3, 3) and unit translations (k, 3)."""
     k, counts = len(matches.pairs), np.diff(matches.offsets)
     rotations, translations = np.full((k, 3, 3), np.nan), np.full((k, 3), np.nan)
     tried = np.minimum(counts, _TRIAL_MATCHES)
@@ -197,6 +190,6 @@ def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, Fl
         pose = estimate["cam2_from_cam1"]
         rotations[p], translations[p] = pose.rotation.matrix(), pose.translation
     translations = normalized(translations)
-    found = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
-    rotations[~found], translations[~found] = np.eye(3), [1.0, 0.0, 0.0]
-    return found, rotations, translations
+    has_pose = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(translations).all(axis=1)
+    rotations[~has_pose], translations[~has_pose] = np.eye(3), [1.0, 0.0, 0.0]
+    return has_pose, rotations, translations

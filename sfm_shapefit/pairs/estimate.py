@@ -17,23 +17,18 @@ def estimate_directions(
 ) -> PairDirections:
     """Return one direction per pair from its matches and the known rotations.
 
-    Each pair is estimated on its own and with the same draws, so neither batches nor threads change
-    a bit of the answer.
-
-    Args:
-        matches: those of k pairs.
-        options: what to believe; defaults if None.
-        threads: number of threads to share the pairs among.
+    Each pair is estimated on its own and with the same draws: neither batches nor `threads` change a bit of
+    the answer.
     """
     options = options or DirectionOptions()
     k = len(matches.pairs)
     directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
-    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
+    arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
     settings = (options.inlier_threshold_px, options.num_hypotheses)
 
     def run(begin: int, end: int) -> None:
-        estimate_pairs(begin, end, *given, *settings, directions, measures, moments)
+        estimate_pairs(begin, end, *arrays, *settings, directions, measures, moments)
 
     if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.

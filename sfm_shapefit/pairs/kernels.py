@@ -11,29 +11,21 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.base.jit import inner_kernel, kernel
 
-# Two matches fix a direction; below this number a robust fit means nothing.
-MIN_MATCHES = 5
+MIN_MATCHES = 5  # matches; two fix a direction, but a robust fit to fewer means nothing
 MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual_px", "parallax_rad")
 """What is counted and measured of a pair, in this order."""
 
-# With this least noise, exact matches still get a finite information.
-_MIN_NOISE_PX = 1e-3
-# Width of the kernel in standard deviations of the noise: 95 % efficient, as simulated.
-_WIDTH = 4.0
-# The width stays in this range: matches are never better, inliers never worse.
-_MIN_WIDTH_PX = 0.5
-_MAX_WIDTH_PX = 8.0
-# The first steps measure the noise anew; it is kept from then on, so that the steps converge.
-_RESCALINGS = 8
-_STEPS = 30
-_LONGEST_STEP_RAD = 0.3
-_LEVERAGE_QUANTILE = 0.9
-# A match has full weight up to this many times that quantile of the inliers with parallax.
-_LEVERAGE = 2.0
-# A match votes on the sign only if its parallax is larger than this, and than so many standard deviations of
-# the noise, which rays without any parallax exceed once in 8000.
-_MIN_VOTE_PX = 2.0
-_VOTE_SIGMAS = 6.0
+_MIN_NOISE_PX = 1e-3  # pixels; exact matches still get a finite information
+_WIDTH = 4.0  # kernel width in standard deviations of the noise; 95 % efficient, as simulated
+_MIN_WIDTH_PX = 0.5  # pixels; matches are never better
+_MAX_WIDTH_PX = 8.0  # pixels; inliers are never worse
+_RESCALINGS = 8  # first steps that measure the noise anew; it is kept afterwards, so that the steps converge
+_STEPS = 30  # steps, a bound; most pairs converge in fewer
+_LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
+_LEVERAGE_QUANTILE = 0.9  # quantile of the leverages of inliers with parallax; few are larger
+_LEVERAGE = 2.0  # multiples of that quantile; a match beyond would decide the direction alone
+_MIN_VOTE_PX = 2.0  # pixels of parallax; a match with less does not vote on the sign
+_VOTE_SIGMAS = 6.0  # standard deviations of parallax, likewise; without any, rays exceed it once in 8000
 
 
 @kernel
@@ -87,10 +79,7 @@ def _fill_matches(a: FloatArray, b: FloatArray, pixel_angle: float, matches: Flo
 
 @kernel
 def _residual(match: FloatArray, d: FloatArray) -> float:
-    """Return the signed Sampson error in px.
-
-    |a x d|^2 + |b x d|^2 has a floor where both rays run along the baseline.
-    """
+    """Return the signed Sampson error in px; its divisor has a floor where rays run along the baseline."""
     along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
     along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
     square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
@@ -340,7 +329,7 @@ def _fill_moments(
                 steep[row, column] += leverage * outer
                 feigned[row, column] += leverage * w * r * r * noise / square
     total = max(total, 1e-300)
-    few = count / (count - 5.0) if count > 5 else 6.0  # of the variance; see the package's header
+    few = count / (count - 5.0) if count > 5 else 6.0  # on the variance; see the package's header
     for row in range(3):
         for column in range(3):
             flat[row, column] = (curved / total) * flat[row, column] - feigned[row, column]
@@ -351,8 +340,8 @@ def _fill_moments(
 def _count_sides(
     matches: FloatArray, d: FloatArray, threshold_px: float, noise_px: float
 ) -> tuple[int, int, int]:
-    """Return how many matches that agree with d meet in front of both cameras for the baseline +d, how many
-    behind both, and how many have the parallax to tell.
+    """Return the votes on the sign of d: how many matches that agree with d meet in front of both cameras for
+    the baseline +d, how many behind both, and how many have enough parallax to vote.
     """
     front, behind, voters = 0, 0, 0
     vote_px = max(_MIN_VOTE_PX, _VOTE_SIGMAS * noise_px)

@@ -8,23 +8,10 @@ thing is matched, a house with its twin, what stands on and around it finds no p
     share     of the keypoints in it that are matched with any third image, those matched with the other image
 
 and of a pair the mean of its two shares. They fall with the baseline, too: they rank pairs, and are compared
-with those of the same scene. Together with the triangles of a pair (`triplets`) they tell wrong pairs from
-right ones: area under the curve
-
-    set, wrong pairs of all                          triangles   share   product
-    rendered tower, 3 of 8 sides alike                   .62       .70      .68
-    rendered courtyard, 6 of 12 houses alike             .81       .87      .88
-    rendered drive, half of the houses alike             .99       .84      .98
-    rendered facade, half of the houses alike           1.00       .91     1.00
-    castle-P30                                          1.00       .98     1.00
-    castle-P19                                          1.00       .99     1.00
-    lego100                                              .99       .89      .99
-    liberty-calibrated                                   .73       .70      .74
-    bundled photographed                                 .92       .88      .93
-
-Right is what is within 5 degrees of the truth. With the box around the matched keypoints for the overlap,
-shares told less: .57 on the tower, .78 on the courtyard, .74 on the drive, .82 on lego100. Among pairs that
-turn as much, a share tells more (`arrangements`).
+with those of the same scene. Together with the triangles of a pair (`triplets`) they separate wrong pairs
+from right ones, .68 to 1.00 of the area under the curve on nine sets; a box around the matched keypoints in
+place of the affine map does worse: `scripts/results/notes.md#missing-matches`. Among pairs that turn as much,
+a share says more (`arrangements`).
 
 Sources: Zach, Irschara, Bischof, "What can missing correspondences tell us about 3D structure and motion?",
 CVPR 2008; Wilson, Snavely, "Network principles for SfM: disambiguating repeated structures with local
@@ -40,23 +27,14 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.matches import KeypointMatches
 
-# Of squared singular values: where matches are on a line to a thousandth, nothing is known across it.
-_RANK = 1e-6
-# Keypoints on the border of an image are in it, whatever is rounded.
-_SLACK_PX = 1e-6
-# A pair in no triangle is as likely as not to be right.
-_NO_TRIANGLE = 0.5
-# A pair is doubtful whose score is a smaller share of the median score.
-_DOUBTFUL_SHARE = 0.05
+_RANK = 1e-6  # ratio of squared singular values; matches on a line to a thousandth say nothing across it
+_SLACK_PX = 1e-6  # pixels; keypoints on the border of an image are in it, whatever is rounded
+_NO_TRIANGLE = 0.5  # score of a pair in no triangle; it is as likely as not to be right
+_DOUBTFUL_SHARE = 0.05  # share of the median score; a pair below it is doubtful
 
 
 def count_partners(num_keypoints: Sequence[int], batches: Iterable[KeypointMatches]) -> list[IntArray]:
-    """Return in how many pairs each keypoint of each image is matched.
-
-    Args:
-        num_keypoints: of each image.
-        batches: the matches of all pairs.
-    """
+    """Return in how many pairs each keypoint of each image is matched, from the matches of all pairs."""
     counts = [np.zeros(count, dtype=np.int64) for count in num_keypoints]
     for batch in batches:
         for k, ends in enumerate(batch.pairs.tolist()):
@@ -93,9 +71,9 @@ def matched_shares(
         for k, (part, ends, affine) in enumerate(zip(rows, pairs, maps, strict=True)):
             image, there = images[ends[side]], images[ends[other]]
             sides[side, k] = _share(image, batch.keypoints[part, side], affine, there.size)
-    known = np.isfinite(sides)  # a side that says nothing leaves it to the other
+    finite = np.isfinite(sides)  # a side that says nothing leaves it to the other
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(known, sides, 0.0).sum(axis=0) / known.sum(axis=0))
+        return np.asarray(np.where(finite, sides, 0.0).sum(axis=0) / finite.sum(axis=0))
 
 
 class _Image(NamedTuple):
@@ -106,9 +84,9 @@ class _Image(NamedTuple):
     partners: IntArray
     """(k,) in how many pairs they are matched."""
     place_of: IntArray
-    """Of each keypoint of the image, its place among them."""
+    """Place of each keypoint of the image among them."""
     size: FloatArray
-    """(2,) of the image."""
+    """(2,) width and height of the image."""
 
     @classmethod
     def of(cls, pixels: FloatArray, size: FloatArray, partners: IntArray) -> "_Image":
@@ -118,14 +96,7 @@ class _Image(NamedTuple):
 
 
 def _share(image: _Image, matched: IntArray, affine: FloatArray, size: FloatArray) -> float:
-    """Return the share of one image's overlap with another that is matched.
-
-    Args:
-        image: the one.
-        matched: (m,) which of its keypoints are matched with the other.
-        affine: (4, 2) see `_affine_maps`.
-        size: (2,) of the other image.
-    """
+    """Return the share of the keypoints in the overlap with another image that are `matched` (m,) there."""
     own = np.zeros(len(image.partners), dtype=np.bool_)
     own[image.place_of[matched]] = True
     inside = image.partners > own
@@ -140,13 +111,9 @@ def _share(image: _Image, matched: IntArray, affine: FloatArray, size: FloatArra
 def _affine_maps(source: FloatArray, target: FloatArray, starts: IntArray) -> FloatArray:
     """Return the affine map of each pair that takes source to target (m, 2) best, (b, 4, 2).
 
-    Of a map the rows are its linear part, two, the middle of the source, and that of the target: it takes x
-    to (x - middle) @ linear + target's middle. Where the sources lie on one line, it is the one of least
-    norm.
-
-    Args:
-        source, target: the matches of all pairs, one pair after the other.
-        starts: (b,) the first match of each pair; each has one or more.
+    The rows of a map are its linear part, two, the middle of the source, and that of the target: it takes x
+    to (x - middle) @ linear + target's middle. Where the sources lie on one line, it has the least norm.
+    `starts` (b,) has the first match of each pair, which has one or more.
     """
     counts = np.diff(np.append(starts, len(source)))
     both = np.concatenate([source, target], axis=1)
@@ -164,5 +131,5 @@ def score_pairs(triplet_scores: FloatArray, shares: FloatArray) -> FloatArray:
 
 def doubtful_pairs(scores: FloatArray) -> BoolArray:
     """Return which pairs have a far smaller score than is usual among all of them, (k,)."""
-    known = scores[np.isfinite(scores)]
-    return np.asarray(scores < _DOUBTFUL_SHARE * float(np.median(known)) if len(known) else scores < 0.0)
+    finite = scores[np.isfinite(scores)]
+    return np.asarray(scores < _DOUBTFUL_SHARE * float(np.median(finite)) if len(finite) else scores < 0.0)

@@ -111,11 +111,7 @@ def is_usable(status: Sequence[DirectionStatus]) -> BoolArray:
 
 
 def concatenate(parts: Sequence[PairDirections]) -> PairDirections:
-    """Return the rows of all parts, in order.
-
-    Raises:
-        ValueError: if there are no parts.
-    """
+    """Return the rows of all parts, in order; ValueError if there are none."""
     names = (field.name for field in fields(PairDirections))
     columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     return PairDirections(**{**columns, "status": list(columns["status"])})

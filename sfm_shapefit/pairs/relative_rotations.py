@@ -9,9 +9,8 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 
 SOUND = 2.0
-"""Least W ln n of a pair that is believed."""
-# Least W, whatever the number of matches.
-_LEAST_WEIGHT_SHARE = 0.4
+"""Least W ln n of a pair that is believed; W its mean robust weight, n its number of matches."""
+_LEAST_WEIGHT_SHARE = 0.4  # W, a share; below it no number of matches makes a pair sound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,4 +49,4 @@ class RelativeRotations:
 
 
 AGREEMENT_DEG = 5.0
-"""Pairs agree with averaged rotations up to here."""
+"""Degrees up to which a pair agrees with averaged rotations; right pairs are mostly within one."""

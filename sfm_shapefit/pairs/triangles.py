@@ -17,21 +17,15 @@ from sfm_shapefit.base.geometry import angle_between, normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency
 
-_ITERATIONS = 10
-# A triangle's weight falls so fast, per radian, with the scores of its sides, at the end.
-_SHARPEST = 20.0
+_ITERATIONS = 10  # rounds of weights and scores; the weights sharpen from one to the next
+_SHARPEST = 20.0  # fall of a triangle's weight per radian of its sides' scores; reached in the last round
 # Two sides are opposite if one is so near to the other turned round; a noise of 0.05 then bends the
 # plane by 0.3.
 _OPPOSITE_RAD = 0.2
 
 
 def triangle_scores(graph: ViewGraph, iterations: int = _ITERATIONS) -> FloatArray:
-    """Return each pair's mean angle to what its triangles say, (m,) radians; 0 for pairs in no triangle.
-
-    Args:
-        graph: any view graph.
-        iterations: 0 weighs all triangles alike (AAB).
-    """
+    """Return each pair's mean angle to what its triangles say, (m,) radians; 0 for pairs in no triangle."""
     sides = _triangles(graph)
     if len(sides) == 0:
         return np.zeros(graph.num_edges)
@@ -54,7 +48,7 @@ def _weighted_means(side: IntArray, angles: FloatArray, weights: FloatArray, num
 def _triangles(graph: ViewGraph) -> IntArray:
     """Return the triangles of each pair, (k, 3) edge indices: the pair (i, j), the pair of i, that of j."""
     around = adjacency(graph.num_nodes, graph.edges)
-    found = [np.empty((0, 3), dtype=np.int64)]
+    blocks = [np.empty((0, 3), dtype=np.int64)]
     for e, (i, j) in enumerate(graph.edges.tolist()):
         rows = [slice(around.pointers[c], around.pointers[c + 1]) for c in (i, j)]
         around_i, around_j = (around.neighbors[row] for row in rows)
@@ -62,8 +56,8 @@ def _triangles(graph: ViewGraph) -> IntArray:
         sides = np.full((len(of_i), 3), e, dtype=np.int64)
         sides[:, 1] = around.edge_of[rows[0]][of_i]
         sides[:, 2] = around.edge_of[rows[1]][of_j]
-        found.append(sides)
-    return np.concatenate(found)
+        blocks.append(sides)
+    return np.concatenate(blocks)
 
 
 def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:
@@ -77,7 +71,7 @@ def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:
         e2 = normalized(b - np.sum(a * b, axis=1, keepdims=True) * a)
     e2 = np.nan_to_num(e2)
     along_a, along_e = np.sum(x * a, axis=1), np.sum(x * e2, axis=1)
-    reach = np.arctan2(np.sum(b * e2, axis=1), np.sum(a * b, axis=1))  # of the arc, from a to b
+    reach = np.arctan2(np.sum(b * e2, axis=1), np.sum(a * b, axis=1))  # length of the arc from a to b
     nearest = np.arctan2(along_e, along_a)
     on_arc = (nearest >= 0.0) & (nearest <= reach)
     off_plane = x - along_a[:, None] * a - along_e[:, None] * e2

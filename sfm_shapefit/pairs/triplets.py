@@ -18,11 +18,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
-# Of a rotation by no more than that angle.
-_LEAST_TRACE = 1.0 + 2.0 * float(np.cos(np.radians(AGREEMENT_DEG)))
-_ROUNDS = 5
-# Triangles of pairs of score 0 count so little, but they count where a pair has no others.
-_LEAST_WEIGHT = 1e-6
+_LEAST_TRACE = 1.0 + 2.0 * float(
+    np.cos(np.radians(AGREEMENT_DEG))
+)  # trace of a rotation by that angle; turns are less
+_ROUNDS = 5  # rounds of scores; later ones hardly change any
+_LEAST_WEIGHT = 1e-6  # weight of a triangle of pairs of score 0; it decides where a pair has no others
 # Between two slices Python can be interrupted: at most some 10 ms for 1,000 images, all matched.
 _PAIRS_PER_SLICE = 1000
 
@@ -30,11 +30,8 @@ _PAIRS_PER_SLICE = 1000
 def score_triplets(num_images: int, relative: RelativeRotations) -> FloatArray:
     """Return the weighted share of each pair's triangles that close within 5 degrees, (k,), in [0, 1].
 
-    NaN for a pair in no triangle. Time and memory are linear in triangles and in pairs.
-
-    Args:
-        num_images: n.
-        relative: k pairs of the images 0..n-1, each once, i < j, in any order.
+    NaN for a pair in no triangle. Pairs of the images 0..n-1 stand once each, i < j, in any order. Time and
+    memory are linear in triangles and in pairs.
 
     Source: loops as evidence against pairs are those of Zach, Klopschitz, Pollefeys, "Disambiguating visual
     relations using loop constraints", CVPR 2010; weighted here instead of inferred.
@@ -52,9 +49,9 @@ def score_triplets(num_images: int, relative: RelativeRotations) -> FloatArray:
             weigh_triangles(begin, end, pairs, starts, rotations, _LEAST_TRACE, scores, closing, total)
         with np.errstate(invalid="ignore"):
             scores = np.where(total > 0.0, closing / total, 1.0)
-    found = np.empty(k)
-    found[order] = np.where(total > 0.0, scores, np.nan)
-    return found
+    shares = np.empty(k)
+    shares[order] = np.where(total > 0.0, scores, np.nan)
+    return shares
 
 
 @kernel
@@ -76,10 +73,9 @@ def weigh_triangles(
         pairs: (p, 2) ascending.
         starts: (n + 1,) the pairs (i, .) are rows starts[i] to starts[i + 1].
         rotations: (p, 3, 3) cam_j_from_cam_i.
-        least_trace: of the rotation around a triangle, if it closes.
-        scores: (p,) of the pairs.
-        closing: (p,) added to, the weights of the triangles of each pair that close.
-        total: (p,) added to, the weights of all its triangles.
+        least_trace: least trace of the rotation around a triangle that closes.
+        scores: (p,) scores of the pairs.
+        closing, total: (p,) added to, the weights of each pair's triangles that close, and of all.
     """
     for ij in range(begin, end):
         i, j = pairs[ij, 0], pairs[ij, 1]

@@ -42,20 +42,17 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.matches import RayMatches
 
-_FIRST_WIDTH_PX = 4.0
+_FIRST_WIDTH_PX = 4.0  # pixels, s of the first step; a pose from few trials is off by as much
 LAST_WIDTH_PX = 1.5
 """s of the last steps. Measured: 1 to 1.5 px are alike, 3 px is a third worse."""
-# The width falls in equal ratios over so many steps.
-_NARROWING_STEPS = 3
-_STEPS = 12
-_LONGEST_STEP_RAD = 0.3
-_CONVERGED_RAD = 1e-7
-_UNKNOWNS = 5
-# Pivots below this share of the trace are rounding. In pixels: parallax of 3e-7 of the focal length.
-_LEAST_PIVOT = 1e-13
-# In rad^-2, and as a share of H_ww's trace, whose rounding the Schur complement has.
-_LEAST_INFORMATION = 1.0
-_ROUNDING = 1e-12
+_NARROWING_STEPS = 3  # steps over which the width falls; in equal ratios
+_STEPS = 12  # steps, a bound; most pairs converge in fewer
+_LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
+_CONVERGED_RAD = 1e-7  # radians; a shorter step is the last
+_UNKNOWNS = 5  # three of the rotation, two of the unit translation; its length is free
+_LEAST_PIVOT = 1e-13  # share of the trace; a smaller pivot is rounding, a parallax of 3e-7 focal lengths
+_LEAST_INFORMATION = 1.0  # rad^-2; a rotation is never known less
+_ROUNDING = 1e-12  # share of H_ww's trace; the rounding of the Schur complement
 
 
 class TwoViewPoses(NamedTuple):
@@ -66,7 +63,7 @@ class TwoViewPoses(NamedTuple):
     translations: FloatArray
     """(k, 3) unit vectors in axes of camera j, x_j = rotation x_i + translation; the sign is the start's."""
     information: FloatArray
-    """(k, 3, 3) of the rotations, in rad^-2; axes of camera j, see `RelativeRotations`."""
+    """(k, 3, 3) information of the rotations, in rad^-2; axes of camera j, see `RelativeRotations`."""
     weight_shares: FloatArray
     """(k,) mean robust weight of the matches, in [0, 1]."""
 
@@ -76,7 +73,7 @@ def refine_two_view_poses(
 ) -> TwoViewPoses:
     """Return the relative poses that fit all matches best, near a start.
 
-    Each pair is refined on its own: neither batches nor threads change a bit of the answer.
+    Each pair is refined on its own: neither batches nor `threads` change a bit of the answer.
 
     Args:
         matches: those of k pairs, any number each; rays are finite and in camera axes.
@@ -84,7 +81,7 @@ def refine_two_view_poses(
         translations: (k, 3) unit vectors to start from, in axes of camera j.
         threads: number of threads to share the pairs among.
 
-    Source: the error is Sampson's, as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
+    Source: Sampson's error as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
     """
     k = len(matches.pairs)
     poses = TwoViewPoses(
@@ -94,10 +91,10 @@ def refine_two_view_poses(
         np.zeros(k),
     )
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
-    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
+    arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
 
     def run(begin: int, end: int) -> None:
-        refine_pairs(begin, end, *given, *poses)
+        refine_pairs(begin, end, *arrays, *poses)
 
     if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
@@ -122,10 +119,7 @@ def refine_pairs(
     information: FloatArray,
     weight_shares: FloatArray,
 ) -> None:
-    """Refine rotations (k, 3, 3) and translations (k, 3) of the pairs begin..end-1 in place.
-
-    Fills their information (k, 3, 3) and weight shares (k,).
-    """
+    """Refine rotations and translations of the pairs begin..end-1; fill information and weight shares."""
     system, basis, step = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.empty((2, 3)), np.empty(_UNKNOWNS)
     for p in range(begin, end):
         first, last = offsets[p], offsets[p + 1]
@@ -193,10 +187,7 @@ def _linearize(
     basis: FloatArray,
     line: FloatArray,
 ) -> None:
-    """Fill the derivatives of a match's residual by the five unknowns, then the residual in px.
-
-    q has a floor where both rays run along the translation.
-    """
+    """Fill a residual's derivatives by the five unknowns, then it in px; q has a floor along the baseline."""
     a0 = rotation[0, 0] * a[0] + rotation[0, 1] * a[1] + rotation[0, 2] * a[2]
     a1 = rotation[1, 0] * a[0] + rotation[1, 1] * a[1] + rotation[1, 2] * a[2]
     a2 = rotation[2, 0] * a[0] + rotation[2, 1] * a[1] + rotation[2, 2] * a[2]

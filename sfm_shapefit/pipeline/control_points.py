@@ -1,10 +1,10 @@
 """Ground control points: read before the work, fitted at its end, when poses and intrinsics are final."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.control_points import control_rows, control_warnings
-from sfm_shapefit.facts.json_types import ControlPoint
+from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
 from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.seed import transform_model
@@ -55,7 +55,7 @@ def bring_to_control_points(
         unused = (
             f"control points were not used for the scale, which is that of {SETS_SCALE[seeded.gauge.scale]}"
         )
-        checks: list[ControlPoint] = [{**row, "use": "check"} for row in rows]
+        checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
         return seeded, checks, (*warnings, f"{unused}; {off_by(fit.motion.scale)}")
     turned = transform_model(seeded.reconstruction, fit.motion)
     return seeded.moved(turned, control_gauge(seeded.gauge, known, fit)), rows, warnings

@@ -16,7 +16,7 @@ from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weig
 from sfm_shapefit.pairs.essential import (
     MANY_PAIRS,
     LikelyPoses,
-    concatenate,
+    concatenate_rotations,
     estimate_relative_rotations,
 )
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -63,7 +63,7 @@ def ask_pairs(
     """
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
-        return concatenate([])
+        return concatenate_rotations([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
     without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
@@ -75,7 +75,7 @@ def ask_pairs(
             asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
             likely = _poses_as_given(source.model, directions, np.array(asked, dtype=np.int64))
         parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
-    return concatenate(parts)
+    return concatenate_rotations(parts)
 
 
 def _poses_as_given(model: PosedModel, directions: PairDirections, rows: IntArray) -> LikelyPoses:

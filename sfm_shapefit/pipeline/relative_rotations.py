@@ -14,7 +14,7 @@ from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
     RelativeSource,
-    concatenate,
+    concatenate_rotations,
     estimate_relative_rotations,
     stored_relative_rotations,
 )
@@ -122,7 +122,7 @@ def measure_rotations(
             matches_per_task=_MATCHES_PER_TASK,
         )
         parts = measure_with_workers(view, work, sharing.executor, sharing.advance)
-    return concatenate(parts)
+    return concatenate_rotations(parts)
 
 
 def _estimate_here(view: View[PosedModel], min_matches: int, sharing: Sharing) -> list[RelativeRotations]:

@@ -1,9 +1,9 @@
 """What is rigid by its graph and yet loose by its geometry.
 
-The test of rigidity takes positions to be general. At the solution they need not be: cameras on
-a line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly
-parallel, the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees
-all of these. Here its loose cameras are put into groups that move together, with what makes them loose:
+The test of rigidity takes positions to be general. At the solution they need not be: cameras on a line see
+each other along it, the pairs of a far camera are nearly parallel, the triangles of a distant group are
+skinny. The covariance of the locations (`uncertainty`) sees all of these. Here its loose cameras are put into
+groups that move together, with what makes them loose:
 
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
@@ -23,15 +23,13 @@ from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
 
 LOOSE_SHARE = 0.05
-"""Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
+"""Standard deviation from which a camera is loose; in median distances of the cameras from their median."""
 FEW_PAIRS = 2
-"""Pairs of a camera up to which they are too few to check one another."""
+"""Pairs of a camera up to which they are too few to check one another: each fits one of its d unknowns."""
 NEARLY_PARALLEL = 0.02
 """The `direction_spread` below which directions are nearly parallel: within about 8 degrees."""
-# Cameras that can lie on a line, or not.
-_SMALLEST_LINE = 3
-# Second over first singular value of positions on a line.
-_ON_A_LINE = 0.02
+_SMALLEST_LINE = 3  # cameras; two are on a line whatever they do
+_ON_A_LINE = 0.02  # second over first singular value of positions; smaller on a line, bends included
 
 
 class Looseness(enum.Enum):
@@ -46,13 +44,13 @@ class Looseness(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LooseGroup:
+class LooseCameras:
     """Cameras that are loose together."""
 
     cameras: IntArray
     """Ascending."""
     cause: Looseness
-    """Of most of them."""
+    """Cause that most of them have."""
     sigma: float
     """Largest standard deviation among them, in the locations' units; infinite if nothing holds them."""
 
@@ -68,7 +66,7 @@ class Conditioning:
     their directions are from parallel; 0 without pairs."""
     causes: tuple[Looseness | None, ...]
     """k causes; None where a camera is not loose."""
-    groups: tuple[LooseGroup, ...]
+    groups: tuple[LooseCameras, ...]
     """The largest standard deviation first."""
 
 
@@ -83,13 +81,12 @@ def condition(
     """Find the cameras that the pairs leave loose at the solution, and why.
 
     Args:
-        locations: (n, d).
+        locations: (n, d); the first `num_cameras` are cameras, the others points.
         edges: (m, 2).
         inliers: (m,) pairs that agree with the solution.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
-        num_cameras: k; nodes beyond are points.
-        undetermined_nodes: nodes whose distance is known to be open, with infinite standard deviations; none
-            if None.
+        num_cameras: k.
+        undetermined_nodes: nodes whose distance is open, with infinite standard deviations; none if None.
     """
     n = len(locations)
     is_undetermined = np.isin(np.arange(n), [] if undetermined_nodes is None else undetermined_nodes)
@@ -113,7 +110,7 @@ def condition(
             elif is_straight:
                 causes[camera] = Looseness.ON_A_LINE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
-        groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
+        groups.append(LooseCameras(cameras=members, cause=cause, sigma=float(largest[members].max())))
     return Conditioning(
         num_pairs=num_pairs[:num_cameras].astype(np.int64),
         narrowness=narrowness[:num_cameras],
@@ -123,15 +120,10 @@ def condition(
 
 
 def direction_spread(num_nodes: int, edges: IntArray, directions: FloatArray) -> FloatArray:
-    """Return how far the directions at each node are from parallel, (n,) in [0, 1]; 0 without any.
+    """Return how far the directions (m, d) at each node are from parallel, (n,) in [0, 1]; 0 without any.
 
     The least over the greatest eigenvalue of the sum of I - u u^T: the squared ratio of the singular values
-    of the stacked projectors.
-
-    Args:
-        num_nodes: n.
-        edges: (m, 2) node indices.
-        directions: (m, d) unit vectors u; those that are not finite count as none.
+    of the stacked projectors. Directions that are not finite count as none.
     """
     d = directions.shape[1]
     projectors = np.nan_to_num(np.eye(d) - directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)

@@ -1,15 +1,14 @@
 """Ground control points: points of known position that images show, which set scale, origin and axes.
 
 Their positions in the model are triangulated; a similarity maps these onto the known ones. It starts from
-the robust fit that position priors have. Then those that fit are told by the noise of all that fit: with n
-points of three coordinates and 7 parameters,
+the robust fit that position priors have. Then the noise of all that fit decides who fits: with n points of
+three coordinates and 7 parameters,
 
     sigma^2 = sum |residual|^2 / (3 n - 7),
 
 a point outside the fit is off by sigma sqrt(1 + h) per axis, with its leverage h = tr(J N^-1 J^T) / 3, and
-fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma that few points tell badly. On
-made points, this left out 0.03 to 0.17 good ones a fit of 4 to 7, and found one that is 25 sigma off per
-axis in 67 % of the fits of 4 points, and in 97 % or more of those of 5 to 7. Three points check nothing.
+fits up to 4 times that; a factor sqrt(1 + 7 / (3 n - 7)) allows for a sigma from few points. Measured:
+`scripts/results/notes.md#control-points`. Three points check nothing.
 """
 
 from typing import NamedTuple
@@ -38,13 +37,11 @@ from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import PointLimits, triangulate_tracks
 
-# Marks are set by hand, in a model that may be bent: they miss by more than keypoints do.
-_MARK_ERRORS = 4.0
-_PARAMETERS = 7
-_FITTING_SIGMAS = 4.0
-_MOST_ROUNDS = 20
-# Nor do those within so many standard deviations.
-_FLAT = 5.0
+_MARK_ERRORS = 4.0  # keypoint errors; marks are set by hand, in a model that may be bent
+_PARAMETERS = 7  # parameters of a similarity: scale 1, turn 3, shift 3
+_FITTING_SIGMAS = 4.0  # standard deviations; chosen on scripts/results/notes.md#control-points
+_MOST_ROUNDS = 20  # rounds, a bound; who fits settles in fewer
+_FLAT = 5.0  # standard deviations; a smaller spread across a line leaves the turn about the line open
 
 
 class TriangulatedControl(NamedTuple):
@@ -53,7 +50,7 @@ class TriangulatedControl(NamedTuple):
     positions: FloatArray
     """(k, 3), NaN for those that cannot be triangulated."""
     errors_px: FloatArray
-    """(m,) of the marks, from the point to the mark; NaN where there is no point or the image is not in the
+    """(m,) distances of the marks from their points; NaN where there is no point or the image is not in the
     model."""
     agreeing: BoolArray
     """(m,) the marks that the point was triangulated from."""
@@ -65,33 +62,27 @@ class ControlFit(NamedTuple):
     motion: Similarity
     """From the model to the control points."""
     fitting: BoolArray
-    """(k,) those that set it."""
+    """(k,) points that set it."""
     sigma: float
-    """Standard deviation of their coordinates; 0 if they are too few to tell."""
+    """Standard deviation of their coordinates; 0 if they are too few to have one."""
     residuals: FloatArray
-    """(k, 3) the model's position minus the known one, in units of the latter; NaN where it has none."""
+    """(k, 3) the model's position minus the known one, in units of the known one; NaN where it has none."""
     scale_sigma: float
     """Relative standard deviation of the scale."""
 
 
 def triangulate_control_points(
-    known: ControlPoints, seen: MarkedViews, options: StructureOptions
+    control: ControlPoints, seen: MarkedViews, options: StructureOptions
 ) -> TriangulatedControl:
-    """Return where the placed images of a model have control points; marks may be wrong.
-
-    Args:
-        known: the points and their marks.
-        seen: the placed images, and their views of the marks.
-        options: of 3D points; a mark may miss by four times what a keypoint may.
-    """
-    counts = np.bincount(known.points[seen.rows], minlength=len(known.names))
+    """Return where the placed images have control points; marks may be wrong, or off by 4 keypoint errors."""
+    counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         cameras=seen.views,
         keypoints=seen.rows,
-        pixels=known.pixels[seen.rows],
+        pixels=control.pixels[seen.rows],
         on_plane=seen.on_plane,
-        ids=np.arange(len(known.names)),
+        ids=np.arange(len(control.names)),
         may_split=False,
     )
     limits = PointLimits(
@@ -105,12 +96,12 @@ def triangulate_control_points(
         focal_lengths_px=seen.focal_lengths_px,
         images=np.arange(len(seen.rotations)),
     )
-    found = triangulate_tracks(tracks, stand, limits)
-    positions = np.full((len(known.names), 3), np.nan)
-    positions[found.tracks] = found.points
-    agreeing, errors = np.zeros(len(known.points), dtype=np.bool_), np.full(len(known.points), np.nan)
-    agreeing[seen.rows] = found.points_seen >= 0
-    to_point = positions[known.points[seen.rows]] - seen.centers[seen.views]
+    triangulated = triangulate_tracks(tracks, stand, limits)
+    positions = np.full((len(control.names), 3), np.nan)
+    positions[triangulated.tracks] = triangulated.points
+    agreeing, errors = np.zeros(len(control.points), dtype=np.bool_), np.full(len(control.points), np.nan)
+    agreeing[seen.rows] = triangulated.points_seen >= 0
+    to_point = positions[control.points[seen.rows]] - seen.centers[seen.views]
     inside = np.einsum("kab,kb->ka", seen.rotations[seen.views], to_point)
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
@@ -118,11 +109,11 @@ def triangulate_control_points(
     return TriangulatedControl(positions, errors, agreeing)
 
 
-def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | str:
+def fit_control_points(control: ControlPoints, positions: FloatArray) -> ControlFit | str:
     """Return the similarity that maps found positions (k, 3) onto the known ones, or why there is none."""
-    there: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
-    rows = np.flatnonzero(there & ~known.is_check)
-    source, target = found[rows], known.positions[rows]
+    there: BoolArray = np.asarray(np.isfinite(positions).all(axis=1))
+    rows = np.flatnonzero(there & ~control.is_check)
+    source, target = positions[rows], control.positions[rows]
     reason = why_too_few(target, "can be triangulated")
     if reason:
         return reason
@@ -149,12 +140,12 @@ def fit_control_points(known: ControlPoints, found: FloatArray) -> ControlFit | 
         )
     fitting = np.zeros(len(there), dtype=np.bool_)
     fitting[rows[fits]] = True
-    residuals = np.where(there[:, None], motion.apply(found) - known.positions, np.nan)
+    residuals = np.where(there[:, None], motion.apply(positions) - control.positions, np.nan)
     size = float(np.linalg.norm(target[fits] - target[fits].mean(axis=0)))
     return ControlFit(motion, fitting, sigma, residuals, sigma / size)
 
 
-def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge:
+def control_gauge(before: Gauge, control: ControlPoints, fit: ControlFit) -> Gauge:
     """Return the gauge of control points, for a model that stands in another one.
 
     y = A (s x + b) becomes c R y + t = R A (c s x + c b + (R A)^T t).
@@ -163,7 +154,7 @@ def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge
     axes = motion.rotation if before.axes is None else motion.rotation @ before.axes
     shift = axes.T @ motion.translation
     total = Similarity(scale=motion.scale, rotation=np.eye(3), translation=shift)
-    used = int(np.sum(~known.is_check & np.isfinite(fit.residuals[:, 0])))
+    used = int(np.sum(~control.is_check & np.isfinite(fit.residuals[:, 0])))
     told = f"the scale is known to {100.0 * fit.scale_sigma:.2g} %"
     warning = ""
     if fit.scale_sigma > METRIC_SIGMA:
@@ -173,12 +164,12 @@ def control_gauge(before: Gauge, known: ControlPoints, fit: ControlFit) -> Gauge
         scale="control points",
         axes=axes,
         statement=(
-            f"control points: {known.statement}; {int(fit.fitting.sum())} of {used} agree, to "
+            f"control points: {control.statement}; {int(fit.fitting.sum())} of {used} agree, to "
             f"{fit.sigma:.3g} per axis; origin and axes: theirs; {told}"
         ),
         warning=warning,
         scale_sigma=fit.scale_sigma,
-        datum=known.datum,
+        datum=control.datum,
     )
 
 

@@ -7,20 +7,15 @@ weak cameras   A camera's pairs hold it by the stacked projectors P_v = I - v v^
                is the least over the greatest of these: 0 where all directions are parallel, so that the
                camera may slide along them, 1 where they point evenly everywhere.
 corruption     In a triangle without errors each direction lies on the arc between the other two. The
-               iterated mean angle to these arcs (`pairs.triangles`) tells wrong pairs from right ones.
-               The estimate is the share of pairs above 0.3 rad, of those in a triangle. On six synthetic
-               families with uniformly wrong directions, noise of 0.01 and 0.05, it lies within 0.03 of the
-               true share up to 0.2 of them, within 0.06 at 0.4 and within 0.09 at 0.5; too high where pairs
-               have few triangles, which wrong sides then spoil, and a little too low elsewhere. It does not
-               see wrong pairs that agree with one another; in the plane, where arcs take up much of the
-               circle, it is too low.
+               estimate is the share, of pairs in a triangle, whose iterated mean angle to these arcs
+               (`pairs.triangles`) is above 0.3 rad: within 0.03 of the true share up to 0.2, within 0.09 at
+               0.5, on six synthetic families (`scripts/results/notes.md#corruption-by-triangles`). It does
+               not see wrong pairs that agree with one another; in the plane it is too low.
 
 A camera most of whose matches contradict the given rotations is named as well. Where the scene repeats itself
-right cameras are among those. The pairs' own relative rotations tell these from wrong ones
-(`judgement.turns`); who has them says which rotations they confirm.
+right cameras are among these, unless the pairs' own relative rotations (`judgement.turns`) confirm them.
 """
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -28,6 +23,7 @@ from scipy.sparse import coo_array
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -41,24 +37,20 @@ from sfm_shapefit.solver.solve import choose_method
 WRONG_SCORE_RAD = 0.3
 """Mean angle to its triangles from which a pair counts as wrong; see above."""
 
-# Beyond so many pairs, which take half a minute, nothing is said of corruption.
-_MAX_SCORED_PAIRS = 200_000
-# Share of a camera's pairs that contradict their triangles, from which its rotation may be wrong.
-_CONTRADICTED_SHARE = 0.5
+_MAX_SCORED_PAIRS = 200_000  # pairs; more take half a minute, and corruption is not estimated
+_CONTRADICTED_SHARE = 0.5  # share of a camera's pairs; if more contradict triangles its rotation may be wrong
 # Cameras of a piece: fewer have no triangle.
 _SMALLEST_CHECKED = 3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PieceDiagnosis:
+class PieceDiagnosis(Record):
     """A parallel-rigid piece of three cameras or more."""
 
     num_cameras: Annotated[int, "Cameras of it."]
     hinges: Annotated[tuple[str, ...], "Names of the cameras that it shares with other pieces."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WeakCamera:
+class WeakCamera(Record):
     """A camera that would be placed, and may be placed badly."""
 
     name: Annotated[str, "Of its image."]
@@ -69,8 +61,7 @@ class WeakCamera:
     reasons: Annotated[tuple[str, ...], "Why it may be placed badly, in words."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Corruption:
+class Corruption(Record):
     """An estimate from the directions alone of how many pairs are wrong."""
 
     share: Annotated[
@@ -80,8 +71,7 @@ class Corruption:
     statement: Annotated[str, "The same in words."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedPlacement:
+class PlannedPlacement(Record):
     """What a placement of the largest piece would do."""
 
     solver: Annotated[str, "The solver that would run."]
@@ -90,9 +80,8 @@ class PlannedPlacement:
     finish: Annotated[str, "What becomes of the starts, a sentence."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Diagnosis:
-    """What there is to know of a view graph without solving."""
+class Diagnosis(Record):
+    """Properties of a view graph that are known without solving."""
 
     dimension: Annotated[int, "Of the locations."]
     num_cameras: Annotated[int, "Nodes of the graph that are no points."]
@@ -122,10 +111,9 @@ def diagnose(
     """Diagnose a view graph without solving.
 
     Args:
-        measured: any view graph, best with what is known of its pairs.
+        measured: any view graph, best with the statistics of its pairs.
         options: how it would be placed; defaults if None.
-        confirmed: (n,) cameras whose rotation is known to be right, though pairs of theirs are wrong; none if
-            None.
+        confirmed: (n,) cameras whose rotation is right, though pairs of theirs are wrong; none if None.
     """
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)

@@ -1,4 +1,4 @@
-"""Scale, origin and axes of the answer: what directions cannot tell, chosen by the user and stated.
+"""Scale, origin and axes of the answer: left open by directions, chosen by the user and stated.
 
 The program leaves scale and shift free (sum_i t_i = 0, L(T) = kappa); rotations are given, so the axes are
 the input's. A gauge is a scale and a shift of the centers and, with position priors alone, a turn of the
@@ -25,22 +25,16 @@ from sfm_shapefit.base.geometry import (
 )
 from sfm_shapefit.scene.given import Datum, PositionPriors
 
-# An input center that is farther off, of the spread of all, is lost and must not set the scale.
-_CAP_OF_SIZE = 0.5
-# The scale is rough if the median distance of the input's centers from the answer is more of their spread.
-_ROUGH = 0.1
-# A smaller spread of centers, relative to their distance from the origin, counts as none.
-_COINCIDENT = 1e-9
+_CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
+_ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
+_COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
 ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
 """What can set a scale, by precedence."""
-
-FEWEST_PRIORS = 2
-_PRIORS_FOR_AXES = 3
-# A spread across a line of fewer residuals than this says nothing of the turn about the line.
-_FLAT = 5.0
-# The weight of a prior is half at so many standard deviations.
-_KERNEL_WIDTH = 3.0
-_REWEIGHTINGS = 20
+FEWEST_PRIORS = 2  # positions; with fewer there is no scale
+_PRIORS_FOR_AXES = 3  # positions; two leave the turn about their line open
+_FLAT = 5.0  # residuals; a smaller spread across a line leaves the turn about the line open
+_KERNEL_WIDTH = 3.0  # standard deviations at which a prior has half of its weight; lost ones hardly count
+_REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
 
 
 class UselessPriorsError(InputError):
@@ -76,11 +70,8 @@ class Gauge:
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
     """Return the gauge of the input's centers: a robust similarity (L1) that keeps the axes.
 
-    Without usable input centers it becomes "unit", and says so.
-
-    Args:
-        locations: (n, 3) the solver's answer.
-        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
+    It maps `locations` (n, 3) onto `input_centers` (n, 3) of the same cameras in the same axes. Without
+    usable input centers it becomes "unit", and says so.
     """
     if coincide(input_centers):
         return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
@@ -149,17 +140,15 @@ def distance_gauge(
 ) -> Gauge:
     """Return the gauge in which cameras are so far apart; origin: the centroid.
 
-    One distance becomes true. Of several the scale is the robust least-squares fit to all, weights
-    1 / (1 + (residual / 3 levels)^4), from the median of what each says alone.
+    One distance becomes true. For several, the scale is the robust least-squares fit to all, weights
+    1 / (1 + (residual / 3 levels)^4), from the median of the scales that single ones give. InputError if the
+    cameras of a pair coincide in the answer.
 
     Args:
         locations: (n, 3) the solver's answer.
         pairs: (k, 2) cameras, k >= 1.
         distances: (k,) of each pair in the output's units, positive.
         names: (k,) the cameras of each pair, for the statement.
-
-    Raises:
-        InputError: if the cameras of a pair coincide in the answer.
     """
     apart = np.linalg.norm(locations[pairs[:, 0]] - locations[pairs[:, 1]], axis=1)
     near = apart <= _COINCIDENT * median_spread(locations)
@@ -203,18 +192,15 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
     """Return the gauge of position priors: a robust similarity, with a turn if they determine one.
 
     From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
-    where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong
-    priors has no part in it.
+    where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong priors
+    has no part in it. UselessPriorsError if fewer than two cameras have one, or the priors coincide or
+    contradict the answer.
 
     Args:
         locations: (n, 3) the solver's answer.
-        priors: of these cameras.
+        priors: priors of these cameras.
         axes_known: whether the locations' axes mean anything. If not, and the priors lie on a line, the model
             is turned onto that line, and about it by any angle.
-
-    Raises:
-        UselessPriorsError: if fewer than two cameras have one, or the priors coincide or contradict the
-            answer.
     """
     if len(priors) < FEWEST_PRIORS:
         raise UselessPriorsError(
@@ -226,22 +212,22 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise UselessPriorsError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
-    found, weights, level = fit_to_priors(source, priors, size, rotate=turns)
+    similarity, weights, level = fit_to_priors(source, priors, size, rotate=turns)
     across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
-        found, weights, level = fit_to_priors(source, priors, size, rotate=False)
+        similarity, weights, level = fit_to_priors(source, priors, size, rotate=False)
     if not turns and not axes_known:
-        found, weights, level = fit_to_priors(source, priors, size, rotate=True)
-    if found.scale <= 0.0:
+        similarity, weights, level = fit_to_priors(source, priors, size, rotate=True)
+    if similarity.scale <= 0.0:
         raise UselessPriorsError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
     return Gauge(
-        similarity=_keep_axes(found.scale, found.rotation.T @ found.translation),
+        similarity=_keep_axes(similarity.scale, similarity.rotation.T @ similarity.translation),
         scale="prior",
-        axes=found.rotation if turns or not axes_known else None,
-        statement=_prior_statement(priors, found, weights, level, turns=turns or not axes_known),
+        axes=similarity.rotation if turns or not axes_known else None,
+        statement=_prior_statement(priors, similarity, weights, level, turns=turns or not axes_known),
         warning=_prior_warning(level, size, turns=turns, axes_known=axes_known),
         datum=priors.datum if turns else None,
     )
@@ -277,24 +263,21 @@ def fit_to_priors(
 ) -> tuple[Similarity, FloatArray, float]:
     """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals.
 
-    Args:
-        source: (k, 3) the locations of the cameras that have a prior.
-        priors: theirs.
-        size: the spread of the priors.
-        rotate: whether the axes are to be found too.
+    `source` (k, 3) are the locations of the cameras with priors, `size` is the priors' spread; with `rotate`
+    the axes are fitted too.
     """
     target = priors.known.positions
-    found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
+    similarity = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
     sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)
     weights = np.ones(len(source))
     level = 0.0
     for _ in range(_REWEIGHTINGS):
-        residuals = np.linalg.norm(found.apply(source) - target, axis=1)
+        residuals = np.linalg.norm(similarity.apply(source) - target, axis=1)
         level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
         spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size)
         weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
-        found = fit_similarity(source, target, weights / spread**2, rotate=rotate)
-    return found, weights, level
+        similarity = fit_similarity(source, target, weights / spread**2, rotate=rotate)
+    return similarity, weights, level
 
 
 def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -304,12 +287,12 @@ def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _prior_statement(
-    priors: PositionPriors, found: Similarity, weights: FloatArray, level: float, *, turns: bool
+    priors: PositionPriors, similarity: Similarity, weights: FloatArray, level: float, *, turns: bool
 ) -> str:
     agreeing = int(np.sum(weights >= 0.5))
     axes = "axes: the input's"
     if turns:
-        axes = f"turned by {float(rotation_angles_deg(found.rotation)):.1f} deg onto theirs"
+        axes = f"turned by {float(rotation_angles_deg(similarity.rotation)):.1f} deg onto theirs"
     return (
         f"prior: {priors.statement}; {agreeing} of {len(weights)} agree, to {level:.3g} per axis; "
         f"origin: theirs, {axes}"

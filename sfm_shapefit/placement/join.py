@@ -1,7 +1,7 @@
-"""Two models joined: the similarity between their worlds, how well it is known, and when it is refused.
+"""Two models joined: the similarity between their worlds, its uncertainty, and when it is refused.
 
-Directions end at the border of a model, and so does its scale. What still ties two models are matches between
-their images, too few to be pairs of one model, or positions that are known of cameras of both. From either
+Directions end at the border of a model, and so does its scale. Two models are still tied by matches between
+their images, too few to be pairs of one model, or by positions that are known of cameras of both. From either
 comes the similarity first_from_second, y = s R x + t, by a robust fit to more than it needs; its standard
 deviations are those of a jackknife, which leaves out one witness (a pair of images, a position) after the
 other, so that errors which the matches of a pair share count once:
@@ -10,8 +10,7 @@ other, so that errors which the matches of a pair share count once:
 
 A join is refused where it is not over-determined; where pairs that contradict it agree among themselves on
 another one, as those of a thing that stands there twice do; or where scale, turn or place stay too uncertain.
-Two models whose scales are known, as those of rigs, are joined by a rigid motion; how well the scale between
-them is known is then what is known of these.
+Two models whose scales are known, as those of rigs, are joined by a rigid motion.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,28 +38,22 @@ from sfm_shapefit.placement.gauge import fit_to_priors, prior_gauge
 from sfm_shapefit.scene.given import PositionPriors
 
 FEWEST_WITNESSES = 3
-"""Pairs of images, or known positions in each model, that a join needs."""
-_FEWEST_MATCHES = 24
-# From fewer points that both models have no start is drawn.
-_FEWEST_POINTS = 6
-# Pairs that agree on another join are a rival from this share of those that agree on the best.
-_LEAST_RIVAL_SHARE = 0.25
-# Pairs that contradict the best join, of those that agree on it, at most.
-_MOST_AGAINST = 3.0
+"""Pairs of images, or known positions in each model, that a join needs; two leave nothing to check it by."""
+_FEWEST_MATCHES = 24  # matches of a pair that can be a witness; fewer are chance
+_FEWEST_POINTS = 6  # points that both models have; from fewer no start is drawn
+_LEAST_RIVAL_SHARE = 0.25  # share of the best join's pairs; from here on another join is a rival
+_MOST_AGAINST = 3.0  # pairs that contradict the best join, per agreeing pair; beyond, it is refused
 # Turns that single pairs suggest agree up to here; so many groups of them are tried.
 _SAME_TURN_DEG = 5.0
-_MOST_TURNS = 8
-_LARGEST_SCALE_SIGMA = 0.05
-_LARGEST_TURN_SIGMA_DEG = 3.0
-# Of the median distance of the second model's cameras from their middle.
-_LARGEST_CENTER_SIGMA = 0.1
-_NUM_SAMPLES = 256
-_NUM_REFINED = 4
-_REWEIGHTINGS = 20
-# More matches than these make the fit no better.
-_MOST_MATCHES = 1_000
-# Witnesses are left out by so many groups at most.
-_MOST_FITS = 12
+_MOST_TURNS = 8  # groups of turns that are tried; bounds the time where single pairs scatter
+_LARGEST_SCALE_SIGMA = 0.05  # relative standard deviation of the scale; above, the join is refused
+_LARGEST_TURN_SIGMA_DEG = 3.0  # degrees, standard deviation of the turn; above, the join is refused
+_LARGEST_CENTER_SIGMA = 0.1  # standard deviation of the place in spreads of the second model; likewise
+_NUM_SAMPLES = 256  # draws of few points; if half are good, none of these is with odds 1e-15
+_NUM_REFINED = 4  # draws; only the best are refined
+_REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
+_MOST_MATCHES = 1_000  # matches; more make the fit no better
+_MOST_FITS = 12  # groups by which witnesses are left out; each is a fit of its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,9 +64,9 @@ class ModelJoin:
     scale_sigma: float
     """Relative standard deviation of its scale."""
     turn_sigma_deg: float
-    """Standard deviation of its rotation: of the angle of its error."""
+    """Standard deviation of the angle by which its rotation is off."""
     center_sigma: float
-    """Standard deviation of where the second model's cameras come to lie, median, in units of the first."""
+    """Median standard deviation of the second model's cameras, in units of the first."""
     evidence: str
     """What it rests on, in words."""
     agreeing: BoolArray | None = None
@@ -86,7 +79,7 @@ class Ties(NamedTuple):
     eyes_first: FloatArray
     """(k, 3) center of the first model's camera."""
     eyes_second: FloatArray
-    """(k, 3) of the second one's."""
+    """(k, 3) center of the second one's."""
     rays_first: FloatArray
     """(k, 3) unit rays in the first model's world."""
     rays_second: FloatArray
@@ -120,17 +113,15 @@ def join_by_matches(
     """Return the join of two models by matches between their images, which are too few to be pairs alone.
 
     A match whose keypoint in one model observes a point says where that is seen from the other; where neither
-    observes one, both rays and the two centers lie in a plane.
+    observes one, both rays and the two centers lie in a plane. UnsolvableError, whose message is the reason,
+    a clause, if it is not safe.
 
     Args:
         ties: the matches.
         turns: (h, 3, 3) rotations first_from_second that single pairs of images suggest.
         centers: (n, 3) of the second model's cameras.
-        metric_sigma: relative standard deviation of what the scales of both models make of the one between
-            them, if both are known: it is 1 then.
-
-    Raises:
-        UnsolvableError: if it is not safe; the message is the reason, a clause.
+        metric_sigma: relative standard deviation of the scale between the models, which is 1, if both are
+            metric.
     """
     metric = metric_sigma is not None
     num_matches, num_pairs = len(ties.pairs), len(np.unique(ties.pairs))
@@ -171,7 +162,7 @@ class PlacedByPriors(NamedTuple):
     """A model on the position priors of its cameras, and how well it stands there."""
 
     centers: FloatArray
-    """(n, 3) of its cameras, in its world."""
+    """(n, 3) centers of its cameras, in its world."""
     priors_from_model: Similarity
     parts: tuple[Similarity, ...]
     """The same without some of the priors in turn."""
@@ -179,25 +170,16 @@ class PlacedByPriors(NamedTuple):
 
 
 def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPriors:
-    """Return a model on its position priors, for `join_by_priors`.
+    """Return a model, cameras at `centers` (n, 3), on their position priors, for `join_by_priors`.
 
-    Args:
-        centers: (n, 3) of its cameras, in its world.
-        priors: of these cameras.
-
-    Raises:
-        UnsolvableError: if they are few, lie on a line, or do not fit; the message is the reason, a clause.
+    UnsolvableError, whose message is the reason, a clause, if they are few, lie on a line, or do not fit.
     """
     best, parts = _fit_priors(centers, priors)
     return PlacedByPriors(centers, best, tuple(parts), len(priors))
 
 
 def join_by_priors(first: PlacedByPriors, second: PlacedByPriors) -> ModelJoin:
-    """Return the join of two models by position priors of cameras of each.
-
-    Raises:
-        UnsolvableError: if it is not safe; the message is the reason, a clause.
-    """
+    """Return the join of two models by position priors; UnsolvableError, the reason, if it is not safe."""
     one, other = first.priors_from_model, second.priors_from_model
     errors = [[_chain(part, other) for part in first.parts], [_chain(one, part) for part in second.parts]]
     evidence = f"position priors of {first.num_priors} and {second.num_priors} cameras"
@@ -224,11 +206,7 @@ def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Sim
 
 
 def _fit_priors(centers: FloatArray, priors: PositionPriors) -> tuple[Similarity, list[Similarity]]:
-    """Return the map of a model onto its priors, and the maps that leave out some of them in turn.
-
-    Raises:
-        UnsolvableError: if they are few, lie on a line, or do not fit.
-    """
+    """Return a model's map onto its priors, and maps that leave out some; UnsolvableError if none is good."""
     if len(priors) <= FEWEST_WITNESSES:
         raise UnsolvableError(
             f"one of them has {counted(len(priors), 'position prior')}, and a join needs "
@@ -270,10 +248,7 @@ def _search(ties: Ties, turns: FloatArray, *, metric: bool) -> Similarity:
 
 
 def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int, *, metric: bool) -> None:
-    """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one.
-
-    False pairs that contradict one another are no rivals, be they ever so many up to a limit.
-    """
+    """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one."""
     num_against = len(np.unique(rest.pairs))
     if num_against > _MOST_AGAINST * num_supporting:
         raise UnsolvableError(
@@ -354,11 +329,11 @@ def _solve_scale_and_shift(ties: Ties, turn: FloatArray) -> FloatArray:
     matrix, target = np.concatenate(matrices), np.concatenate(targets)
     floor = 1e-6 * (float(np.abs(target).max()) or 1.0)
     weights = np.ones(len(target))
-    found = np.zeros(4)
+    solution = np.zeros(4)
     for _ in range(_REWEIGHTINGS):
-        found = np.linalg.lstsq(weights[:, None] * matrix, weights * target)[0]
-        weights = np.maximum(np.abs(matrix @ found - target), floor) ** -0.5
-    return found
+        solution = np.linalg.lstsq(weights[:, None] * matrix, weights * target)[0]
+        weights = np.maximum(np.abs(matrix @ solution - target), floor) ** -0.5
+    return solution
 
 
 def _off(fit: Similarity, ties: Ties) -> tuple[FloatArray, FloatArray]:

@@ -11,21 +11,16 @@ from sfm_shapefit.refinement.near import follow_cameras
 
 
 def move_cameras(placement: Placement, locations: FloatArray) -> Placement:
-    """Return the placement with its cameras moved, and its points after them.
-
-    Args:
-        placement: of k cameras.
-        locations: (k, 3) of these, in the solver's units; a camera whose row is NaN stays where it is.
-    """
+    """Return the placement with k cameras at `locations` (k, 3), NaN unmoved, and its points after them."""
     refined, before = placement.refined, placement.locations
-    known = np.isfinite(locations).all(axis=1)
+    has_location = np.isfinite(locations).all(axis=1)
     moved = refined.locations.copy()
-    moved[: len(before)][known] = locations[known]
+    moved[: len(before)][has_location] = locations[has_location]
     by = float(np.median(np.linalg.norm(moved[: len(before)] - before, axis=1))) / median_spread(before)
     adjusted = replace(
         refined,
         locations=follow_cameras(placement.measured_part(), moved),
         reason=f"{refined.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)",
-        reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(known)),
+        reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(has_location)),
     )
     return replace_locations(placement, adjusted)

@@ -21,7 +21,7 @@ from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit
-from sfm_shapefit.refinement.agreement import Agreement, find_agreement
+from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
@@ -39,7 +39,7 @@ class Near(NamedTuple):
     """Where an adjustment has cameras already."""
 
     locations: FloatArray
-    """(n, 3) of all cameras, in any scale and from any origin; NaN for those it lacks."""
+    """(n, 3) centers of all cameras, in any scale and from any origin; NaN for those it lacks."""
     refined: RefinedPlacement
     """The placement that it started from."""
 
@@ -59,7 +59,7 @@ class Placement(Displayed):
     edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
-    agreement: Agreement
+    agreement: AngularAgreement
     """Which of these edges agree with these locations."""
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
@@ -103,7 +103,7 @@ class Placement(Displayed):
 
     @property
     def pairs(self) -> IntArray:
-        """Those of `edges` that join two cameras, as rows of everything per edge."""
+        """Edges that join two cameras, as rows of everything per edge."""
         return np.flatnonzero(self.measured.is_pair[self.edges])
 
     @property

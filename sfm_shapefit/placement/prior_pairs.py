@@ -9,9 +9,8 @@ from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between, norm
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.scene.given import PositionPriors
 
-# A direction contradicts its baseline beyond so many standard deviations of it, and beyond so many degrees.
-_FAR = 4.0
-_LEAST_DEG = 5.0
+_FAR = 4.0  # standard deviations of the baseline; a direction beyond these and ...
+_LEAST_DEG = 5.0  # ... beyond this, in degrees, contradicts it; good rotations are not that far off
 
 
 class PriorAngles(NamedTuple):
@@ -34,15 +33,15 @@ def compare_with_priors(
     Args:
         pairs: (m, 2) cameras (i, j).
         directions: (m, 3) unit vectors of t_i - t_j in the input's axes; NaN where there is none.
-        priors: of the cameras.
-        gauge: with axes of the priors.
+        priors: priors of the cameras.
+        gauge: gauge with axes of the priors.
         centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
     """
-    known, n = priors.known, len(centers)
+    has_prior, n = priors.known, len(centers)
     positions, sigmas = np.full((n, 3), np.nan), np.full(n, np.nan)
-    positions[known.indices] = known.positions
-    level = float(np.nanmedian(np.linalg.norm(known.off(centers), axis=1))) / MEDIAN_NORMAL_LENGTH
-    sigmas[known.indices] = np.fmax(known.sigmas(), level)
+    positions[has_prior.indices] = has_prior.positions
+    level = float(np.nanmedian(np.linalg.norm(has_prior.off(centers), axis=1))) / MEDIAN_NORMAL_LENGTH
+    sigmas[has_prior.indices] = np.fmax(has_prior.sigmas(), level)
     baselines = positions[pairs[:, 0]] - positions[pairs[:, 1]]
     axes = np.eye(3) if gauge.axes is None else gauge.axes
     angles = angle_between(normalized(baselines), directions @ axes.T)

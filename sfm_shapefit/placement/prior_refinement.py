@@ -37,16 +37,13 @@ def pull_to_priors(
     """Return the placement refined on directions and priors together.
 
     A camera that the refinement had thrown out of the scene and put back stays undetermined, unless a prior
-    holds it where it is now.
+    holds it where it is now. UnsolvableError if the factor would take more memory than the options allow.
 
     Args:
         placement: cameras placed by directions, and points with them.
-        gauge: in which the priors are, from `prior_gauge`.
-        priors: of the images.
+        gauge: gauge in which the priors are, from `prior_gauge`.
+        priors: priors of the images.
         options: as they were given to `place`.
-
-    Raises:
-        UnsolvableError: if the factor would take more memory than the options allow.
     """
     part, refined = placement.measured_part(), placement.refined
     own = priors.of(placement.nodes).known

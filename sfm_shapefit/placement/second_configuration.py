@@ -1,13 +1,13 @@
 """Do the rejected pairs agree on another placement?
 
-Pairs that are wrong at random contradict each other as much as the solution. Those of repeated structure
+Pairs that are wrong at random contradict each other as much as the solution. Pairs of repeated structure
 (facades, a symmetric object) agree with one another on a second configuration, and where they are many the
 solution may be a compromise, or the wrong one of the two. So the rejected pairs are solved by themselves.
 
 n cameras have d (n - 1) - 1 unknowns, and a direction d - 1 equations: even random directions can be made to
-agree as far as there are unknowns, at most f = (d (n - 1) - 1) / (d - 1) pairs of them. Of the pairs beyond
-these, (agreeing - f) / (all - f) is a share that random ones keep at or below 0, measured -2.7 to -0.1; where
-all wrong pairs agree on one configuration it was 0.5 to 1.
+agree as far as there are unknowns, at most f = (d (n - 1) - 1) / (d - 1) pairs of them. The share
+(agreeing - f) / (all - f) of the pairs beyond these was -2.7 to -0.1 for random ones, and 0.5 to 1 where all
+wrong pairs agree on one configuration.
 
 The program is LUD (Ozyesil, Singer 2015, "Robust camera location estimation by convex programming"), a few
 iterations, which cost some hundredths of the placement.
@@ -24,17 +24,13 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.lud import solve_lud
 
-# Pairs of the second configuration, at least, of those that agree with the solution.
-_LEAST_OF_AGREEING = 0.2
-# Share that must agree of the pairs beyond those which unknowns can fit, and how many these must be at least.
-_LEAST_SHARE = 0.3
-_FEWEST_SPARE = 20.0
-_STEPS = 20
-# A pair agrees within so many levels, but within so many degrees at least and at most.
-_LEVELS = 5.0
-_ANGLE_DEG = (3.0, 10.0)
-# As for the second start of a placement.
-_MAX_PAIRS = 1_000_000
+_LEAST_OF_AGREEING = 0.2  # share of the solution's pairs; a smaller second configuration is chance
+_LEAST_SHARE = 0.3  # share of agreeing pairs beyond those that unknowns can fit; random ones stay below 0
+_FEWEST_SPARE = 20.0  # pairs beyond those that unknowns can fit; a share of fewer is chance
+_STEPS = 20  # iterations of LUD; enough to see who agrees
+_LEVELS = 5.0  # levels of error; a pair agrees within these, ...
+_ANGLE_DEG = (3.0, 10.0)  # ... degrees, at least and at most; a level may be tiny or huge
+_MAX_PAIRS = 1_000_000  # pairs; as for the second start of a placement, which takes as long
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,8 +73,8 @@ def find_second_configuration(
     fitted = (graph.dimension * (rigid.num_nodes - 1) - 1) / (graph.dimension - 1)
     if rigid.num_edges - fitted < _FEWEST_SPARE:
         return None
-    found = solve_lud(rigid, _STEPS, certified=False).locations
-    angles = angle_between_deg(rigid.directions, normalized(differences(found, rigid.edges)))
+    second = solve_lud(rigid, _STEPS, certified=False).locations
+    angles = angle_between_deg(rigid.directions, normalized(differences(second, rigid.edges)))
     alike = int(np.sum(angles <= np.clip(_LEVELS * level_deg, *_ANGLE_DEG)))
     if alike - fitted < _LEAST_SHARE * (rigid.num_edges - fitted) or alike < _LEAST_OF_AGREEING * agreeing:
         return None

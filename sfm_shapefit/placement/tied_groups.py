@@ -14,15 +14,11 @@ from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# The largest offset, of the median baseline, below which the scale of the offsets means nothing.
-_LEAST_UNIT = 1e-6
+_LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means nothing
 
 
 def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
-    """Return whether any group has two nodes apart that pairs with other groups see.
-
-    Without one the scale of the offsets is open.
-    """
+    """Return whether a group has two nodes apart that others see; else the offsets' scale is open."""
     nodes = np.unique(edges[groups.joins(edges)])
     return bool(len(nodes)) and bool(groups.restricted_to(nodes).center().offsets.any())
 
@@ -30,11 +26,8 @@ def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
 def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
     """Return the nodes of the groups that the pairs tie to one another, and the edges between these groups.
 
-    They are those around the fixed group, or the largest set if none is fixed.
-
-    Raises:
-        UnsolvableError: if the pairs do not tie the groups, or leave the scale of their offsets open; the
-            message says which.
+    They are those around the fixed group, or the largest set if none is fixed. UnsolvableError, which says
+    which, if the pairs do not tie the groups, or leave the scale of their offsets open.
     """
     groups, edges = measured.groups, measured.graph.edges
     assert groups is not None
@@ -56,11 +49,7 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
 
 
 def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
-    """Return the length of the offsets' unit at the locations (n, d) of tied groups.
-
-    Raises:
-        UnsolvableError: if it is not positive, or too small to mean anything.
-    """
+    """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
     assert part.groups is not None
     unit = float(part.groups.fit(locations)[0][-1])
     size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())

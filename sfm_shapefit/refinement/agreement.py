@@ -25,23 +25,17 @@ from sfm_shapefit.solver.program import along, differences
 
 # Probability that a normal residual counts as wrong; in 3D a chi-square of 25, "5 sigma".
 _OUTLIER_PROBABILITY = 3.7e-6
-# Keeps the quantile below 0.65, so that a third of the pairs may be wrong.
-_LARGEST_FITTED_SHARE = 0.3
-# Share of the equations that unknowns take up, beyond which residuals hardly speak.
-_LARGEST_SHARE = 0.9
-# Of the median residual; a normal residual is below it once in a million times.
-_EXACTLY_FITTED = 1e-3
-# With so large a share of exactly fitted pairs the locations come from a sum of norms.
-_MIN_FITTED_SHARE = 0.02
-# Exact data have a finite information all the same.
-_MIN_LEVEL_RAD = 1e-9
-# Rounds of "who agrees?" and "how large are the residuals of those who do?".
-_LEVEL_ROUNDS = 5
-_BISECTIONS = 50
+_LARGEST_FITTED_SHARE = 0.3  # share of pairs; keeps the quantile below 0.65, so that a third may be wrong
+_LARGEST_SHARE = 0.9  # unknowns per equation; beyond, residuals hardly say anything
+_EXACTLY_FITTED = 1e-3  # share of the median residual; a normal one is below it once in a million times
+_MIN_FITTED_SHARE = 0.02  # share of exactly fitted pairs; from here on locations come from a sum of norms
+_MIN_LEVEL_RAD = 1e-9  # radians; exact data still get a finite information
+_LEVEL_ROUNDS = 5  # rounds of "who agrees?" and "how large are their residuals?"; they settle in fewer
+_BISECTIONS = 50  # halvings; double precision has no more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Agreement:
+class AngularAgreement:
     """Which directions of a graph agree with its locations."""
 
     angles_rad: FloatArray
@@ -54,18 +48,18 @@ class Agreement:
     """The part of it, per axis, that the directions' own covariances do not explain."""
 
 
-def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> Agreement:
+def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> AngularAgreement:
     """Return which directions agree with locations (n, d) of a measured graph."""
     graph, groups = measured.graph, measured.groups
-    freedom, own = graph.dimension - 1, own_covariances(measured)
+    freedom, covariances = graph.dimension - 1, own_covariances(measured)
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
     num_groups = graph.num_nodes if groups is None else groups.num_groups
     num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
-    excess, agrees = _excess(residuals, own, behind, num_unknowns)
+    excess, agrees = _excess(residuals, covariances, behind, num_unknowns)
     angles = np.linalg.norm(residuals, axis=1)
-    return Agreement(
+    return AngularAgreement(
         angles_rad=angles, agrees=agrees, level_rad=_level(angles, num_unknowns, freedom), excess_rad=excess
     )
 
@@ -103,19 +97,19 @@ def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[
 def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
     """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
     share, is_exact = _fitted_share(angles, num_unknowns, freedom)
-    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
+    median_length = np.sqrt(chdtri(freedom, 0.5))  # median length of a vector of unit normal components
     quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
     shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
     return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
 
 
 def _excess(
-    residuals: FloatArray, own: FloatArray, behind: BoolArray, num_unknowns: int
+    residuals: FloatArray, covariances: FloatArray, behind: BoolArray, num_unknowns: int
 ) -> tuple[float, BoolArray]:
     """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
     freedom = residuals.shape[1]
     angles = np.linalg.norm(residuals, axis=1)
-    values, vectors = np.linalg.eigh(own)
+    values, vectors = np.linalg.eigh(covariances)
     squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
     limit = chdtri(freedom, _OUTLIER_PROBABILITY)
     used: BoolArray = np.ones(len(angles), dtype=np.bool_)

@@ -23,15 +23,14 @@ from sfm_shapefit.refinement.angular import (
     allocate_normal,
     information_at,
     plan_refinement,
-    take_step,
+    take_angular_step,
 )
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.program import adjoint
 
-_MAX_STEPS = 40
-# A step that lowers the cost by less than this share of it is the last one.
-_CONVERGED = 1e-9
+_MAX_STEPS = 40  # steps, a bound; a start near the answer needs few
+_CONVERGED = 1e-9  # relative decrease of the cost; a smaller one is the last
 
 
 def weighted_anchors(anchors: KnownPositions, t: FloatArray) -> KnownPositions:
@@ -57,7 +56,7 @@ def refine_anchored(
         metric: covariance and class of each pair.
         levels: (number of classes,) in radians.
         anchors: measured positions of some nodes.
-        max_bytes: what a factor of the normal equations may take; UnsolvableError if it would take more.
+        max_bytes: limit of a factor of the normal equations; above, UnsolvableError.
     """
     plan = plan_refinement(_join(graph, anchors), max_bytes)
     if plan is None:
@@ -69,7 +68,7 @@ def refine_anchored(
     terms = _AnchoredTerms(graph, information_at(graph, metric, levels), anchors)
     t, damping = start, DAMPING.first
     for _ in range(_MAX_STEPS):
-        moved, damping, before, after = take_step(terms, factor, t, damping)
+        moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         if before - after <= _CONVERGED * before:
             break
         t = moved
@@ -98,10 +97,10 @@ class _AnchoredTerms(AngularTerms):
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
         blocks, damped, gradient = self.linearize(t)
-        own = weighted_anchors(self._anchors, t).information
-        pull = np.einsum("kab,kb->ka", own, self._anchors.off(t))
+        anchor_blocks = weighted_anchors(self._anchors, t).information
+        pull = np.einsum("kab,kb->ka", anchor_blocks, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
-        return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right
+        return np.concatenate([blocks, anchor_blocks]), np.append(damped, np.zeros(len(anchor_blocks))), right
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step (n + 1, d), with the origin where it is."""

@@ -48,34 +48,28 @@ KERNEL_WIDTH = 3.0
 """k: a residual of so many standard deviations counts half of what it can."""
 
 DAMPING = DampingRange()
-"""Of the steps, relative to the damping matrix of `AngularTerms`."""
+"""Damping of the steps, relative to the damping matrix of `AngularTerms`."""
 
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 # On exact data a smaller level would reject pairs for their rounding.
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH
-# With less than this share of a class inside the kernel most of it is not fitted yet, and its level stays.
-_LEAST_SHARE = 0.2
+_LEAST_SHARE = 0.2  # share of a class inside the kernel; with less most is not fitted yet, its level stays
 # The floor under |d|, relative to the median length: a shorter baseline has no direction.
 _SHORTEST = 1e-3
-# A smaller relative change of the levels, and a smaller relative decrease of the cost, counts as none.
-_SETTLED = 0.03
-_CONVERGED = 1e-9
-# A move of less than this share of the extent, by all but a tenth of the nodes, counts as none.
-_STILL = 1e-6
-# Costs that differ by less, relatively, are those of the same place.
-_ALIKE = 1e-6
-# A cost that is above the best one so far by more than so many of its last decreases does not catch up.
-_HOPELESS = 20.0
-_MAX_STEPS = 60
-# One factorization in blocks of so many operations takes about a second, and 15 to 40 are needed.
-_MAX_FLOPS = 3e10
+_SETTLED = 0.03  # relative change of a level; a smaller one counts as none
+_CONVERGED = 1e-9  # relative decrease of the cost; a smaller one counts as none
+_STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the nodes counts as none
+_ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
+_HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
+_MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
+_MAX_FLOPS = 3e10  # operations of one factorization in blocks; they take about a second per step
 
 
 class Metric(NamedTuple):
     """What a residual is judged by."""
 
     covariance: FloatArray | None
-    """(m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
+    """(m, d - 1, d - 1) covariances in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
     classes: IntArray
     """(m,) the class of each pair, 0, 1, ...; each has a level of its own."""
 
@@ -118,18 +112,17 @@ def refine_angles(
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
+    The cost at the final levels is not above that of the start, which is returned if nothing better was
+    found.
+
     Args:
         graph: a connected view graph.
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
-        plan: what `plan_refinement` says; or memory for a factor, such as that over groups, in which case
+        plan: from `plan_refinement`; or memory for a factor, such as that over groups, in which case
             locations are and stay those of the groups.
         other: (n, d) refined locations of the other start; once the levels have settled, the refinement ends
             where it has come as low as these, and where it clearly cannot.
-
-    Returns:
-        Locations whose cost at the final levels is not above that of the start: these, if nothing better
-        was found.
     """
     factor, spread = allocate_normal(plan, graph.dimension), _spread(graph, metric)
     first = _unit(start)
@@ -142,7 +135,7 @@ def refine_angles(
         levels = levels if settled else lower
         information = _information(graph, spread, levels[metric.classes])
         terms = AngularTerms(graph, information, steep=not settled)
-        moved, damping, before, after = take_step(terms, factor, t, damping)
+        moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
         t, steps = moved, steps + 1
         if settled and still:
@@ -162,10 +155,7 @@ def _is_decided(before: float, after: float, other_cost: float) -> bool:
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel over the pairs at locations (n, d), at the level of each class, radians.
-
-    No pair adds more than k^2 pi / 4 times its weight.
-    """
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 by weight; levels in radians."""
     return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
 
 
@@ -209,7 +199,7 @@ def allocate_normal(plan: SymbolicFactor | LaplacianFactor, dimension: int) -> L
     return allocate_factor(plan, dimension) if isinstance(plan, SymbolicFactor) else plan
 
 
-def take_step(
+def take_angular_step(
     terms: AngularTerms, factor: LaplacianFactor, t: FloatArray, damping: float
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
@@ -225,12 +215,12 @@ def take_step(
         after = terms.cost(proposed)
         return (proposed, after) if after < before else None
 
-    found, damping = take_damped_step(propose, damping, DAMPING)
-    moved, after = (t, before) if found is None else found
+    proposal, damping = take_damped_step(propose, damping, DAMPING)
+    moved, after = (t, before) if proposal is None else proposal
     return moved, damping, before, after
 
 
-def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
+def fitting_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
     """Return which pairs fit locations (n, d), (m,): those of chi2 below k^2 at the level of each class."""
     information = information_at(graph, metric, levels)
     residuals = _residuals(graph, _unit(locations))
@@ -241,23 +231,20 @@ def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, leve
 def residual_levels(
     graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray
 ) -> FloatArray:
-    """Return the level of each class, from the median of the residuals that its kernel does not reject.
-
-    That kernel is the one at the present `levels`. Own covariances are part of a level.
-    """
+    """Return each class's level: median residual, own covariances included, inside the present kernel."""
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
     unknowns = graph.dimension * (graph.num_nodes - 1) - 1
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
-    median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # of a residual of unit variance per axis
+    median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # with unit variance per axis
     chords = np.linalg.norm(_residuals(graph, _unit(locations)), axis=1)
-    found = np.empty_like(levels)
+    new_levels = np.empty_like(levels)
     for c, level in enumerate(levels):
-        own = chords[metric.classes == c]
-        inside = own[own < KERNEL_WIDTH * level]
-        few = len(inside) < _LEAST_SHARE * len(own) or len(own) == 0
-        found[c] = level if few else np.median(inside) / median_length
-    return np.maximum(found, _LEAST_LEVEL_RAD)
+        class_chords = chords[metric.classes == c]
+        inside = class_chords[class_chords < KERNEL_WIDTH * level]
+        few = len(inside) < _LEAST_SHARE * len(class_chords) or len(class_chords) == 0
+        new_levels[c] = level if few else np.median(inside) / median_length
+    return np.maximum(new_levels, _LEAST_LEVEL_RAD)
 
 
 def information_at(graph: ViewGraph, metric: Metric, levels: FloatArray) -> FloatArray:
@@ -272,8 +259,8 @@ def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] |
     """
     if metric.covariance is None:
         return None
-    known = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
-    variances, axes = np.linalg.eigh(np.where(known.reshape(-1, 1, 1), metric.covariance, 0.0))
+    finite = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(finite.reshape(-1, 1, 1), metric.covariance, 0.0))
     return np.asarray(tangent_bases(graph.directions) @ axes), np.maximum(variances, 0.0)
 
 
@@ -296,11 +283,7 @@ def _unit(t: FloatArray) -> FloatArray:
 
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:
-    """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
-
-    A few loose nodes may wander for long; in a long chain the cost may hardly fall while all of it still
-    moves.
-    """
+    """Return the most that nine tenths of the nodes moved, over the extent; loose ones wander for long."""
     return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 

@@ -14,10 +14,9 @@ from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_chole
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver.program import adjoint, differences
 
-# A step is solved until its residual has fallen to this share.
-_REDUCTION = 1e-2
-_MAX_STEPS = 80
-_SEED = 1
+_REDUCTION = 1e-2  # share of the residual that a solve may leave; damped steps need no more
+_MAX_STEPS = 80  # conjugate gradient steps, a bound; a solve that ends there is used as it is
+_SEED = 1  # seed of the approximate factor; same input, same answer
 
 
 class GraphShape(NamedTuple):

@@ -12,10 +12,8 @@ from sfm_shapefit.refinement.starts import OPENING_RAD, RefinedPlacement
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import normalize_locations
 
-# Distance between a camera as solved and as adjusted, in spreads of all, beyond which it does not count more.
-_CAP_OF_SIZE = 0.5
-# Smallest eigenvalue of the sum of projectors below which the rays of a point count as parallel.
-_LEAST_SPREAD = 1e-12
+_CAP_OF_SIZE = 0.5  # spreads of all cameras; a larger distance from solved to adjusted counts no more
+_LEAST_SPREAD = 1e-12  # smallest eigenvalue of a point's sum of projectors; below, its rays are parallel
 # Rounds of "which residuals are inside?" and "how large are these?"; the level settles in about five.
 _ROUNDS = 10
 
@@ -28,7 +26,7 @@ def stay_near(
     Args:
         measured: a piece.
         solved: its certified solution.
-        centers: (k, 3) of its cameras by the adjustment, in any scale and from any origin, in the same axes.
+        centers: (k, 3) adjusted centers of its cameras, in any scale and from any origin, in the same axes.
         first: the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]

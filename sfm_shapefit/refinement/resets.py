@@ -26,18 +26,13 @@ from sfm_shapefit.solver.program import differences
 # Distance of a stray, in the largest distance of the start, both in median distances. A sound refinement
 # moves cameras by a fraction of the radius, not by 3 radii.
 _REACH = 3.0
-# Each radius at which strays are looked for, in the one before.
-_FARTHER = 10.0
-# Share of the pairs that leave a group which must agree if the rest holds the group.
-_LEAST_AGREEMENT = 0.5
+_FARTHER = 10.0  # ratio of successive radii at which strays are looked for; strays may stand at any distance
+_LEAST_AGREEMENT = 0.5  # share of the pairs that leave a group; if fewer agree the rest does not hold it
 # Pairs with the rest that must agree: along a single direction a group may slide.
 _FEWEST_AGREEING = 2
-# Nodes that must stay in the scene to say where the start lies.
-_FEWEST_OTHERS = 3
-# Eigenvalues below this share of the largest are rounding; they count as this much information instead,
-# which is a standard deviation of a million distances.
-_ROUNDING = 1e-14
-_UNKNOWN = 1e-12
+_FEWEST_OTHERS = 3  # nodes that must stay in the scene; fewer do not show where the start lies
+_ROUNDING = 1e-14  # share of the largest eigenvalue; smaller ones are rounding
+_UNKNOWN = 1e-12  # information that these count as; a standard deviation of a million distances
 # A distance is open if its standard deviation is a larger share of it: three of them reach to the rest.
 _OPEN_SHARE = 1.0 / 3.0
 
@@ -53,12 +48,12 @@ def find_strays(
         agreeing: (m,) pairs that fit the refined locations.
         noise_rad: (m,) standard deviation of each direction, per axis.
     """
-    found: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
+    strays: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
     reach = _REACH
     while (far := left_scene(start, refined, reach)).any():
-        found |= _find_drifting(graph, refined, far, agreeing, noise_rad)
+        strays |= _find_drifting(graph, refined, far, agreeing, noise_rad)
         reach *= _FARTHER
-    return np.flatnonzero(found).astype(np.int64)
+    return np.flatnonzero(strays).astype(np.int64)
 
 
 def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) -> BoolArray:

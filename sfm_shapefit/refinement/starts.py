@@ -21,7 +21,7 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.angular import (
     AngularResult,
     Metric,
-    agreeing_pairs,
+    fitting_pairs,
     plan_refinement,
     refine_angles,
     residual_levels,
@@ -32,29 +32,22 @@ from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 
 COLLAPSED = 0.3
-"""Disagreement of the starts beyond which one of them has collapsed."""
+"""Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
 
-# Disagreement from which LUD is likely to be the better start.
-_UNEQUAL = 0.1
-# More change nothing after the refinement.
-_LUD_STEPS = 50
-# Up to so many pairs LUD's own bound is computed, which costs about 100 more iterations.
-_LUD_CERTIFIED_PAIRS = 50_000
-# Beyond so many pairs the second start takes as long as the first.
-_LUD_PAIRS = 1_000_000
-# Weight in LUD of a direction to a 3D point, since all have one loss there whatever their noise.
-_POINT_WEIGHT = 10.0
-# A relative difference of costs that says nothing where the starts disagree.
-_TIE = 1e-3
-# Length of a pair, as a share of the mean of all, below which its cameras stand in one place.
-_POINT_LENGTH = 1e-6
+_UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
+_LUD_STEPS = 50  # iterations; more change nothing after the refinement
+_LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
+_LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
+_POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
+_TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
+_POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
 OPENING_RAD = 0.1
-"""Largest width of the kernel at which unrefined starts are compared."""
+"""Largest width of the kernel, in radians, at which unrefined starts are compared; see `angular`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -168,23 +161,23 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = _choose(graph, starts, costs, apart, options)
+    chosen, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
-    moved = _measure_moves(kept)
+    moved = _measure_moves(chosen)
     # To the bit: the certificate is that of these very locations.
-    is_as_solved = kept.locations is solved.locations and moved[1] == 0.0
+    is_as_solved = chosen.locations is solved.locations and moved[1] == 0.0
     return RefinedPlacement(
-        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.best),
-        start=kept.name,
+        locations=solved.locations if is_as_solved else normalize_locations(graph, chosen.best),
+        start=chosen.name,
         is_refined=moved[1] > 0.0,
         reason=reason,
         disagreement=apart,
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=moved,
-        num_turned_pairs=_count_turned_pairs(problem, kept, levels),
-        reset_nodes=kept.reset_nodes,
+        num_turned_pairs=_count_turned_pairs(problem, chosen, levels),
+        reset_nodes=chosen.reset_nodes,
         lud=lud,
     )
 
@@ -197,7 +190,7 @@ def _plan_normal_solver(
     if groups is None:
         return plan_refinement(graph, max_bytes)
     try:
-        return ReducedFactor(graph.edges, groups.normalize(), max_bytes=max_bytes)
+        return RigidReduction(graph.edges, groups.normalize(), max_bytes=max_bytes)
     except UnsolvableError:
         return None
 
@@ -213,12 +206,12 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
     metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, OPENING_RAD)
-    found = []
+    candidates = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
         locations = lud_over_groups(_weight_points(graph, classes, point_weight), groups)
         if locations is not None and projected_length(graph, locations) > 0.0:
-            found.append((robust_cost(graph, locations, metric, opening), locations))
-    return None, min(found, key=lambda pair: pair[0])[1] if found else None
+            candidates.append((robust_cost(graph, locations, metric, opening), locations))
+    return None, min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 
 def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
@@ -277,7 +270,7 @@ def _reset_strays(
 ) -> tuple[AngularResult, IntArray]:
     """Return a refinement with lone strays reset, or all nodes where that fits better, and the strays."""
     graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
-    agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
+    agreeing = fitting_pairs(graph, refined.locations, metric, levels)
     nodes = find_strays(graph, fallback, refined.locations, agreeing, _noise(metric, levels))
     if problem.measured.groups is not None:
         group_of = problem.measured.groups.group_of
@@ -295,17 +288,17 @@ def _noise(metric: Metric, levels: FloatArray) -> FloatArray:
     """Return the standard deviation of each direction (m,), per axis, radians."""
     variances = levels[metric.classes] ** 2
     if metric.covariance is not None:
-        own = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
-        variances = variances + np.trace(own, axis1=1, axis2=2) / own.shape[1]
+        covariances = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
+        variances = variances + np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
     return np.asarray(np.sqrt(variances))
 
 
-def _count_turned_pairs(problem: _Problem, kept: Start, levels: FloatArray) -> int:
+def _count_turned_pairs(problem: _Problem, chosen: Start, levels: FloatArray) -> int:
     """Return how many pairs the refinement made fit, or not fit any more."""
-    if kept.refined is None:
+    if chosen.refined is None:
         return 0
     before, after = (
-        agreeing_pairs(problem.graph, t, problem.metric, levels) for t in (kept.locations, kept.best)
+        fitting_pairs(problem.graph, t, problem.metric, levels) for t in (chosen.locations, chosen.best)
     )
     return int(np.sum(before != after))
 
@@ -358,8 +351,8 @@ def _normalize(t: FloatArray) -> FloatArray:
     return np.asarray(centered / np.linalg.norm(centered))
 
 
-def _measure_moves(kept: Start) -> tuple[float, float]:
+def _measure_moves(chosen: Start) -> tuple[float, float]:
     """Return the median and the largest move by the refinement, see `RefinedPlacement.moved`."""
-    before, after = _normalize(kept.locations), _normalize(kept.best)
+    before, after = _normalize(chosen.locations), _normalize(chosen.best)
     moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
     return float(np.median(moved)), float(moved.max())

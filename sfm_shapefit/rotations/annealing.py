@@ -30,36 +30,32 @@ from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,
     follow_tree,
     move_to_modes,
+    reweigh_pairs,
     turn_cameras,
     weigh_blocks,
-    weigh_pairs,
 )
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
-# From 60 degrees nine rounds lead down to 5; the others are spent there.
-_ROUNDS = 14
-_COOLING = 0.75
+_ROUNDS = 14  # rounds; nine lead from 60 degrees down to 5, the others are spent there
+_COOLING = 0.75  # factor on the width per round; see the header
 _COLDEST = np.radians(AGREEMENT_DEG)
 LONGEST_STEP = 0.5
-"""No camera turns farther in a step, in radians, as steps are of first order."""
+"""Radians that a camera turns in a step, at most; steps are of first order."""
 FULL_LIMIT = np.radians(AGREEMENT_DEG)
-"""Pairs with a larger residual are left out of the phase with the full information."""
+"""Radians; pairs with a larger residual are left out of the phase with the full information."""
 SCALE_OF_MEDIAN = 3.0
-"""Of the loss with the full information, in medians of the Mahalanobis lengths."""
+"""Width of the loss with the full information; in medians of the Mahalanobis lengths."""
 # Triangles that close to within about this angle count as closed.
 _CLOSING_SCALE = np.radians(AGREEMENT_DEG)
-# Python can be interrupted between slices of so many.
-_PAIRS_PER_SLICE = 200_000
-# Predictions of a camera's rotation within about this angle vote for each other.
-_VOTING_SCALE = np.radians(10.0)
+_PAIRS_PER_SLICE = 200_000  # pairs; Python can be interrupted between slices
+_VOTING_SCALE = np.radians(10.0)  # radians; predictions of a rotation within about this vote for each other
 # A camera moves only for so much more votes: by less, two could move for one another for ever.
 _MARGIN = 0.05
 # A move can make a neighbor move; whoever is still wrong after these has annealing to come.
 _SWEEPS = 5
 SETTLED = 1e-7
-"""Steps shorter than this, in radians, end the rounds."""
-# Right sides of the rounds are solved to this share where there is no factor, the last ones further.
-_REDUCTION, LAST_REDUCTION = 3e-2, 1e-4
+"""Radians; rounds end when no step is longer."""
+_REDUCTION, LAST_REDUCTION = 3e-2, 1e-4  # share of the residual, without a factor; rounds, and the last ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -137,11 +133,11 @@ def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, wi
     """Return rotations (n, 4) after rounds of a robust loss that narrows from `widest`, in radians."""
     turns, k = turns.copy(), len(given.pairs)
     weights = np.sqrt(given.supports / given.supports.mean())
-    found, gradient = np.empty(k), np.empty((given.num_cameras, 3))
+    robust, gradient = np.empty(k), np.empty((given.num_cameras, 3))
     for step in range(_ROUNDS):
         tau = max(widest * _COOLING**step, float(_COLDEST))
-        weigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
-        turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), LONGEST_STEP)
+        reweigh_pairs(given.pairs, given.measured, turns, weights, tau, robust, gradient)
+        turned = turn_cameras(turns, system.solve_scalar(robust, gradient, _REDUCTION), LONGEST_STEP)
         if tau <= _COLDEST and turned <= SETTLED:
             break
     return turns

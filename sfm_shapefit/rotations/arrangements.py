@@ -1,9 +1,9 @@
 """Two arrangements of the same images, where a scene repeats itself: which one the matches speak for.
 
 Averaged rotations follow most matches. Where a tower has the same side thrice, or a courtyard the same house,
-the false pairs between them may be more than the true ones, and agree: the images are folded together. What
-tells is what is missing: folded images that turn by little against one another would share nearly all that
-they see, and share only the repeated thing. So with
+the false pairs between them may be more than the true ones, and agree: the images are folded together. Folded
+images that turn by little against one another would share nearly all that they see, and share only the
+repeated thing. So with
 
     share_e      of a pair's overlap that is matched (`missing_matches`)
     usual_e      the 80 % quantile of the shares of the 81 pairs whose relative rotations turn most nearly as
@@ -21,20 +21,12 @@ Rendered scenes with sides or houses alike, mean error of the rotations in degre
 
     scene                           cameras   all pairs   taken       evidence of both
     tower, 3 of 8 sides                48      71, 25     .06, 0         76 -> 257
-    tower, 2 of 8                      40      41, 18     .08, 0         99 -> 157
     tower, 4 of 8                      40      93, 35     6.8, 6         92 -> 160
-    tower, 3 of 8, others              48      23, 15     3.9, 4        113 -> 193
     tower, 5 of 8                      40      82, 35     none          144 -> 166
-    courtyard, 7 of 12 houses          36      78, 25     .05, 0         20 -> 161
 
-Right rotations do not make all centers right: the first tower is placed to .0010 m, but the parts of the
-second stand .3 to 1.5 m off against one another, and of the courtyard 20 cameras are kept, .4 m off. So no
-model of another arrangement is called good.
-
-The first tower and a courtyard of half its houses alike chose the form, all six scenes that half and third.
-None is taken, as it should be, on the facade and the courtyard of half their houses alike, the drive,
-castle-P19, castle-P30, lego100, liberty, fountain-P11, Herz-Jesus-P25, brighton-beach, and bundled scenes:
-there no other arrangement keeps all images and reaches half of the largest evidence (0.48 at most).
+Right rotations do not make all centers right: parts of some towers stand .3 to 1.5 m off against one another.
+So no model of another arrangement is called good. On fifteen scenes that need none, none is taken. More
+scenes: `scripts/results/notes.md#arrangements`.
 
 Sources: missing correspondences as evidence are Zach, Irschara, Bischof's (CVPR 2008); choosing among whole
 reconstructions by them, after the fact, is Heinly, Dunn, Frahm, "Correcting for duplicate scene structure in
@@ -52,11 +44,11 @@ from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
-_USUAL_QUANTILE, _NUM_ALIKE = 0.8, 81
-_EVEN_SHARE, _SPREAD = 0.65, 0.25
-_LEAST_SHARES = (0.7, 0.5, 0.6, 0.8, 0.9)
-_CLEARLY_MORE = 4.0 / 3.0
-_LEAST_EVIDENCE = 0.5
+_USUAL_QUANTILE, _NUM_ALIKE = 0.8, 81  # quantile of shares, and pairs that turn nearly as much; see above
+_EVEN_SHARE, _SPREAD = 0.65, 0.25  # shares of the usual one; where a pair's evidence is 0, and 1 more
+_LEAST_SHARES = (0.7, 0.5, 0.6, 0.8, 0.9)  # shares of the usual one that are tried; the likeliest first
+_CLEARLY_MORE = 4.0 / 3.0  # evidence over that of all pairs; chosen on scripts/results/notes.md#arrangements
+_LEAST_EVIDENCE = 0.5  # share of the largest evidence; chosen on scripts/results/notes.md#arrangements
 
 
 class Arrangement(NamedTuple):
@@ -66,7 +58,7 @@ class Arrangement(NamedTuple):
     agree: BoolArray
     """(k,) which pairs do, of all."""
     evidence: float
-    """Of these pairs."""
+    """Evidence of the pairs that agree."""
 
     @property
     def mean_evidence(self) -> float:
@@ -86,19 +78,14 @@ class Chosen(NamedTuple):
 
 
 def evidence_of(relative: RelativeRotations, shares: FloatArray) -> FloatArray:
-    """Return how much speaks for each pair being right, (k,), from -1 to 1; 0 where no share is known.
-
-    Args:
-        relative: k pairs.
-        shares: (k,) see `missing_matches.matched_shares`; NaN where unknown.
-    """
-    found, known = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
-    if len(known) == 0:
-        return found
-    usual = _usual_shares(rotation_angles_deg(relative.rotations[known]), shares[known])
-    compared = shares[known] / np.maximum(usual, np.finfo(np.float64).tiny)
-    found[known] = np.clip((compared - _EVEN_SHARE) / _SPREAD, -1.0, 1.0)
-    return found
+    """Return how much the `matched_shares` speak for each pair being right, -1 to 1; 0 where unknown."""
+    evidence, finite = np.zeros(len(shares)), np.flatnonzero(np.isfinite(shares))
+    if len(finite) == 0:
+        return evidence
+    usual = _usual_shares(rotation_angles_deg(relative.rotations[finite]), shares[finite])
+    compared = shares[finite] / np.maximum(usual, np.finfo(np.float64).tiny)
+    evidence[finite] = np.clip((compared - _EVEN_SHARE) / _SPREAD, -1.0, 1.0)
+    return evidence
 
 
 def _usual_shares(angles_deg: FloatArray, shares: FloatArray) -> FloatArray:
@@ -149,8 +136,8 @@ def choose_arrangement(
 
 def agreeing_pairs(relative: RelativeRotations, averaged: AveragedRotations) -> BoolArray:
     """Return which pairs agree with averaged rotations within 5 degrees, (k,)."""
-    known = averaged.registered[relative.pairs].all(axis=1)
-    return np.asarray(known & (relative.residuals_deg(averaged.rotations) <= AGREEMENT_DEG))
+    registered = averaged.registered[relative.pairs].all(axis=1)
+    return np.asarray(registered & (relative.residuals_deg(averaged.rotations) <= AGREEMENT_DEG))
 
 
 def _arrange(relative: RelativeRotations, evidence: FloatArray, averaged: AveragedRotations) -> Arrangement:

@@ -43,18 +43,15 @@ from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenv
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import DualCertificate, certify_rotations
 
-# Standard deviation that is added to that of a pair: calibration is not exact, and matches share errors.
-_FLOOR = np.radians(0.05)
-_WIDEST = np.radians([30.0, 60.0])
-# Where a camera was moved, annealing goes on from here.
-_REATTACHED = np.radians(10.0)
-_VERY_SOUND = 2.5
+_FLOOR = np.radians(0.05)  # radians added to a pair's deviation; calibration is inexact, matches share errors
+_WIDEST = np.radians([30.0, 60.0])  # radians; widths at which annealing begins, one answer each: see above
+_REATTACHED = np.radians(10.0)  # radians; annealing goes on from here once cameras were moved
+_VERY_SOUND = 2.5  # W ln n; fewer pairs than SOUND has, but hardly any wrong one
 # With more pairs, fewer answers are tried: two, and one.
 _MANY_PAIRS, _MOST_PAIRS = 5_000, 100_000
 # The kept answer of a small graph goes on until it stays: a round leaves about half of the way.
 _LAST_ROUNDS = 40
-# Entries of R R^T - I, and relative asymmetry of information, that are still rounding.
-_ROTATION_TOLERANCE = 1e-6
+_ROTATION_TOLERANCE = 1e-6  # entries of R R^T - I, relative asymmetry of information; smaller is rounding
 
 
 def average_rotations(
@@ -66,10 +63,11 @@ def average_rotations(
     weights: npt.ArrayLike | None = None,
     threads: int = 1,
 ) -> AveragedRotations:
-    """Return the rotations of images from relative rotations of pairs, of which many may be wrong.
+    """Return the rotations of images from relative rotations of pairs, many of which may be wrong.
 
-    Images outside the largest component of the pairs get none. The answer does not depend on `threads` nor on
-    the order of the pairs.
+    Images outside the largest component of the pairs get none. The answer, with standard deviations,
+    agreement of the pairs and a certificate, does not depend on `threads` nor on the order of the pairs.
+    InputError if there is no pair, one is given twice, or an array is not as described.
 
     Args:
         pairs: (k, 2) images (i, j), i != j, each pair once.
@@ -79,13 +77,7 @@ def average_rotations(
             None, all pairs are alike.
         num_images: n; one more than the largest index if None.
         weights: (k,) how many matches stand behind each pair; all alike if None.
-        threads: of factorizations.
-
-    Returns:
-        The rotations with standard deviations, the agreement of the pairs, and whether they are certified.
-
-    Raises:
-        InputError: if there is no pair, one is given twice, or an array is not as described.
+        threads: threads of factorizations.
 
     Source: see `rotations.annealing`, `rotations.averaging_uncertainty` and `rotations.dual_certificate`.
     """
@@ -98,11 +90,7 @@ def average_rotations(
 def average_relative_rotations(
     num_images: int, relative: RelativeRotations, threads: int = 1
 ) -> AveragedRotations:
-    """Return the rotations of images from what their matches say; unsound pairs do not count, unless all are.
-
-    Raises:
-        InputError: as of `average_rotations`.
-    """
+    """Return `average_rotations` of sound pairs; unsound ones do not count, unless all are."""
     supports = relative.weight_shares * relative.num_matches
     sound, very_sound = relative.are_sound(), relative.are_sound(_VERY_SOUND)
     used = sound if sound.any() else np.ones(len(sound), dtype=np.bool_)
@@ -304,10 +292,7 @@ def _are_definite(blocks: FloatArray) -> BoolArray:
 def _ordered(
     pairs: IntArray, rotations: FloatArray, information: FloatArray, supports: FloatArray, num_images: int
 ) -> tuple[AveragingPairs, int]:
-    """Return checked pairs with i < j in ascending order, their information capped, and the number of images.
-
-    A pair that is turned around has R^T for R, and -R^T w for w.
-    """
+    """Return checked pairs, turned to i < j (R^T, -R^T w), ascending, capped; and the number of images."""
     turned = pairs[:, 0] > pairs[:, 1]
     back = rotations[turned].transpose(0, 2, 1)
     rotations, information, pairs = rotations.copy(), information.copy(), np.sort(pairs, axis=1)

@@ -23,11 +23,11 @@ class AveragedRotations(Displayed):
     of pairs as independent; what they share, as errors of the calibration, comes on top. Infinite where the
     pairs that agree do not tie the image to the largest part of the others, NaN without rotation."""
     agreements: FloatArray
-    """(n,) of the weight of each image's pairs, the share that agrees within 5 deg; NaN where it has none."""
+    """(n,) share of the weight of each image's pairs that agrees within 5 degrees; NaN without pairs."""
     best_agreements: FloatArray
     """(n,) the largest such share in any answer that was tried."""
     share: float
-    """Of the weight of all pairs of registered images: what agrees within 5 deg."""
+    """Share of the weight of all pairs of registered images that agrees within 5 degrees."""
     num_pairs: int
     """Pairs whose residuals count in the answer."""
     num_tried: int = 1

@@ -85,13 +85,10 @@ def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
 
 
 @kernel
-def weigh_pairs(
-    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, found: Any, gradient: Any
+def reweigh_pairs(
+    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, robust: Any, gradient: Any
 ) -> None:
-    """Fill the robust weights (k,) and the gradient D^T W x (n, 3).
-
-    The robust weight is weights[e] / (1 + (|x| / scale)^2)^2.
-    """
+    """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and the gradient D^T W x (n, 3)."""
     x = np.empty(3)
     for i in range(len(gradient)):
         gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
@@ -100,7 +97,7 @@ def weigh_pairs(
         square = _world_residual(measured[e], turns[i], turns[j], x)
         loss = 1.0 + square / (scale * scale)
         w = weights[e] / (loss * loss)
-        found[e] = w
+        robust[e] = w
         for c in range(3):
             gradient[i, c] -= w * x[c]
             gradient[j, c] += w * x[c]
@@ -191,8 +188,7 @@ def follow_tree(order: Any, parents: Any, links: Any, pairs: Any, measured: Any,
         order: (t,) cameras, parents before children; a root has parent -1, and its rotation is given.
         parents: (n,) parent of each camera.
         links: (n,) the pair that joins a camera with its parent.
-        pairs: (k, 2)
-        measured: (k, 4)
+        pairs, measured: (k, 2), (k, 4)
         turns: (n, 4) in place.
     """
     for k in range(len(order)):

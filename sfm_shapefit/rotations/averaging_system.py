@@ -28,21 +28,18 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.rotations.averaging_kernels import apply_blocks, sum_blocks
 
 RIDGE = 1e-9
-"""Share of the mean diagonal that is added to it."""
+"""Share of the mean diagonal that is added to it; holds cameras whose pairs are all left out."""
 
-# A solve by conjugate gradients takes about a microsecond per pair, a factorization at 10 Gflop/s twice as
-# much at so many operations per pair.
+# Operations of a factorization per pair; at 10 Gflop/s as long as two solves by conjugate gradients, about a
+# microsecond per pair each.
 _FLOPS_PER_PAIR = 20_000.0
-# Factors that take less than a tenth of a second are worth it whatever the pairs.
-_FEW_FLOPS = 1e9
-_BLOCK_FLOPS = 27.0
-# Ordering graphs of more nodes is worth it only if a diagonal is no good preconditioner.
-_MANY_NODES = 3_000
-_JACOBI_STEPS = 12
-# A preconditioner that takes more steps is made anew for the next system.
-_STALE_STEPS = 25
-_MAX_STEPS = 300
-_SEED = 1
+_FEW_FLOPS = 1e9  # operations; a factor of so few takes a tenth of a second, and is worth it for any pairs
+_BLOCK_FLOPS = 27.0  # operations per scalar one; those of 3 x 3 blocks
+_MANY_NODES = 3_000  # nodes; more are worth ordering only if a diagonal is no good preconditioner
+_JACOBI_STEPS = 12  # steps; a graph that a diagonal solves in so few is an expander
+_STALE_STEPS = 25  # steps; a preconditioner that takes more is made anew for the next system
+_MAX_STEPS = 300  # conjugate gradient steps; a bound
+_SEED = 1  # seed of the preconditioner; same input, same answer
 
 
 @dataclass(slots=True, eq=False)
@@ -53,7 +50,7 @@ class AveragingSystem:
     pairs: IntArray
     """(k, 2)"""
     plan: SymbolicFactor | None
-    """Of the factors; None where no factor is small enough."""
+    """Plan of the factors; None where no factor is small enough."""
     factors_blocks: bool
     """Whether the factor of blocks is small enough too."""
     is_expander: bool
@@ -116,11 +113,7 @@ class AveragingSystem:
         return self._factors[block]
 
     def _refactor(self, blocks: FloatArray) -> None:
-        """Factor the matrix of blocks (k, b, b).
-
-        Raises:
-            UnsolvableError: if it is not positive definite to working precision.
-        """
+        """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
         factor = self._factor_of(b)
         diagonal = np.zeros((self.num_nodes, b, b))
@@ -154,12 +147,12 @@ class AveragingSystem:
                 self._preconditioner = self._factors[1]
             else:
                 self._preconditioner = approximate_cholesky(self.graph, weights, _SEED)
-        found = conjugate_gradients(
+        solution = conjugate_gradients(
             apply, self._preconditioner, right, tol=tol, max_iterations=_MAX_STEPS, coupled=coupled
         )
-        if found.iterations > _STALE_STEPS:
+        if solution.iterations > _STALE_STEPS:
             self._preconditioner = None
-        return found.x
+        return solution.x
 
 
 def plan_system(num_nodes: int, pairs: IntArray, weights: FloatArray, threads: int) -> AveragingSystem:

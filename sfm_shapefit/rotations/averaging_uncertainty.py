@@ -38,13 +38,13 @@ from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_kernels import sum_blocks
 from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
 
-_LOSS_FACTOR = 0.823
-_MEDIAN_SQUARE = 2.366
+_LOSS_FACTOR = 0.823  # c of the header; for Geman and McClure's loss at three medians
+_MEDIAN_SQUARE = 2.366  # median of chi2 with three degrees of freedom; scales residuals to v
 MOST_LEVERAGE = 0.9
-"""Pairs of a higher leverage say nothing of the residual scale."""
-_SAMPLES = 16
-_REDUCTION = 1e-2
-_SEED = 2
+"""Leverage above which a pair is left out of the residual scale: it hardly shows its residual."""
+_SAMPLES = 16  # samples of L^+; they serve the second, small part of the covariance
+_REDUCTION = 1e-2  # share of the residual that a sample may have; far below its own noise
+_SEED = 2  # seed of the samples; same input, same answer
 
 
 def estimate_sigmas(
@@ -59,9 +59,9 @@ def estimate_sigmas(
 
     Args:
         given: the pairs of n cameras.
-        system: of these.
-        last: at the answer.
-        references: (n,) whose mean turn counts as exact; all if None.
+        system: solver of these.
+        last: system at the answer.
+        references: (n,) cameras whose mean turn counts as exact; all if None.
     """
     references = np.ones(given.num_cameras, dtype=np.bool_) if references is None else references
     n, inside = given.num_cameras, _ties(given.num_cameras, last)

@@ -16,8 +16,8 @@ that is larger. At a stationary point S X = 0, so mu cannot be 0.
 In world axes, with E_e = R_j^T R_ij R_i, S has the blocks sum_e k_e sym(E_e) on the diagonal and -k_e E_e at
 (j, i): near the Laplacian of the weights. Where its factor is small, Cholesky decides. On expanders a few
 Lanczos steps find the smallest eigenvalue m on the complement of the null vectors N = 1 (x) I / sqrt(n); then
-lambda_min(S) >= -|S N|^2 / m, as N^T S N = 0 for any X. That it is the smallest that they find is not proved:
-only the answers of Cholesky are proofs to the last.
+lambda_min(S) >= -|S N|^2 / m, as N^T S N = 0 for any X. That it is the smallest is not proved: only the
+answers of Cholesky are proofs to the last.
 
 What it proves: of the pairs that are kept, with their final weights, no other rotations fit better. It does
 not say that these pairs are the right ones. The averaged rotations minimize a finer cost, with the full
@@ -41,16 +41,14 @@ from sfm_shapefit.rotations.annealing import LONGEST_STEP
 from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
 from sfm_shapefit.rotations.averaging_system import AveragingSystem
 
-_TOLERANCE = 1e-6
-# Rounding of the pivots of a factorization, as a share of the mean diagonal.
-_ROUNDING = 1e-13
-_MOST_FLOPS = 3e11
-_POLISHING_STEPS = 30
-_SETTLED = 1e-10
-_REDUCTION = 1e-3
-# Restarts of Lanczos' method; who has not settled by then is not certified, which is safe.
-_LANCZOS_STEPS = 300
-_SEED = 3
+_TOLERANCE = 1e-6  # mu relative to f(X) / 3n; see the header
+_ROUNDING = 1e-13  # share of the mean diagonal; rounding of a factorization's pivots
+_MOST_FLOPS = 3e11  # operations of a factorization; half a minute at 10 Gflop/s, more is not checked
+_POLISHING_STEPS = 30  # steps to the stationary point; a bound
+_SETTLED = 1e-10  # radians; a shorter step is the last
+_REDUCTION = 1e-3  # share of the residual that a polishing step may leave; the next one takes it
+_LANCZOS_STEPS = 300  # restarts of Lanczos' method; who has not settled is not certified, which is safe
+_SEED = 3  # seed of Lanczos' start; same input, same answer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +63,7 @@ class DualCertificate:
     cost: float
     """f at the stationary point next to the averaged rotations."""
     lower_bound: float
-    """Of the cost of any rotations; minus infinity if not certified."""
+    """Bound of the cost of any rotations; minus infinity if not certified."""
     distance_deg: float
     """How far that point is from the averaged rotations, as the largest turn of a camera."""
 
@@ -73,13 +71,10 @@ class DualCertificate:
 def certify_rotations(
     system: AveragingSystem, measured: FloatArray, weights: FloatArray, turns: FloatArray
 ) -> DualCertificate | None:
-    """Check the answer of a connected graph; None where that would take too long.
+    """Check the answer of a connected graph of k pairs; None where that would take too long.
 
-    Args:
-        system: of its k pairs.
-        measured: (k, 4) cam_j_from_cam_i.
-        weights: (k,) positive, the final ones.
-        turns: (n, 4) cam_from_world.
+    The weights (k,) are the final, positive ones of `measured` (k, 4), cam_j_from_cam_i; `turns` (n, 4) are
+    cam_from_world.
     """
     affordable = system.plan is not None and 27.0 * system.plan.flops <= _MOST_FLOPS
     if not (affordable or system.is_expander):

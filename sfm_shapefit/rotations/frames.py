@@ -21,13 +21,10 @@ from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotatio
 def relative_rotations_of_frames(
     relative: RelativeRotations, frame_of_image: IntArray, sensor_rotations: FloatArray
 ) -> RelativeRotations:
-    """Return the relative rotations of frames, each pair once.
+    """Return the relative rotations of frames, each pair once; pairs inside a frame say nothing of frames.
 
-    Args:
-        relative: of images; pairs inside a frame say nothing of frames.
-        frame_of_image: (n,) 0..f-1.
-        sensor_rotations: (n, 3, 3) sensor_from_rig of each image. Where each image is its own frame,
-            `relative` is the answer as it is.
+    `frame_of_image` is (n,) in 0..f-1, `sensor_rotations` (n, 3, 3) sensor_from_rig of each image. Where each
+    image is its own frame, `relative` is the answer as it is.
     """
     is_rigged = (frame_of_image != np.arange(len(frame_of_image))).any()
     if not (is_rigged or (sensor_rotations != np.eye(3)).any()):

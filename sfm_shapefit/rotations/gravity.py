@@ -38,21 +38,15 @@ from sfm_shapefit.rotations.averaging_uncertainty import MOST_LEVERAGE, estimate
 from sfm_shapefit.scene.given import Gravity
 
 DOWN = np.array([0.0, 0.0, -1.0])
-"""In axes of the world."""
+"""Direction of gravity in world axes: z points up."""
 
-# Gravities that are within so much of one another say the same of the world in the beginning.
-_VOTING = np.radians(10.0)
-# A gravity that is farther off has no part.
-_LIMIT = np.radians(45.0)
-# Rounds end when cameras have settled; each leaves about half of the way, so these are enough for rounding.
-_ROUNDS = 60
-# Share of the information about the axis of gravity, which it says nothing of, that keeps blocks definite.
-_ABOUT_DOWN = 1e-9
-# A gravity is wrong beyond so many of its standard deviations, or of the level of all.
-_WRONG_SIGMAS = 5.0
-# Median of the length of two normal components of variance 1.
-_MEDIAN_LENGTH = 1.1774
-FEWEST_GRAVITIES = 2
+_VOTING = np.radians(10.0)  # radians; gravities within this say the same of the world in the beginning
+_LIMIT = np.radians(45.0)  # radians; a gravity that is farther off has no part
+_ROUNDS = 60  # rounds, a bound; each leaves about half of the way to where cameras settle
+_ABOUT_DOWN = 1e-9  # share of the information; about the axis gravity has none, and blocks stay definite
+_WRONG_SIGMAS = 5.0  # own standard deviations, or levels of all; a gravity beyond is wrong
+_MEDIAN_LENGTH = 1.1774  # median length of two normal components; sqrt(2 ln 2)
+FEWEST_GRAVITIES = 2  # gravities; a single one has nothing to check it
 
 
 def down_of(rotations: FloatArray, gravity: Gravity) -> FloatArray:
@@ -93,23 +87,23 @@ def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gr
     """Return averaged rotations refined on pairs and gravities together, in a world whose z points up.
 
     Args:
-        averaged: of n images, by the pairs alone.
+        averaged: rotations of n images, by the pairs alone.
         given: the pairs, among these images.
-        gravity: of images that have a rotation; two at least, or the rotations are returned as they are.
+        gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
-    own = gravity.among(members)
-    if len(own.indices) < FEWEST_GRAVITIES:
+    gravities = gravity.among(members)
+    if len(gravities.indices) < FEWEST_GRAVITIES:
         return averaged
-    upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], own)).T
+    upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], gravities)).T
     inside: BoolArray = np.asarray(averaged.registered[given.pairs].all(axis=1))
-    kept = given.subset(inside)
-    pairs = np.ascontiguousarray(np.searchsorted(members, kept.pairs))
-    found = _refine(upright[members], replace(kept, num_cameras=len(members), pairs=pairs), own)
+    inner = given.subset(inside)
+    pairs = np.ascontiguousarray(np.searchsorted(members, inner.pairs))
+    refined = _refine(upright[members], replace(inner, num_cameras=len(members), pairs=pairs), gravities)
     rotations, sigmas = averaged.rotations.copy(), averaged.sigmas_deg.copy()
-    to_world = Rotation.from_quat(found.turns[:-1]) * Rotation.from_quat(found.turns[-1]).inv()
+    to_world = Rotation.from_quat(refined.turns[:-1]) * Rotation.from_quat(refined.turns[-1]).inv()
     rotations[members] = to_world.as_matrix()
-    sigmas[members] = np.degrees(_sigmas_of_cameras(found))
+    sigmas[members] = np.degrees(_sigmas_of_cameras(refined))
     return replace(averaged, rotations=rotations, sigmas_deg=sigmas, certified=None)
 
 
@@ -123,17 +117,17 @@ class _Refined(NamedTuple):
     system: AveragingSystem
 
 
-def _sigmas_of_cameras(found: "_Refined") -> FloatArray:
+def _sigmas_of_cameras(refined: "_Refined") -> FloatArray:
     """Return the standard deviations of the cameras per axis, in radians, (n,), relative to their mean turn.
 
     The world has no part in that mean: how it is turned about gravity nothing says. It becomes the first
     node, since the system is grounded at the last one, and all is known relative to a camera.
     """
-    n = found.graph.num_cameras
-    pairs = np.ascontiguousarray(np.sort((found.graph.pairs + 1) % n, axis=1))
-    system = plan_system(n, pairs, np.sqrt(found.graph.supports), found.system.threads)
+    n = refined.graph.num_cameras
+    pairs = np.ascontiguousarray(np.sort((refined.graph.pairs + 1) % n, axis=1))
+    system = plan_system(n, pairs, np.sqrt(refined.graph.supports), refined.system.threads)
     is_camera = np.arange(n) > 0
-    return estimate_sigmas(replace(found.graph, pairs=pairs), system, found.last, is_camera)[1:]
+    return estimate_sigmas(replace(refined.graph, pairs=pairs), system, refined.last, is_camera)[1:]
 
 
 def _refine(upright: FloatArray, given: AveragingPairs, gravity: Gravity) -> _Refined:

@@ -1,8 +1,8 @@
 """Videos among the images of a database, and whether their loops are to be believed.
 
-Frames of a video are named by a running number. Those next to one another share most of what they see: such
-pairs are hardly ever false. A pair of frames far apart in time is a loop where the camera came back, or
-repeated structure where it did not.
+Frames of a video are named by a running number. Neighbors share most of what they see, and are hardly ever
+false pairs. A pair of frames far apart in time is a loop where the camera came back, or repeated structure
+where it did not.
 
     reach     of a frame: the last one that strong pairs of it lead to without a gap in time
     neighbor  a pair within the reach of one of its frames; a loop pair otherwise
@@ -11,8 +11,7 @@ repeated structure where it did not.
 
 A loop pair agrees with the chain if its relative rotation is that of the chain within its uncertainty. A
 visit is taken if most of its matches are of pairs that agree, and then only these pairs are: what agrees with
-the chain agrees with one another. Of the pairs refused so, against the truth: castle-P30 33 of 33 are wrong,
-kitti-turn 1 of 1; of those taken on castle-P30, none of 37.
+the chain agrees with one another. Checked on `scripts/results/notes.md#loops-of-videos`.
 """
 
 import re
@@ -29,22 +28,16 @@ from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotatio
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
-# Of so many digits at most, as Python reads no integer of more than 4,300.
+# A running number and what surrounds it; at most 255 digits, as Python reads no integer of more than 4,300.
 _LAST_NUMBER = re.compile(r"^(.*?)(\d{1,255})(\D*)$", re.DOTALL)
-# Fewer images with running numbers are no video.
-_FEWEST_FRAMES = 10
-# Of successive frames, the share that must be matched, and how many times more matches these pairs have than
-# pairs that are farther apart, on average.
+_FEWEST_FRAMES = 10  # images with running numbers; fewer are no video
+# Share of successive frames that must be matched, and how many times more matches these pairs have than pairs
+# that are farther apart: a folder of numbered photographs is no video.
 _MATCHED_SHARE, _MORE_MATCHES = 0.8, 2.0
-# Matching takes the next frames, and then some whose distances double: a wider gap ends a frame's reach.
-_STEP, _DOUBLING = 10, 2.0
-# Of the matches of successive frames, the share that extends a frame's reach: with all pairs matched, false
-# ones are at every distance.
-_STRONG_SHARE = 0.1
-# Frames so near in time are of one visit.
-_NEAR = 10
-# Standard deviations that a loop may be off the chain, which drifts so many degrees a frame besides.
-_MOST_SIGMAS, _DRIFT_DEG = 5.0, 0.02
+_STEP, _DOUBLING = 10, 2.0  # frames, and ratio of distances; matching takes the next, then some that double
+_STRONG_SHARE = 0.1  # share of the matches of successive frames; false pairs have fewer, at every distance
+_NEAR = 10  # frames; so near in time they are of one visit
+_MOST_SIGMAS, _DRIFT_DEG = 5.0, 0.02  # deviations of a loop from the chain, degrees a frame; it drifts
 
 
 class Videos(NamedTuple):
@@ -79,11 +72,11 @@ class Visit:
     first: tuple[int, int]
     """The first and the last image of the earlier stretch."""
     second: tuple[int, int]
-    """Those of the later one."""
+    """The first and the last image of the later one."""
     num_pairs: int
     num_matches: int
     num_refused: int
-    """Of its pairs: all, or those that do not agree with the chain."""
+    """Number of its pairs that were refused: all, or those that do not agree with the chain."""
     angle_deg: float
     """Median angle between the relative rotations of its pairs and those of the chain."""
     tolerance_deg: float
@@ -105,7 +98,7 @@ class Loops(NamedTuple):
 
 
 def find_videos(names: Sequence[str]) -> Videos:
-    """Return the videos that names tell: ten images or more that only differ by their last number."""
+    """Return the videos among names: ten images or more that only differ by their last number."""
     groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for image, name in enumerate(names):
         found = _LAST_NUMBER.match(name)
@@ -136,13 +129,7 @@ def confirm_videos(videos: Videos, relative: RelativeRotations) -> Videos:
 
 
 def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -> Loops:
-    """Return which loops agree with the chain of neighbors; pairs of other images are not judged.
-
-    Args:
-        videos: among n images.
-        relative: pairs of these.
-        threads: of the averaging.
-    """
+    """Return which loops of videos agree with the chain of neighbors; other pairs are not judged."""
     is_loop = loop_pairs(videos, relative)
     visits: list[Visit] = []
     refused = [np.zeros(0, dtype=np.int64)]
@@ -158,8 +145,8 @@ def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -
         except UnsolvableError:
             continue
         angles, tolerances = _compare(videos, averaged, relative.subset(loops))
-        known = np.isfinite(angles)
-        loops, angles, tolerances = loops[known], angles[known], tolerances[known]
+        finite = np.isfinite(angles)
+        loops, angles, tolerances = loops[finite], angles[finite], tolerances[finite]
         found = _judge_visits(videos, relative.subset(loops), angles, tolerances)
         visits += found[0]
         refused.append(loops[found[1]])

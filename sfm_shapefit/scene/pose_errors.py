@@ -13,22 +13,21 @@ Q_k, ATE is the distance of the centers, and RPE the translation and the angle o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, rotation_angles_deg
+from sfm_shapefit.base.record import Record
 
-MAX_PAIRS = 2_000_000
+MOST_COMPARED_PAIRS = 2_000_000
 """Of more pairs so many are drawn, by a fixed seed."""
 # Cameras that are closer, relative to the extent of all, have no direction from one to the other.
 _COINCIDENT = 1e-9
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorSummary:
+class ErrorSummary(Record):
     """Statistics of one kind of error over the common cameras."""
 
     median: Annotated[float, "Of all errors."]
@@ -37,8 +36,7 @@ class ErrorSummary:
     max: Annotated[float, "The largest error."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryErrors:
+class TrajectoryErrors(Record):
     """Errors of cameras that follow one another in the order of their names, as evo defines them."""
 
     ate: Annotated[ErrorSummary, "Absolute trajectory error, in the reference's units."]
@@ -46,7 +44,7 @@ class TrajectoryErrors:
     rpe_rotation_deg: Annotated[ErrorSummary, "Angle of the relative pose error of neighbors."]
 
 
-class Poses(NamedTuple):
+class ComparedPoses(NamedTuple):
     """n cameras."""
 
     rotations: FloatArray
@@ -54,9 +52,9 @@ class Poses(NamedTuple):
     centers: FloatArray
     """(n, 3) in world axes."""
 
-    def taken(self, order: IntArray) -> "Poses":
+    def taken(self, order: IntArray) -> "ComparedPoses":
         """Return some of the cameras, in another order."""
-        return Poses(self.rotations[order], self.centers[order])
+        return ComparedPoses(self.rotations[order], self.centers[order])
 
 
 def summarize_errors(errors: FloatArray) -> ErrorSummary:
@@ -89,8 +87,8 @@ def area_under_recall(errors: FloatArray, num_missing: int, thresholds: Sequence
     return areas
 
 
-def relative_pose_errors(model: Poses, reference: Poses, extent: float) -> FloatArray:
-    """Return the error of each pair of n corresponding cameras in degrees, at most `MAX_PAIRS` of them.
+def relative_pose_errors(model: ComparedPoses, reference: ComparedPoses, extent: float) -> FloatArray:
+    """Return the error of each pair of n cameras in degrees, of at most `MOST_COMPARED_PAIRS` pairs.
 
     Args:
         model, reference: the same cameras in two worlds.
@@ -112,10 +110,10 @@ def relative_pose_errors(model: Poses, reference: Poses, extent: float) -> Float
     return np.asarray(errors)
 
 
-def trajectory_errors(model: Poses, reference: Poses) -> TrajectoryErrors:
+def trajectory_errors(model: ComparedPoses, reference: ComparedPoses) -> TrajectoryErrors:
     """Return ATE and RPE of n corresponding cameras in the order of time."""
     onto = fit_similarity(model.centers, reference.centers)
-    moved = Poses(model.rotations @ onto.rotation.T, onto.apply(model.centers))
+    moved = ComparedPoses(model.rotations @ onto.rotation.T, onto.apply(model.centers))
     turns, shifts = [], []
     for poses in (moved, reference):
         before, after = poses.rotations[:-1], poses.rotations[1:]
@@ -130,12 +128,12 @@ def trajectory_errors(model: Poses, reference: Poses) -> TrajectoryErrors:
 
 def _pairs(n: int) -> tuple[IntArray, IntArray]:
     """Return the cameras of all pairs i < j of n, or of as many as are looked at."""
-    if n * (n - 1) // 2 <= MAX_PAIRS:
+    if n * (n - 1) // 2 <= MOST_COMPARED_PAIRS:
         first, second = np.triu_indices(n, 1)
         return first, second
     rng = np.random.default_rng(0)
-    first = rng.integers(0, n, MAX_PAIRS)
-    second = (first + rng.integers(1, n, MAX_PAIRS)) % n
+    first = rng.integers(0, n, MOST_COMPARED_PAIRS)
+    second = (first + rng.integers(1, n, MOST_COMPARED_PAIRS)) % n
     return np.minimum(first, second), np.maximum(first, second)
 
 

@@ -1,5 +1,4 @@
-"""The core: solvers of the ShapeFit program, and the certificate of what they return.
+"""The core: solvers of the ShapeFit program (`solve.solve`), and the certificate of what they return.
 
-No input or output, no log, no random draw. `solve.solve` is the entry;
-`certificate.certify` trusts no solver.
+No input or output, no log, no random draw. `certificate.certify` trusts no solver.
 """

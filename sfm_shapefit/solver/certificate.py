@@ -5,10 +5,9 @@ metric of its own for every edge, that restores D^T y = lambda c,
 
     y' = y - S D h,    (D^T S D) h = D^T y - lambda c,    lambda = <y, D T> / <c, T>,
 
-and divided by max(1, max_e ||y'_e|| / w_e), which keeps the equality since both constraints are
-homogeneous. Then no locations have an objective below lambda / max(...). The choice of lambda makes
-the right-hand side orthogonal to T, the one direction in which D^T S D is nearly singular when the
-data are nearly exact.
+and divided by max(1, max_e ||y'_e|| / w_e), which keeps the equality since both constraints are homogeneous.
+Then no locations have an objective below lambda / max(...). The choice of lambda makes the right-hand side
+orthogonal to T, the one direction in which D^T S D is nearly singular when the data are nearly exact.
 
 The division is what costs: one pair that is moved out of its ball by 1 % lowers the bound by 1 %. So
 
@@ -64,39 +63,31 @@ _ROUND_REDUCTION = 0.1
 # misses what was asked for in any case.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
 RESIDUAL_FLOOR = 0.1
-"""The least residual, relative to the mean one, that the metric takes seriously."""
+"""Least residual that the metric takes seriously, relative to the mean one; exact pairs have none."""
 
-# The share of the metric across the surface of a ball that is taken away.
-_ALONG_SURFACE = 0.97
-# A pair counts as on the surface of its ball from this ||y_e|| / w_e on.
-_ON_SURFACE = 0.99
+_ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away; see above
+_ON_SURFACE = 0.99  # ||y_e|| / w_e; from here on a pair counts as on the surface of its ball
 REPAIRS = 4
-"""Each repair shrinks the equality residual to the rounding of the previous one."""
+"""Number of repairs: each shrinks the equality residual to the rounding of the previous one."""
 
-# Conjugate gradients need 10 to 60 steps on all but long chains.
-_CG_STEPS = 500
-# From so many pairs on, the passes over them run by so many blocks, on several threads.
-_LARGE, _EDGE_BLOCKS = 200_000, 4
-_SEED = 1
-# An equality residual of so much per gap needs no repair, for the bound moves by 100 times it; within limits.
-_EXACT_PER_GAP = 1e-5
-_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10
+_CG_STEPS = 500  # conjugate gradient steps; 10 to 60 are needed on all but long chains
+_LARGE, _EDGE_BLOCKS = 200_000, 4  # pairs, and blocks; passes over more pairs run in parallel blocks
+_SEED = 1  # seed of the preconditioner; same input, same answer
+_EXACT_PER_GAP = 1e-5  # equality residual per gap; it needs no repair, for the bound moves by 100 times it
+_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of that residual; rounding, and what a bound may rest on
 # The rounds end where the gap is expected below this share of the one asked for. The exact repair is expected
 # to multiply the present excess by the second number: by 4 on boxes, by 1 to 2 on communities.
 _ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
-# No bound may rest on a larger equality residual, relative to the largest degree.
-_UNREPAIRED = 1e-9
+_UNREPAIRED = 1e-9  # equality residual relative to the largest degree; no bound may rest on a larger one
 STRICT = 1e-3
-"""A pair counts as held by its fit if ||y_e|| < (1 - this) w_e."""
+"""Relative distance of ||y_e|| from w_e; a pair that is farther inside its ball counts as held by its fit."""
 
 REGULAR = 1e-9
-"""A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this."""
+"""Least pivot of a regular matrix, relative to its diagonal entry; far above rounding."""
 
-# In single precision it must be far above the rounding of the factor, n d eps.
-_REGULAR_SINGLE = 1e-3
-# From so many unknowns on a factor in single precision is tried first.
-_SINGLE_FROM = 450
-# Uniqueness is not examined beyond so many pairs, whose ordering alone takes seconds, or so many operations.
+_REGULAR_SINGLE = 1e-3  # likewise in single precision; far above the rounding of the factor, n d eps
+_SINGLE_FROM = 450  # unknowns; from here on a float32 factor is tried first, which is faster
+# Pairs and operations; beyond, uniqueness is not examined: the ordering of more pairs alone takes seconds.
 _UNIQUENESS_EDGES, _UNIQUENESS_FLOPS = 500_000, 1e11
 
 
@@ -140,7 +131,7 @@ def certify(
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        threads: of a repair; the bound does not depend on it.
+        threads: threads of a repair; the bound does not depend on them.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.

@@ -27,30 +27,24 @@ from sfm_shapefit.solver.program import scale_functional
 if TYPE_CHECKING:  # rigs.solve calls this solver
     from sfm_shapefit.graph.groups import RigidGroups
 
-# The least tolerance that double precision can still serve.
-_LEAST_CONE_TOL = 1e-12
+_LEAST_CONE_TOL = 1e-12  # tolerance of the cone solver; double precision serves no smaller one
 # The cone solver's tolerance per tolerance of ours: its own gap is relative to an inexact dual.
 _CONE_TOL_PER_TOL = 1e-3
-# Factors on the cone solver's tolerance, tried in turn until it returns a point.
-_LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)
+_LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)  # on the tolerance; tried in turn until a point is returned
 
 
 def solve_conic(
     graph: ViewGraph, tol: float, max_iterations: int, groups: "RigidGroups | None" = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with cvxpy and Clarabel.
+    """Solve the program with cvxpy and Clarabel; return locations (n, d), approximate dual (m, d), and steps.
+
+    UnsolvableError if the cone solver returns no point at all.
 
     Args:
         graph: a connected, parallel-rigid view graph.
         tol: the certified gap wanted.
         max_iterations: limit of interior-point steps.
-        groups: of its nodes, where the program is that over groups; no pair may lie inside one.
-
-    Returns:
-        locations (n, d), the approximate dual (m, d), and the number of interior-point steps.
-
-    Raises:
-        UnsolvableError: if the cone solver returns no point at all.
+        groups: groups of its nodes, where the program is that over groups; no pair may lie inside one.
     """
     import cvxpy as cp
 

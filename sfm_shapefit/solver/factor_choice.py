@@ -5,12 +5,10 @@ from collections.abc import Callable
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 FEW_UNKNOWNS = 450
-"""Up to so many unknowns a sparse factor does not pay, whatever the graph."""
+"""Unknowns up to which a sparse factor does not pay; whatever the graph."""
 
-# Beyond so many unknowns a dense factor takes seconds.
-_MOST_DENSE_UNKNOWNS = 1800
-# From this share of all pairs on, no order of elimination saves much.
-_DENSE_SHARE = 0.3
+_MOST_DENSE_UNKNOWNS = 1800  # unknowns; beyond, a dense factor takes seconds
+_DENSE_SHARE = 0.3  # share of all pairs; from here on no order of elimination saves much
 
 
 def prefers_dense_factor(graph: ViewGraph, predict_flops: Callable[[], float]) -> bool:

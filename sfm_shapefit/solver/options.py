@@ -1,7 +1,4 @@
-"""What the solver is told and what it answers: `SolverOptions`, `Status`, `SolverResult`.
-
-Pure data, no numerics, so that the command line, the tests and the benchmark can import it cheaply.
-"""
+"""What the solver is told and what it answers: data alone, cheap to import."""
 
 import enum
 import os
@@ -18,7 +15,7 @@ if TYPE_CHECKING:  # numpy is not cheap
 Solver = Literal["auto", "newton", "admm", "conic"]
 
 NO_FACTOR = 0
-"""The `factor_memory_mb` with which nothing is factored that can be left out."""
+"""Megabytes for `factor_memory_mb`: nothing is factored that can be left out."""
 
 MAX_THREADS = 256
 """Threads that may be asked for; work is cut into as many shares, so that millions would never end."""

@@ -75,8 +75,7 @@ def objective(graph: ViewGraph, t: FloatArray) -> float:
 def normalize_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
     """Return `t` centered and scaled so that L(T) = kappa = sum of the weights.
 
-    Raises:
-        UnsolvableError: if they are not finite or point against the directions.
+    UnsolvableError if they are not finite or point against the directions.
     """
     centered: FloatArray = t - t.mean(axis=0)
     length = projected_length(graph, centered)

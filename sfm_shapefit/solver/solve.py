@@ -22,16 +22,13 @@ from sfm_shapefit.solver.program import normalize_locations, scale_functional
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 
-# The scale constraint says nothing where c is smaller than this, relative to the sum of weights.
-_DIRECTIONS_CANCEL = 1e-9
-# The bound is not to be called rigorous where the dual violates its equality by more.
-_LARGEST_RESIDUAL = 1e-9
+_DIRECTIONS_CANCEL = 1e-9  # c relative to the sum of weights; smaller, the scale constraint says nothing
+_LARGEST_RESIDUAL = 1e-9  # violation of the dual's equality; with more a bound is not called rigorous
 _ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
-# From so many operations of one block factorization on, splitting is faster to the same gap.
-_LARGEST_NEWTON_FLOPS = 4e9
+_LARGEST_NEWTON_FLOPS = 4e9  # operations of one block factorization; from here on splitting is faster
 
 
-class Run(NamedTuple):
+class SolverRun(NamedTuple):
     """What a solver returns; the certificate decides what it is worth."""
 
     locations: FloatArray
@@ -46,7 +43,7 @@ class Choice(NamedTuple):
 
     method: str
     solve: Callable[[ViewGraph, float, int, OnIteration | None], tuple[Any, ...]]
-    """Takes the graph, the tolerance, the limit of iterations and a callback; returns what makes a `Run`."""
+    """From graph, tolerance, limit of iterations and callback to the fields of a `SolverRun`."""
     reason: str
 
 
@@ -98,16 +95,14 @@ def run_choice(
     prove: Callable[[FloatArray, FloatArray], Certificate],
     start: float,
 ) -> SolverResult:
-    """Run the chosen solver and return what it found; the solve began at `start`, by `time.perf_counter()`.
+    """Run the chosen solver and return its answer; the solve began at `start`, by `time.perf_counter()`.
 
     `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
-
-    Raises:
-        UnsolvableError: if the locations found are not finite or point against the directions.
+    UnsolvableError if the locations are not finite or point against the directions.
     """
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)
-    run = Run(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
+    run = SolverRun(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
     locations = normalize_locations(graph, run.locations)
     certificate = prove(locations, run.dual)
     status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
@@ -163,11 +158,11 @@ def _split(
     tol: float,
     limit: int,
     watch: OnIteration | None,
-) -> Run:
+) -> SolverRun:
     """Solve by splitting, and say how it ended."""
     found = solve_hybrid(graph, tol, limit, resources, prediction, watch)
     note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
-    return Run(found.locations, found.certificate.dual, found.iterations, note)
+    return SolverRun(found.locations, found.certificate.dual, found.iterations, note)
 
 
 def _refuse_undetermined(graph: ViewGraph) -> None:

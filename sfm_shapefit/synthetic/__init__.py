@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sfm_shapefit.synthetic.graphs import (
-        Corruption,
+        CorruptionKind,
         GraphProblem,
         Noise,
         box_graph_problem,
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 _HOMES = ("options", "graphs", "streets", "scenes", "rigs", "rendering")
 
 __all__ = [
-    "Corruption",
+    "CorruptionKind",
     "GraphProblem",
     "Noise",
     "RenderOptions",

@@ -22,7 +22,7 @@ Then ask for what you need, and compare with the truth:
         problem = random_graph(30, p=0.5, q=0.1)
         assert_locations_near(solve(problem.view_graph).locations, problem.locations, max_error=1e-6)
 
-What there is:
+The fixtures:
 
 | fixture | what it is |
 |---|---|
@@ -77,19 +77,16 @@ def assert_reconstruction_near(
 ) -> None:
     """Fail unless a reconstruction has the true camera poses, up to a similarity.
 
-    Cameras are matched by name; the alignment is robust, so that one camera far off does not hide in it. At
-    least one of the limits must be given.
+    Cameras are matched by name; the alignment is robust, so that one camera far off does not hide in it.
+    Without any limit it raises ValueError; the failure names every limit that is exceeded, and the worst
+    camera.
 
     Args:
         found, truth: reconstructions or model folders.
-        max_error: of any placed camera's center, in units of the truth.
-        max_median_error: of the median placed camera's center, in units of the truth.
-        max_rotation_error_deg: of any placed camera's rotation.
+        max_error: limit for any placed camera's center, in units of the truth.
+        max_median_error: limit for the median placed camera's center, in units of the truth.
+        max_rotation_error_deg: limit for any placed camera's rotation.
         min_placed: the fraction of the true cameras that must be placed.
-
-    Raises:
-        AssertionError: naming every limit that is exceeded, and the worst camera.
-        ValueError: if no limit is given.
     """
     if max_error is None and max_median_error is None and max_rotation_error_deg is None:
         raise ValueError("give max_error, max_median_error or max_rotation_error_deg")
@@ -116,15 +113,10 @@ def assert_reconstruction_near(
 
 
 def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: float) -> None:
-    """Fail unless locations are the true ones up to shift and scale, as directions leave them.
+    """Fail unless locations (n, d) are the true ones up to shift and scale, as directions leave them.
 
-    Args:
-        found, truth: (n, d).
-        max_error: the paper's relative error: both centered and scaled to Frobenius norm 1, the norm of
-            their difference.
-
-    Raises:
-        AssertionError: with the error and the location that is farthest off.
+    `max_error` is the paper's relative error: both centered and scaled to Frobenius norm 1, the norm of their
+    difference. The failure names the location that is farthest off.
     """
     assert found.shape == truth.shape, f"locations have shape {found.shape}, the truth has {truth.shape}"
     one, two = (t - t.mean(axis=0) for t in (found, truth))

@@ -38,7 +38,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 Seed = int | np.random.Generator
-Corruption = Literal["uniform", "self-consistent", "concentrated"]
+CorruptionKind = Literal["uniform", "self-consistent", "concentrated"]
 
 
 class Noise(TypedDict, total=False):
@@ -50,7 +50,7 @@ class Noise(TypedDict, total=False):
     """Probability that a direction is a wrong one."""
     seed: Seed
     """An integer, or a Generator to draw from."""
-    corruption: Corruption
+    corruption: CorruptionKind
     """What wrong directions are like."""
 
 
@@ -83,8 +83,6 @@ def random_graph_problem(n: int, p: float = 0.5, d: int = 3, **noise: Unpack[Noi
         p: probability of each pair.
         d: dimension, at least 2.
         noise: `sigma`, `q`, `seed` and `corruption`, see `Noise`; the other families take them as well.
-
-    Source: Hand, Lee, Voroninski (2015), section 4.
     """
     rng = _rng(noise)
     locations = rng.standard_normal((n, d))
@@ -103,8 +101,7 @@ def expander_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise])
 def box_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
 
-    The model of an area mapped from a drone. About degree / 1.25 neighbors are taken, because the union of
-    the neighborhoods is larger than each of them.
+    About degree / 1.25 neighbors are taken, for the union of the neighborhoods is larger than each of them.
     """
     rng = _rng(noise)
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
@@ -118,9 +115,8 @@ def trajectory_graph_problem(
 ) -> GraphProblem:
     """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
 
-    The model of a video. A loop closure joins a random camera and one of its 60 nearest in space. The speed
-    varies smoothly, three times up and down, by the factor `speed_ratio`: equal steps are a cue that methods
-    with a bound on each length profit from by chance.
+    A loop closure joins a random camera and one of its 60 nearest in space. The speed varies smoothly, three
+    times up and down, by the factor `speed_ratio`: equal steps favor methods with a bound on each length.
     """
     rng = _rng(noise)
     heading = np.cumsum(0.15 * rng.standard_normal(n))
@@ -137,10 +133,7 @@ def trajectory_graph_problem(
 
 
 def ring_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
-    """Return cameras round a circle, a step of 1 apart, each joined to the next degree / 2, and 5 far links.
-
-    The model of a walk round a large building.
-    """
+    """Return cameras round a circle, 1 apart, each joined to the next degree / 2, and 5 far links."""
     rng = _rng(noise)
     angle = 2.0 * np.pi * np.arange(n) / n
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1) * n / (2.0 * np.pi)
@@ -155,10 +148,7 @@ def ring_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> 
 
 
 def lawn_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
-    """Return strips of 50 cameras, each joined to the next degree / 4 along and to as many across.
-
-    The model of an area mapped strip by strip with little overlap. Strips are 3 steps apart.
-    """
+    """Return strips of 50 cameras, 3 apart, each joined to the next degree / 4 along and across."""
     rng = _rng(noise)
     strip, place = np.divmod(np.arange(n), 50)
     locations = np.stack([place, 3.0 * strip, np.zeros(n)], axis=1) + 0.2 * rng.standard_normal((n, 3))
@@ -175,10 +165,9 @@ def lawn_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> 
 
 
 def corridor_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
-    """Return a corridor of about n / 2 cameras with 5 side branches.
+    """Return a corridor of about n / 2 cameras with 5 side branches, each of which hangs on its junction.
 
-    The model of a building's inside. Cameras within degree / 2 steps of one another are joined. Nothing
-    closes a loop: each branch hangs on its junction.
+    Cameras within degree / 2 steps of one another are joined. Nothing closes a loop.
     """
     rng = _rng(noise)
     length = n // 10
@@ -213,7 +202,7 @@ def _next_ones(n: int, degree: float) -> IntArray:
 def community_graph_problem(n: int, degree: float = 30.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
-    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). 93 % of the edges join cameras of one
     cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
     (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
     that the mean degree stays somewhat below `degree`.
@@ -253,8 +242,10 @@ def _rng(noise: Noise) -> np.random.Generator:
 def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, noise: Noise) -> GraphProblem:
     """Return the directions of `edges` with noise and corruption."""
     sigma, q, corruption = noise.get("sigma", 0.0), noise.get("q", 0.0), noise.get("corruption", "uniform")
-    if corruption not in get_args(Corruption):
-        raise ValueError(f"corruption must be one of {', '.join(get_args(Corruption))}, got {corruption!r}")
+    if corruption not in get_args(CorruptionKind):
+        raise ValueError(
+            f"corruption must be one of {', '.join(get_args(CorruptionKind))}, got {corruption!r}"
+        )
     right = noisy_directions(locations, edges, sigma, rng)
     wrong = normalized(rng.standard_normal(right.shape))
     odds = np.full(len(edges), q) if corruption != "concentrated" else _odds_by_degree(edges, q)

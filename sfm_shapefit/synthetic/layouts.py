@@ -18,7 +18,7 @@ from sfm_shapefit.synthetic.options import SceneOptions, Shape
 ByteArray = npt.NDArray[np.uint8]
 
 FARTHEST_M = 40.0
-"""Surface texture is too small to be detected beyond."""
+"""Meters from a camera to a surface; beyond, its texture is too small to be detected."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +48,7 @@ class SceneCameras:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Layout:
+class SceneLayout:
     """Surfaces and cameras, before any photograph."""
 
     centers: FloatArray
@@ -63,7 +63,7 @@ class Layout:
     """(p, 3) red, green, blue."""
 
 
-def _ring(n: int, p: int, rng: np.random.Generator) -> Layout:
+def _ring(n: int, p: int, rng: np.random.Generator) -> SceneLayout:
     """Cameras on a circle of 4 m around a ball of 1.4 m, all looking at it."""
     angle = 2.0 * np.pi * (np.arange(n) + rng.uniform(-0.2, 0.2, n)) / n
     radius = rng.uniform(3.8, 4.4, n)
@@ -71,7 +71,7 @@ def _ring(n: int, p: int, rng: np.random.Generator) -> Layout:
     target = rng.uniform(-0.15, 0.15, (n, 3))
     outward = normalized(rng.standard_normal((p, 3)))
     longitude = np.arctan2(outward[:, 1], outward[:, 0])
-    return Layout(
+    return SceneLayout(
         centers=centers,
         rotations=looking_along(target - centers),
         points=outward * rng.uniform(1.35, 1.45, (p, 1)),
@@ -80,7 +80,7 @@ def _ring(n: int, p: int, rng: np.random.Generator) -> Layout:
     )
 
 
-def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
+def _facade(n: int, p: int, rng: np.random.Generator) -> SceneLayout:
     """A grid of cameras, 2 m apart, 10 m before a wall with 1 m of relief."""
     columns = int(np.ceil(np.sqrt(n)))
     column, row = np.arange(n) % columns, np.arange(n) // columns
@@ -89,7 +89,7 @@ def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
     forward = np.array([0.0, 1.0, 0.0]) + 0.1 * rng.standard_normal((n, 3))
     along = rng.uniform(-4.0, 2.0 * columns + 2.0, p)
     height = rng.uniform(0.0, 2.0 * float(row.max()) + 7.0, p)
-    return Layout(
+    return SceneLayout(
         centers=centers,
         rotations=looking_along(forward),
         points=np.stack([along, rng.uniform(-0.5, 0.5, p), height], axis=1),
@@ -98,7 +98,7 @@ def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
     )
 
 
-def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
+def _drive(n: int, p: int, rng: np.random.Generator) -> SceneLayout:
     """Cameras every 1.5 m on a winding street, looking ahead; facades 7 m left and right, and the ground."""
     at = 1.5 * np.arange(n)
     road, ahead, left = street(at)
@@ -116,7 +116,7 @@ def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     normals = np.where(on_ground[:, None], [0.0, 0.0, 1.0], -side[:, None] * across)
     walls = _draw_board(along / 2.0, height / 1.5, (188, 143, 110), (84, 96, 112), rng)
     asphalt = _draw_board(along / 3.0, lateral / 3.0, (96, 96, 96), (120, 120, 118), rng)
-    return Layout(
+    return SceneLayout(
         centers=centers,
         rotations=looking_along(ahead + 0.02 * rng.standard_normal((n, 3))),
         points=points,
@@ -134,12 +134,12 @@ def street(along_m: npt.NDArray[np.floating]) -> tuple[FloatArray, FloatArray, F
     return position, ahead, np.stack([-ahead[:, 1], ahead[:, 0], zero], axis=1)
 
 
-def _cloud(n: int, p: int, rng: np.random.Generator) -> Layout:
+def _cloud(n: int, p: int, rng: np.random.Generator) -> SceneLayout:
     """Cameras 4 to 7 m around a Gaussian cloud, with random roll; each point faces a random way."""
     centers = rng.uniform(4.0, 7.0, (n, 1)) * normalized(rng.standard_normal((n, 3)))
     target = 0.3 * rng.standard_normal((n, 3))
     points = rng.standard_normal((p, 3))
-    return Layout(
+    return SceneLayout(
         centers=centers,
         rotations=looking_along(target - centers, up=rng.standard_normal((n, 3))),
         points=points,
@@ -148,7 +148,7 @@ def _cloud(n: int, p: int, rng: np.random.Generator) -> Layout:
     )
 
 
-def _courtyard(n: int, p: int, rng: np.random.Generator) -> Layout:
+def _courtyard(n: int, p: int, rng: np.random.Generator) -> SceneLayout:
     """Cameras around the inside of a yard, 24 by 18 m, looking across at four facades and the ground."""
     half = np.array([12.0, 9.0])
     angle = 2.0 * np.pi * (np.arange(n) + rng.uniform(-0.3, 0.3, n)) / n
@@ -168,7 +168,7 @@ def _courtyard(n: int, p: int, rng: np.random.Generator) -> Layout:
     along = np.where(wall < 2, flat[:, 0], flat[:, 1])
     bricks = _draw_board(along / 1.5, flat[:, 2] / 1.5, (178, 102, 78), (226, 205, 170), rng)
     paving = _draw_board(flat[:, 0] / 2.0, flat[:, 1] / 2.0, (128, 128, 120), (150, 150, 140), rng)
-    return Layout(
+    return SceneLayout(
         centers=centers,
         rotations=looking_along(forward),
         points=points,
@@ -177,7 +177,7 @@ def _courtyard(n: int, p: int, rng: np.random.Generator) -> Layout:
     )
 
 
-LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], Layout]] = {
+LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], SceneLayout]] = {
     "ring": _ring,
     "facade": _facade,
     "drive": _drive,
@@ -187,7 +187,7 @@ LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], Layout]] = {
 """By shape: (number of images, number of points, generator) -> layout."""
 
 
-def lay_out_scene(options: SceneOptions, rng: np.random.Generator) -> tuple[Layout, Rigs]:
+def lay_out_scene(options: SceneOptions, rng: np.random.Generator) -> tuple[SceneLayout, Rigs]:
     """Return the layout of a scene, each camera of its shape replaced by a frame of the rig, and that rig."""
     rigs = mounted(options.rig, options.num_images)
     layout = LAYOUTS[options.shape](len(rigs.rig_of_frame), options.num_points, rng)
@@ -218,10 +218,7 @@ def turn_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Gener
 
 
 def looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:
-    """Return cam_from_world (n, 3, 3) of cameras that look along `forward` (n, 3), `up` upwards.
-
-    Up is z if None. The rows are the camera's axes in the world: x to the right, y down, z ahead.
-    """
+    """Return cam_from_world, rows right, down, ahead, of cameras along `forward` (n, 3); up is z if None."""
     ahead = normalized(forward)
     upward = np.broadcast_to([0.0, 0.0, 1.0], ahead.shape) if up is None else up
     right = normalized(np.cross(ahead, upward))

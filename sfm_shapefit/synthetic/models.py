@@ -19,7 +19,7 @@ from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import ModelContent
 
 
-class Points(NamedTuple):
+class ModelPoints(NamedTuple):
     """The points of a model."""
 
     ids: IntArray
@@ -49,14 +49,14 @@ def new_rigs(rigs: Rigs, camera: pycolmap.Camera) -> tuple[list[pycolmap.Camera]
     for r in range(count):
         rig = pycolmap.Rig(rig_id=r + 1)
         for s in range(sensors):
-            own = copy.copy(camera)
-            own.camera_id = r * sensors + s + 1
-            cameras.append(own)
+            mounted = copy.copy(camera)
+            mounted.camera_id = r * sensors + s + 1
+            cameras.append(mounted)
             if s == 0:
-                rig.add_ref_sensor(own.sensor_id)
+                rig.add_ref_sensor(mounted.sensor_id)
             else:
                 rotation = rigs.sensor_rotations[r, s]
-                rig.add_sensor(own.sensor_id, rigid(rotation, -rotation @ rigs.sensor_centers[r, s]))
+                rig.add_sensor(mounted.sensor_id, rigid(rotation, -rotation @ rigs.sensor_centers[r, s]))
         made.append(rig)
     return cameras, made
 
@@ -95,7 +95,7 @@ class ModelParts(NamedTuple):
     camera: pycolmap.Camera
     keypoints: Sequence[FloatArray]
     """Per image, (k, 2)."""
-    points: Points | None
+    points: ModelPoints | None
 
     def model(self, rotations: FloatArray) -> pycolmap.Reconstruction:
         """Return the model with the given rotations at the true centers."""

@@ -29,7 +29,7 @@ class Rigs:
     sensor_rotations: FloatArray
     """(rigs, sensors, 3, 3) sensor_from_rig."""
     sensor_centers: FloatArray
-    """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
+    """(rigs, sensors, 3) place of each sensor in its rig, in meters; 0 for the reference."""
 
     def rotations_of(self, frame_rotations: FloatArray) -> FloatArray:
         """Return cam_from_world (n, 3, 3) of the images from rig_from_world (f, 3, 3) of their frames."""
@@ -52,13 +52,7 @@ def mounted(kind: RigKind, num_images: int) -> Rigs:
 
 
 def rigs_of(num_frames: int, yaw_deg: FloatArray, offsets_m: FloatArray) -> Rigs:
-    """Return one rig and its frames.
-
-    Args:
-        num_frames: in each of which all sensors take an image.
-        yaw_deg: (s,) where each sensor looks, counted to the left of ahead.
-        offsets_m: (s, 3) where it stands in the rig.
-    """
+    """Return one rig, sensors turned left by `yaw_deg` and at `offsets_m`, and its frames, all complete."""
     count = len(yaw_deg)
     return Rigs(
         rig_of_frame=np.zeros(num_frames, dtype=np.int64),
@@ -70,10 +64,7 @@ def rigs_of(num_frames: int, yaw_deg: FloatArray, offsets_m: FloatArray) -> Rigs
 
 
 def yawed(yaw_deg: FloatArray) -> FloatArray:
-    """Return sensor_from_rig rotations (s, 3, 3) of sensors that look so far to the left of ahead.
-
-    They turn about the rig's y axis, which points down.
-    """
+    """Return sensor_from_rig rotations (s, 3, 3) of sensors turned to the left about the rig's y axis."""
     yaw = np.radians(yaw_deg)
     cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
     rows = [[cosine, zero, sine], [zero, one, zero], [-sine, zero, cosine]]

@@ -1,7 +1,4 @@
-"""What to photograph and what to write of it: `SceneOptions`, `WorkspaceOptions`.
-
-Pure data, and cheap to import: the command line makes its flags of them.
-"""
+"""What to photograph and what to write of it: data alone, cheap to import, as flags are made of it."""
 
 import math
 from dataclasses import dataclass

@@ -5,10 +5,10 @@
     OUT/sparse/0       the model: what `sfm-shapefit locate` is given
     OUT/truth          the exact model, where sparse/0 is not it
 
-Nothing about keypoints and matches is made up: they err, miss and mistake one house for another as they do
-for photographs. What is known is the truth: the surface point under every keypoint, and so of every match
-whether it is right (`judge_matches`). The points of the exact model are those surface points, joined along
-right matches. On the CPU and with a seed, all of it is the same on every run, byte by byte.
+Keypoints and matches err, miss and mistake one house for another as they do for photographs. The truth is
+known: the surface point under every keypoint, and so whether a match is right (`judge_matches`). The points
+of the exact model are those surface points, joined along right matches. On the CPU and with a seed, all of it
+is the same on every run, byte by byte.
 """
 
 from contextlib import closing
@@ -27,7 +27,7 @@ from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.scene.matches import MatchBatch, Reading
 from sfm_shapefit.synthetic.models import (
     ModelParts,
-    Points,
+    ModelPoints,
     image_name,
     new_camera,
     new_images,
@@ -38,9 +38,8 @@ from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
 from sfm_shapefit.synthetic.workspace import compact_database
 
-# A right match is off by no more: this is COLMAP's own limit for inliers.
-_LARGEST_ERROR_PX = 4.0
-_POINT_GRAY = 160
+_LARGEST_ERROR_PX = 4.0  # pixels; COLMAP's own limit for inliers, a right match is off by no more
+_POINT_GRAY = 160  # gray value of a point; its color in the pictures is not looked up
 _NO_MATCHES = MatchBatch(
     pairs=np.empty((0, 2), dtype=np.int64),
     offsets=np.zeros(1, dtype=np.int64),
@@ -73,12 +72,10 @@ def write_rendered_workspace(
 
     Args:
         scene: what to photograph.
-        out: a folder that does not exist yet; its parents are made.
+        out: a folder that does not exist yet; its parents are made. InputError if it exists or cannot be
+            written.
         options: what stands in it; the defaults if None. Without `database` nothing is matched, and the model
             has poses but no points.
-
-    Raises:
-        InputError: if `out` exists or cannot be written.
     """
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
@@ -96,15 +93,12 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     """Tell right from wrong among the inlier matches of a database of the scene's images.
 
     A match is right if the surface point under its keypoint in either image projects to within 4 pixels of
-    its keypoint in the other.
+    its keypoint in the other. InputError if the database cannot be read or has none of the images.
 
     Args:
         scene: what the images show.
         database: made from its images, by whatever detector and matcher; image k is named as by this module.
         min_matches: pairs with fewer are left out.
-
-    Raises:
-        InputError: if the database cannot be read or has none of the scene's images.
     """
     model = read_model(_parts(scene, None).model(scene.rotations))
     with closing(open_database(database, model.names)) as matches:
@@ -194,7 +188,7 @@ def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
     return ModelParts(scene, camera, judged.keypoints, _true_points(judged))
 
 
-def _true_points(judged: JudgedMatches) -> Points:
+def _true_points(judged: JudgedMatches) -> ModelPoints:
     """Return the points along right matches, each at the mean of the surface points under its keypoints."""
     first = np.cumsum([0] + [len(xy) for xy in judged.keypoints])
     pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
@@ -209,7 +203,7 @@ def _true_points(judged: JudgedMatches) -> Points:
             points.append(surface[group[once]].mean(axis=0))
             tracks.append(np.stack([images, group[once] - first[images]], axis=1))
     colors = np.full((len(points), 3), _POINT_GRAY, dtype=np.uint8)
-    return Points(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
+    return ModelPoints(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
 
 
 def _camera(scene: RenderedScene) -> pycolmap.Camera:

@@ -33,12 +33,9 @@ from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras, lay_out_scen
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
-# A pixel has so many samples along either side.
-_SAMPLES = 2
-# This is far below the spacing of rays, and far above rounding.
-_RAY_SLACK = 1e-6
-# A triangle that comes nearer than this is drawn without bounds.
-_NEAREST_DEPTH_M = 0.05
+_SAMPLES = 2  # samples of a pixel along either side; smooths edges
+_RAY_SLACK = 1e-6  # share of a ray; far below the spacing of rays, far above rounding
+_NEAREST_DEPTH_M = 0.05  # meters; a triangle that comes nearer is drawn without bounds
 # These are the colors at the horizon and above: too smooth for features.
 _SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))
 _OF_POINTS_ONLY = (
@@ -99,10 +96,7 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
 
 
 def draw_image(scene: RenderedScene, image: int) -> ByteArray:
-    """Return one photograph, (height, width, 3): red, green, blue.
-
-    Depends on the scene's options and the image's index only, not on what was drawn before.
-    """
+    """Return one photograph, (height, width, 3) red, green, blue: a function of options and index alone."""
     rng = np.random.default_rng([scene.options.seed, 2, image])
     height, width = scene.options.image_height, scene.options.image_width
     y, x = (np.indices((_SAMPLES * height, _SAMPLES * width)).reshape(2, -1) + 0.5) / _SAMPLES
@@ -191,15 +185,15 @@ def _facing_triangles(scene: RenderedScene, image: int) -> _Triangles:
     v = np.ascontiguousarray(in_camera.swapaxes(1, 2))
     volume = np.linalg.det(v)
     size = np.prod(np.linalg.norm(in_camera, axis=2), axis=1)
-    kept = np.flatnonzero((volume < -1e-12 * size) & (in_camera[:, :, 2].max(axis=1) > _NEAREST_DEPTH_M))
-    return _Triangles(kept, in_camera[kept], np.linalg.inv(v[kept]))
+    facing = np.flatnonzero((volume < -1e-12 * size) & (in_camera[:, :, 2].max(axis=1) > _NEAREST_DEPTH_M))
+    return _Triangles(facing, in_camera[facing], np.linalg.inv(v[facing]))
 
 
 def _bounds(corners: FloatArray, rays: FloatArray) -> IntArray:
     """Return the samples (k, 4) first and last row, first and last column that each triangle can cover.
 
-    A triangle in front of the camera is bounded by its corners. Of one that passes behind it, it is only
-    known whether it lies wholly beyond one side of the image, where the bounds are empty.
+    A triangle in front of the camera is bounded by its corners. A triangle that passes behind it has no
+    bounds unless it lies wholly beyond one side of the image, where the bounds are empty.
     """
     depth = corners[:, :, 2]
     ahead = np.asarray((depth > _NEAREST_DEPTH_M).all(axis=1))

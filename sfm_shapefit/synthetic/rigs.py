@@ -17,21 +17,20 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
 from sfm_shapefit.synthetic.mounts import Rigs, yawed
 from sfm_shapefit.synthetic.options import SceneOptions
-from sfm_shapefit.synthetic.scenes import Scene, scene_of
+from sfm_shapefit.synthetic.scenes import Scene, build_scene
 
-NUM_RIGS, NUM_SENSORS = 2, 3
+NUM_RIGS, NUM_SENSORS = 2, 3  # rigs, cameras of each; the fewest that differ, ahead and to both sides
 
-# Two frames of a vehicle are so far apart.
-_STEP_M = 1.5
-# Angles count to the left of ahead.
-_YAW_DEG = np.array([0.0, 40.0, -40.0])
+_STEP_M = 1.5  # meters between two frames of a vehicle; their views overlap
+_YAW_DEG = np.array([0.0, 40.0, -40.0])  # degrees to the left of ahead; views of neighbors overlap
+# Meters to the right, down and ahead, by rig and sensor: cars of two sizes.
 _OFFSETS_M = np.array(
     [
         [[0.0, 0.0, 0.0], [-0.8, 0.1, -0.3], [0.8, 0.1, -0.3]],
         [[0.0, 0.0, 0.0], [-1.0, -0.3, -0.5], [1.0, -0.3, -0.5]],
     ]
 )
-_LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])
+_LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])  # meters, by rig; two cars on one street
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,15 +41,10 @@ class RigScene(Rigs):
 
 
 def make_rig_drive(options: SceneOptions) -> RigScene:
-    """Return the drive of two rigs of three cameras.
+    """Return the drive of two rigs of three cameras, with exact rotations.
 
-    Args:
-        options: `num_images` is rounded down to whole frames; `shape` and `rig` are not read. Rotations are
-            exact.
-
-    Raises:
-        ValueError: if there is not a frame for each rig, or rotations are to be wrong.
-        InputError: as `make_scene`.
+    `options.num_images` is rounded down to whole frames; `shape` and `rig` are not read. ValueError if there
+    is not a frame for each rig, or rotations are to be wrong; InputError as `make_scene`.
     """
     num_frames = options.num_images // NUM_SENSORS
     if num_frames < NUM_RIGS:
@@ -74,7 +68,7 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
         centers=rigs.centers_of(rotations, centers),
         rotations=rigs.rotations_of(rotations),
     )
-    scene = scene_of(layout, rigs, options, rngs)
+    scene = build_scene(layout, rigs, options, rngs)
     return RigScene(scene=scene, **{item.name: getattr(rigs, item.name) for item in fields(Rigs)})
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
-_NOISE_OF_100_MATCHES_DEG = 0.3
+_NOISE_OF_100_MATCHES_DEG = 0.3  # degrees, of a relative rotation; falls with the root of the matches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,9 +35,9 @@ def rotation_problem(
     Args:
         num_images: n.
         pairs: (k, 2) such as the edges of `ring_graph_problem(n).view_graph`; each pair once.
-        wrong_share: of the pairs are wrong.
+        wrong_share: share of the pairs that are wrong.
         noise: factor of the errors of right pairs; the information always is that of factor 1.
-        seed: of all draws.
+        seed: seed of all draws.
     """
     rng, k = np.random.default_rng(seed), len(pairs)
     pairs = np.sort(np.asarray(pairs, dtype=np.int64), axis=1)

@@ -27,8 +27,8 @@ from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic.layouts import (
     FARTHEST_M,
     ByteArray,
-    Layout,
     SceneCameras,
+    SceneLayout,
     lay_out_scene,
     state_rotations,
     turn_at_random,
@@ -36,16 +36,11 @@ from sfm_shapefit.synthetic.layouts import (
 from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import SceneOptions
 
-# Nothing is photographed closer than this.
-_NEAREST_DEPTH_M = 0.3
-# This angle between a surface's normal and the line of sight is also the occlusion rule.
-_LARGEST_VIEW_ANGLE_DEG = 80.0
-# A corrupted pair's direction is off by at least this.
-_SMALLEST_FALSE_ANGLE_DEG = 10.0
-# A corrupted pair has at most so many matches, which keeps the number of extra keypoints low.
-_MOST_FALSE_MATCHES = 200
-# This is roughly the direction error over the rotation error of a two-view estimate.
-_RELATIVE_POSE_DIRECTION_FACTOR = 3.0
+_NEAREST_DEPTH_M = 0.3  # meters; nothing is photographed closer
+_LARGEST_VIEW_ANGLE_DEG = 80.0  # degrees from a normal to the line of sight; also the occlusion rule
+_SMALLEST_FALSE_ANGLE_DEG = 10.0  # degrees; a corrupted pair's direction is off by at least this
+_MOST_FALSE_MATCHES = 200  # matches of a corrupted pair; keeps the number of extra keypoints low
+_RELATIVE_POSE_DIRECTION_FACTOR = 3.0  # direction error per rotation error; about that of a two-view estimate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,17 +95,14 @@ class _FalseList:
 
 
 def make_scene(options: SceneOptions) -> Scene:
-    """Lay out, photograph, pair and corrupt a scene.
-
-    Raises:
-        InputError: if no two images share `min_matches` points, or if fewer pairs can be corrupted
-            than asked for.
-    """
+    """Lay out, photograph, pair and corrupt a scene; InputError if too few points are shared for that."""
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
-    return scene_of(*lay_out_scene(options, rngs[0]), options, rngs[1:])
+    return build_scene(*lay_out_scene(options, rngs[0]), options, rngs[1:])
 
 
-def scene_of(layout: Layout, rigs: Rigs, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
+def build_scene(
+    layout: SceneLayout, rigs: Rigs, options: SceneOptions, rngs: list[np.random.Generator]
+) -> Scene:
     """Photograph, pair and corrupt a layout with five streams of draws; raises what `make_scene` does."""
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
@@ -152,16 +144,10 @@ def scene_of(layout: Layout, rigs: Rigs, options: SceneOptions, rngs: list[np.ra
 def project_points(
     points: FloatArray, cam_from_world: FloatArray, center: FloatArray, calibration: FloatArray
 ) -> FloatArray:
-    """Return the (k, 2) pixels of (k, 3) points in a camera without distortion, by OpenCV.
+    """Return the (k, 2) pixels of (k, 3) points in world axes in a camera without distortion, by OpenCV.
 
-    Args:
-        points: (k, 3) in world axes.
-        cam_from_world: (3, 3) rotation.
-        center: (3,) camera center in world axes.
-        calibration: (3, 3) K.
-
-    Raises:
-        ValueError: if a point is not in front of the camera; OpenCV would project it without a word.
+    The camera has the rotation cam_from_world, its center in world axes, and the (3, 3) calibration K.
+    ValueError if a point is not in front of it; OpenCV would project it without a word.
     """
     import cv2
 
@@ -179,7 +165,7 @@ def project_points(
 # --- keypoints -------------------------------------------------------------------------------------------
 
 
-def _candidates(layout: Layout, options: SceneOptions) -> Iterator[IntArray]:
+def _candidates(layout: SceneLayout, options: SceneOptions) -> Iterator[IntArray]:
     """Yield for each image the points, ascending, near enough to be shown: those in a ball about its view.
 
     A view is a pyramid of height h = `FARTHEST_M` and half diagonal r at its end; the smallest ball about it
@@ -193,17 +179,14 @@ def _candidates(layout: Layout, options: SceneOptions) -> Iterator[IntArray]:
     radius_m = max(ahead_m, r) * (1.0 + 1e-9)
     tree = KDTree(layout.points)
     for center, axis in zip(layout.centers, layout.rotations[:, 2], strict=True):
-        found = tree.query_ball_point(center + ahead_m * axis, radius_m, return_sorted=True)
-        yield np.asarray(found, dtype=np.int64)
+        rows = tree.query_ball_point(center + ahead_m * axis, radius_m, return_sorted=True)
+        yield np.asarray(rows, dtype=np.int64)
 
 
 def _photograph(
-    layout: Layout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
+    layout: SceneLayout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
 ) -> tuple[IntArray, FloatArray]:
-    """Return which of the candidates an image shows, ascending, and their noisy pixels, all inside the image.
-
-    A point shows when it is in front, near enough, inside the image, and faces the camera.
-    """
+    """Return the candidates that an image shows, ascending: in front, near, inside, facing; and pixels."""
     center, cam_from_world = layout.centers[image], layout.rotations[image]
     points = layout.points[candidates]
     ids = candidates[_in_view_from(points, center[None], cam_from_world, options)[0]]
@@ -315,7 +298,7 @@ def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> t
 
 
 def _false_lists(
-    layout: Layout,
+    layout: SceneLayout,
     keypoint_points: list[IntArray],
     pairs: IntArray,
     options: SceneOptions,
@@ -323,23 +306,23 @@ def _false_lists(
 ) -> dict[int, _FalseList]:
     """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs."""
     asked = round(options.corrupted_pair_fraction * len(pairs))
-    found: dict[int, _FalseList] = {}
+    false_lists: dict[int, _FalseList] = {}
     for e in rng.permutation(len(pairs)):
-        if len(found) == asked:
+        if len(false_lists) == asked:
             break
         false = _false_list(layout, keypoint_points, pairs[e], options, rng)
         if false is not None:
-            found[int(e)] = false
-    if len(found) < asked:
+            false_lists[int(e)] = false
+    if len(false_lists) < asked:
         raise InputError(
-            f"only {len(found)} of the {asked} pairs to corrupt have a false baseline that keeps"
+            f"only {len(false_lists)} of the {asked} pairs to corrupt have a false baseline that keeps"
             f" {options.min_matches} points in view; lower corrupted_pair_fraction or raise num_points"
         )
-    return found
+    return false_lists
 
 
 def _false_list(
-    layout: Layout,
+    layout: SceneLayout,
     keypoint_points: list[IntArray],
     pair: IntArray,
     options: SceneOptions,
@@ -367,8 +350,8 @@ def _false_list(
     rows = np.flatnonzero(in_view[first])[: min(shared, _MOST_FALSE_MATCHES)]
     exact = project_points(points[rows], layout.rotations[displaced], centers[first], options.calibration)
     noisy = exact + options.pixel_noise_px * rng.standard_normal(exact.shape)
-    kept = _inside_image(noisy, options)
-    return _FalseList(displaced=side, keypoints=chosen[rows][kept], xy=noisy[kept], center=centers[first])
+    inside = _inside_image(noisy, options)
+    return _FalseList(displaced=side, keypoints=chosen[rows][inside], xy=noisy[inside], center=centers[first])
 
 
 def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -386,7 +369,7 @@ def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.G
 
 
 def _relative_poses(
-    layout: Layout,
+    layout: SceneLayout,
     pairs: IntArray,
     false_lists: dict[int, _FalseList],
     ray_noise_rad: float,

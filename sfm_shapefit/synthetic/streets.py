@@ -14,12 +14,10 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.graphs import GraphProblem, Seed, noisy_directions
 
-# A camera is paired with so many cameras ahead.
-_BAND = 10
-_PAIR_NOISE_RAD, _PAIR_SHARE_WRONG = 0.01, 0.1
-_RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15
-# These are the largest over the smallest speed, and the cameras per wave of it.
-_SPEED_RATIO, _WAVE = 3.0, 50.0
+_BAND = 10  # cameras ahead that a camera is paired with; as far as a street's views overlap
+_PAIR_NOISE_RAD, _PAIR_SHARE_WRONG = 0.01, 0.1  # radians, and share; directions between cameras
+_RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15  # radians, and share; directions to points are far more exact
+_SPEED_RATIO, _WAVE = 3.0, 50.0  # largest over smallest speed, cameras per wave of it; lengths must be found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +26,7 @@ class StreetProblem(GraphProblem):
 
     num_cameras: int
     covariance: FloatArray
-    """(m, 2, 2) of each direction in its tangent plane, rad^2, as far as it is not wrong."""
+    """(m, 2, 2) covariance of each direction in its tangent plane, rad^2, as far as it is not wrong."""
 
 
 def street_problem(
@@ -62,7 +60,7 @@ def street_problem(
         num_cameras=n,
         edges=edges,
         directions=np.where(corrupted[:, None], wrong, measured),
-        covariance=noise[:, None, None] ** 2 / 3.0 * np.eye(2),  # of a random vector of that length
+        covariance=noise[:, None, None] ** 2 / 3.0 * np.eye(2),  # a random vector of that length has it
         corrupted=corrupted,
     )
 

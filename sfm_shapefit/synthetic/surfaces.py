@@ -22,19 +22,15 @@ from sfm_shapefit.synthetic.layouts import FARTHEST_M, ByteArray, street
 from sfm_shapefit.synthetic.options import Shape
 from sfm_shapefit.synthetic.textures import facade_texture, ground_texture
 
-_HOUSE_DEPTH_M = 4.0
-_HOUSE_WIDTH_M = 8.0
-# Each side has a picture of its own.
-_TOWER_SIDES = 8
-_STORY_M = 2.6
-# The ground's picture has at most so many texels along either side.
-_MOST_TEXELS = 2048
-_TEXELS_PER_M = 64.0
-# The tower has more texels, for it is photographed from nearby.
-_TEXELS_PER_M_NEAR = 160.0
-_LIGHT = normalized(np.array([0.3, -0.5, 0.8]))
-# This is the brightness of a surface that the light does not reach.
-_SHADE = 0.7
+_HOUSE_DEPTH_M = 4.0  # meters; a terraced house's
+_HOUSE_WIDTH_M = 8.0  # meters; several houses to a view
+_TOWER_SIDES = 8  # sides; each has a picture of its own
+_STORY_M = 2.6  # meters; a usual house's
+_MOST_TEXELS = 2048  # texels of the ground's picture along either side; bounds its memory
+_TEXELS_PER_M = 64.0  # texels per meter; as fine as pixels from across the street
+_TEXELS_PER_M_NEAR = 160.0  # texels per meter of the tower; it is photographed from nearby
+_LIGHT = normalized(np.array([0.3, -0.5, 0.8]))  # direction to the light; from the side, mostly above
+_SHADE = 0.7  # brightness of a surface that the light does not reach; still shows its texture
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,17 +70,11 @@ class _Place(NamedTuple):
         return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
-_ALONG_X = np.array([1.0, 0.0, 0.0])
+_ALONG_X = np.array([1.0, 0.0, 0.0])  # unit vector; the axis of walls without a turn
 
 
 def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
-    """Return the surfaces that the cameras of a layout look at.
-
-    The fraction `repeated` of the houses, or of the tower's sides, are one and the same.
-
-    Raises:
-        InputError: if the shape has no surfaces.
-    """
+    """Return a layout's surfaces, the fraction `repeated` of them alike; InputError if the shape has none."""
     if shape not in _BUILDERS:
         raise InputError(
             f"a {shape} has no surfaces to draw; choose one of the shapes {', '.join(_BUILDERS)}"

@@ -9,8 +9,7 @@ import numpy as np
 
 from sfm_shapefit.synthetic.layouts import ByteArray
 
-# There is a stone to so many pixels of the picture.
-_STONE_AREA_PX = 700
+_STONE_AREA_PX = 700  # pixels of the picture per stone; about 26 across
 
 
 def ground_texture(height_px: int, width_px: int, rng: np.random.Generator) -> ByteArray:

@@ -18,24 +18,18 @@ import pycolmap
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.synthetic import models
-from sfm_shapefit.synthetic.models import ModelParts, Points
+from sfm_shapefit.synthetic.models import ModelParts, ModelPoints
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.scenes import Scene
 
-# This is a value of COLMAP's TwoViewGeometry::ConfigurationType.
-_CALIBRATED = 2
+_CALIBRATED = 2  # value of COLMAP's TwoViewGeometry::ConfigurationType; see its header
 
 
 def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:
-    """Write a scene as a COLMAP workspace, whole or not at all.
+    """Write a scene as a COLMAP workspace, whole or not at all; the default options if None.
 
-    Args:
-        scene: what to write.
-        out: a folder that does not exist yet; its parents are made.
-        options: what stands in it; the defaults if None.
-
-    Raises:
-        InputError: if `out` exists or cannot be written.
+    `out` is a folder that does not exist yet; its parents are made. InputError if it exists or cannot be
+    written.
     """
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
@@ -45,7 +39,7 @@ def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = 
         models.write_models(parts, workspace, options.model)
 
 
-def _points(scene: Scene) -> Points:
+def _points(scene: Scene) -> ModelPoints:
     """Return the points that two images or more show; point p of the scene has id p + 1."""
     image = np.repeat(np.arange(scene.num_images), [len(ids) for ids in scene.keypoint_points])
     keypoint = np.concatenate([np.arange(len(ids)) for ids in scene.keypoint_points])
@@ -56,7 +50,7 @@ def _points(scene: Scene) -> Points:
     shown = np.flatnonzero(length >= 2)
     seen = np.stack([image[kept], keypoint[kept]], axis=1)
     tracks = np.split(seen, np.cumsum(length[shown])[:-1]) if len(shown) else []
-    return Points(shown + 1, scene.points[shown], scene.colors[shown], tracks)
+    return ModelPoints(shown + 1, scene.points[shown], scene.colors[shown], tracks)
 
 
 def _camera(scene: Scene) -> pycolmap.Camera:

@@ -16,15 +16,14 @@ from sfm_shapefit.base.settings import (
     _fits,
     flat_values,
     group,
-    groups_of,
     homes_of,
     merge_options,
     option,
+    setting_groups,
 )
-from sfm_shapefit.facts import key_figures
-from sfm_shapefit.facts.columns import columns_of
 from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.placed import UNITS
+from sfm_shapefit.facts.tables import CameraRow, columns_of
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.placement.gauge import ScaleKind
 from sfm_shapefit.placement.options import GaugeOptions
@@ -50,7 +49,7 @@ ALL = (*GROUPS, *COMPOSED)
 @pytest.mark.parametrize("settings", ALL)
 def test_every_option_has_a_sentence_that_help_shows(settings):
     shown = " ".join(settings.__doc__.split())
-    for item in (item for one in groups_of(settings) for item in one.options):
+    for item in (item for one in setting_groups(settings) for item in one.options):
         assert item.help.endswith(".")
         assert f"{item.name} = {item.default!r} {item.help}" in shown
     assert "LocateOptions" in inspect.getdoc(sfm_shapefit.locate)
@@ -66,7 +65,7 @@ def test_every_default_is_what_its_option_takes(settings):
 
 @pytest.mark.parametrize("settings", COMPOSED)
 def test_each_option_belongs_to_one_group_and_has_one_name(settings):
-    names = [item.name for one in groups_of(settings) for item in one.options]
+    names = [item.name for one in setting_groups(settings) for item in one.options]
     assert len(names) == len(set(names))
     assert set(names) == set(homes_of(settings)) == set(flat_values(settings()))
 
@@ -249,7 +248,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
 
 
 def test_every_scale_has_its_unit():
-    assert set(key_figures.UNITS) == {*get_args(ScaleKind)}
+    assert set(UNITS) == {*get_args(ScaleKind)}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):

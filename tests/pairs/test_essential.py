@@ -12,7 +12,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs import essential as relative_rotations
 from sfm_shapefit.pairs.essential import (
     LikelyPoses,
-    concatenate,
+    concatenate_rotations,
     estimate_relative_rotations,
     stored_relative_rotations,
 )
@@ -85,7 +85,7 @@ def test_neither_threads_nor_batches_change_a_bit():
     assert seen[-1] == len(whole.pairs)
     _, parts = batches(path, max_matches=3000)
     assert len(parts) > 5
-    assert_same_bits(concatenate([estimate_relative_rotations(part) for part in parts]), found)
+    assert_same_bits(concatenate_rotations([estimate_relative_rotations(part) for part in parts]), found)
 
 
 def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():

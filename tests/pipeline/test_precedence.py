@@ -76,7 +76,7 @@ def test_control_points_come_before_distances_and_priors_and_only_check_what_is_
         told["fix"] = str(tmp_path / "names.txt")
     found = sfm_shapefit.locate(COURTYARD / "truth", COURTYARD / "database.db", **told)
     unused = [warning for warning in found.warnings if "not used" in warning]
-    uses = {row["use"] for row in found.control_points}
+    uses = {row.use for row in found.control_points}
     assert found.gauge.scale == ("fixed" if fixed else "control points")
     assert [warning.split(" were")[0] for warning in unused] == [
         "known distances",

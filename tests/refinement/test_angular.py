@@ -99,7 +99,7 @@ def test_a_start_is_kept_if_nothing_better_is_found(monkeypatch):
     problem = synthetic.random_graph_problem(20, 0.6, sigma=0.01, seed=3)
     graph = problem.view_graph
     worse = shape(shaken(problem, 0.5))
-    monkeypatch.setattr(angular, "take_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
+    monkeypatch.setattr(angular, "take_angular_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
     found = refined(graph, problem.locations)
     np.testing.assert_allclose(found.locations, shape(problem.locations), rtol=1e-12)
 
@@ -128,7 +128,7 @@ def test_a_camera_without_any_pull_is_held_where_it_was():
     plan = plan_refinement(graph)
     assert plan is not None
     factor = angular.allocate_factor(plan, 3)
-    moved = angular.take_step(terms, factor, angular._unit(far), angular.DAMPING.least)[0]
+    moved = angular.take_angular_step(terms, factor, angular._unit(far), angular.DAMPING.least)[0]
     assert np.linalg.norm(moved - angular._unit(far), axis=1)[3] < 0.2
 
 

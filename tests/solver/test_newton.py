@@ -138,7 +138,7 @@ def test_bound_and_objective_before_the_first_step_are_those_of_the_formulas():
     problem, iterate, _, _ = steps.allocate(graph)
     rng = np.random.default_rng(7)
     iterate.r[:], iterate.feasible[:] = rng.standard_normal((2, *iterate.r.shape))
-    progress = steps.Progress(*steps.measure(problem, iterate))
+    progress = steps.NewtonProgress(*steps.measure_gap(problem, iterate))
     kappa = graph.weights.sum()
     expected = graph.weights @ np.linalg.norm(iterate.r, axis=1) / kappa
     assert progress.objective == pytest.approx(expected, rel=1e-12)

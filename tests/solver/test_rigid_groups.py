@@ -18,7 +18,7 @@ from sfm_shapefit.solver.program import adjoint, along, differences, scale_funct
 from sfm_shapefit.solver.rigs import solve as groups_solve
 from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.rigs.solve import solve_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
@@ -92,7 +92,7 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     roots = rng.normal(size=(len(edges), 3, 3))
     blocks = np.eye(3) + roots @ roots.transpose(0, 2, 1)
     matrix, expand = written_out(edges, unit, blocks)
-    factor = ReducedFactor(edges, unit)
+    factor = RigidReduction(edges, unit)
     factor.refactor(blocks)
     g = adjoint(rng.normal(size=v.shape), edges, n)
     x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
@@ -118,7 +118,7 @@ def test_a_scale_that_nothing_holds_is_refused():
     graph, groups, _ = rig_problem(13, frames=5, wrong=0.0)
     between = outer(graph, groups)[0]
     edges, v = between.edges, between.directions
-    factor = ReducedFactor(edges, groups.normalize())
+    factor = RigidReduction(edges, groups.normalize())
     with pytest.raises(UnsolvableError, match="do not determine a scale"):  # all may grow along the solution
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
@@ -250,7 +250,7 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
     with pytest.raises(InputError, match="have no solver admm"):
         solve_groups(graph, groups, SolverOptions(solver="admm"))
     with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
-        ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)
+        RigidReduction(outer(graph, groups)[0].edges, groups, max_bytes=1000)
 
 
 def test_a_group_that_one_pair_holds_hangs_free_two_pairs_hold_it_and_without_offsets_nothing_is_tied():

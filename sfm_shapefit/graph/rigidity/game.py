@@ -11,11 +11,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.graph.rigidity.growth import compact, incidence, roots, unite
+from sfm_shapefit.graph.rigidity.growth import compact, incidence, merge_sets, roots
 from sfm_shapefit.graph.viewgraph import connected_components
 
-# A game is contracted and restarted when so many times its nodes have been marked.
-_GAME_WORK = 20
+_GAME_WORK = 20  # nodes marked, per node; then contracting and restarting is cheaper than going on
 
 
 class Game(NamedTuple):
@@ -70,9 +69,8 @@ def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimen
 def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
     """Play a game and unite sets by what it shows: those that lie in the same rigid set.
 
-    Returns:
-        The rigid set that each set lies in, (number of sets,), compact; and whether these sets are
-        all that there are. If not, two sets at least were united, and the game has to be played again.
+    Returns the rigid set that each set lies in, (number of sets,), compact, and whether these are final. If
+    not, two sets at least were united, and the game has to be played again.
     """
     if len(game.ends) == 0:
         return np.arange(game.num_sets), True
@@ -272,4 +270,4 @@ def _search_sets(board: _Board, owner: IntArray, done: BoolArray, parent: IntArr
                 w = board.ends[link, 0] + board.ends[link, 1] - x
                 if board.inside[w] == board.clock[1]:
                     done[owner[link]] = True
-                    unite(parent, owner[k], owner[link])
+                    merge_sets(parent, owner[k], owner[link])

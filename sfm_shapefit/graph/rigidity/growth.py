@@ -12,11 +12,9 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import group_by
 
-# A later round rarely unites anything; the pebble game is exact anyway.
-_GROWTH_ROUNDS = 4
+_GROWTH_ROUNDS = 4  # rounds; a later one rarely unites anything, and the pebble game is exact anyway
 
-# Limit of the nodes looked at while growing, as a multiple of all incidences of sets and nodes.
-_GROWTH_WORK = 30
+_GROWTH_WORK = 30  # nodes looked at, per incidence of a set and a node; a bound, the game is exact anyway
 
 
 def compact(label: IntArray) -> IntArray:
@@ -34,7 +32,7 @@ def roots(parent: IntArray) -> IntArray:
 
 
 @inner_kernel
-def unite(parent: IntArray, a: int, b: int) -> None:
+def merge_sets(parent: IntArray, a: int, b: int) -> None:
     """Unite the sets of two items under the smaller root, halving the paths to both roots."""
     while parent[a] != a:
         parent[a] = parent[parent[a]]
@@ -81,8 +79,8 @@ def _unite_triangles(edges: IntArray, degree: IntArray, parent: IntArray) -> Non
             for r in range(start[b], start[b + 1]):
                 c = head_of[r]
                 if seen_from[c] == a:
-                    unite(parent, edge_of[s], edge_of[r])
-                    unite(parent, edge_of[s], seen_edge[c])
+                    merge_sets(parent, edge_of[s], edge_of[r])
+                    merge_sets(parent, edge_of[s], seen_edge[c])
 
 
 @kernel
@@ -204,7 +202,7 @@ def _reach_out(growth: _Growth, seed: int, b: int, node: int) -> int:
             growth.reached_by[other] = b
             growth.reached_at[other] = node
         elif growth.reached_at[other] == node:
-            unite(growth.parent, growth.reached_by[other], b)
+            merge_sets(growth.parent, growth.reached_by[other], b)
         else:
             return int(growth.reached_by[other])
     return -1
@@ -216,7 +214,7 @@ def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
     if growth.taken[eaten] == seed:
         return tail
     growth.taken[eaten] = seed
-    unite(growth.parent, seed, eaten)
+    merge_sets(growth.parent, seed, eaten)
     for s in range(growth.start[eaten], growth.start[eaten + 1]):
         node = growth.nodes[s]
         if growth.inside[node] != seed:

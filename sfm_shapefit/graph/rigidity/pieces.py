@@ -5,19 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import IntArray, frozen
+from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.rigidity.game import contract, play
 from sfm_shapefit.graph.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.operators import Int32Array, adjacency, check_edges
+from sfm_shapefit.laplacian.operators import adjacency, check_edges
 
-# A pebble game on so many nodes takes milliseconds.
-_FIRST_GAME_NODES = 500
+_FIRST_GAME_NODES = 500  # nodes; a pebble game on these takes milliseconds
 
-# So many pairs per node are twice what rigidity needs in space, and mostly enough where pairs abound.
-_FEW_LINKS = 6
+_FEW_LINKS = 6  # pairs per node; twice what rigidity needs in space, mostly enough where pairs abound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,29 +27,25 @@ class RigidPiece:
     edges: IntArray
     """Indices of its pairs in the graph's `edges`, ascending."""
     hinges: IntArray
-    """Those of its nodes that also belong to another piece of at least 3 nodes, ascending."""
+    """Nodes that also belong to another piece of at least 3 nodes, ascending."""
 
 
 def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return the rigid piece of each pair, for positions in general position.
 
-    The contraction is exact: a motion of the whole is one translation and scale per set, equal where
-    sets share a node. A frame on the b shared nodes w_0, w_1, ... of a set (d - 1 copies of
-    each w_0 w_k, one of each w_1 w_k, k > 1) admits the same motions there: it has d b - (d + 1)
-    copies, and it is independent, since each w_k adds d copies, at most d - 1 of them to one node.
+    The contraction is exact: a motion of the whole is one translation and scale per set, equal where sets
+    share a node. A set on the b shared nodes w_0, w_1, ... is replaced by a frame: d - 1 copies of each
+    w_0 w_k, one of each w_1 w_k, k > 1. It admits the same motions there, as it has d b - (d + 1) copies, and
+    it is independent, since each w_k adds d copies, at most d - 1 of them to one node.
 
     Args:
         num_nodes: n.
-        edges: (m, 2) node indices in [0, n), no self-loops.
+        edges: (m, 2) node indices; InputError for a self-loop or an index outside [0, n).
         dimension: d >= 2.
 
     Returns:
-        (m,) labels. Piece 0 has the most nodes; then come more edges, then the smaller first
-        node, then the smaller second one, so labels do not depend on the order of `edges`. A pair
-        that belongs to nothing larger is a piece of its own.
-
-    Raises:
-        InputError: if an edge is a self-loop or out of range, or `dimension` is below 2.
+        (m,) labels. Piece 0 has the most nodes; then come more edges, then the smaller first node, then the
+        smaller second one, whatever the order of `edges`. A pair may be a piece of its own.
     """
     edges = _check_edges(num_nodes, edges, dimension)
     set_of = compact(triangle_sets(num_nodes, edges))
@@ -70,10 +64,7 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
 
 
 def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
-    """Return whether the pairs fix all n nodes up to one translation and one scale, generically.
-
-    A single node without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
-    """
+    """Return whether pairs fix all n nodes up to translation and scale, generically; one node is rigid."""
     checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
         graph = adjacency(num_nodes, checked)
@@ -141,14 +132,14 @@ def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbors: Int32Arr
 @kernel
 def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
     """Return which pairs are among the first `few` kept at one of their nodes, at least, (m,)."""
-    kept = np.zeros(num_nodes, dtype=np.int64)
+    counts = np.zeros(num_nodes, dtype=np.int64)
     is_kept = np.zeros(len(edges), dtype=np.bool_)
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        if kept[i] < few or kept[j] < few:
+        if counts[i] < few or counts[j] < few:
             is_kept[e] = True
-            kept[i] += 1
-            kept[j] += 1
+            counts[i] += 1
+            counts[j] += 1
     return is_kept
 
 

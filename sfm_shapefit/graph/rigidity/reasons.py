@@ -8,17 +8,12 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 
 
 def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, str]:
-    """Say for each camera outside the largest piece why its position is not determined with it.
+    """Return why each camera outside the largest of the `rigid_pieces` is not determined with it, by index.
 
-    Args:
-        graph: the view graph.
-        pieces: its pieces, as `rigid_pieces` returns them.
-
-    Returns:
-        Camera index, ascending, to one of: "no pair"; "another component"; "pendant: joined by a
-        single pair to NAME"; "another rigid piece, hinged at NAME, ..."; "not rigidly tied to the
-        largest piece". Hinges shared with the largest piece are named if there are any, else all
-        hinges of the camera's piece. Without names in the graph, NAME is "camera K".
+    One of: "no pair"; "another component"; "pendant: joined by a single pair to NAME"; "another rigid piece,
+    hinged at NAME, ..."; "not rigidly tied to the largest piece". Hinges shared with the largest piece are
+    named if there are any, else all hinges of the camera's piece. Without names in the graph, NAME is "camera
+    K".
     """
     placed = np.zeros(graph.num_nodes, dtype=np.bool_)
     if pieces:

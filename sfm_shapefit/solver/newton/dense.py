@@ -14,7 +14,7 @@ from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,
     STALL,
     STEPS_PER_FACTOR,
-    Progress,
+    NewtonProgress,
     Scalars,
     allocate,
     allowed_violation,
@@ -25,8 +25,8 @@ from sfm_shapefit.solver.newton.steps import (
     extend_step,
     is_cancelled,
     is_within,
-    linearize,
-    measure,
+    linearize_program,
+    measure_gap,
     pays,
     set_gradient,
     set_residuals,
@@ -41,17 +41,16 @@ _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
 """By bytes per number: in single precision each gains a digit or more, or M is too ill-conditioned."""
 _PATIENCE = {4: 3, 8: STALL}
-"""By bytes per number: factorizations without progress after which it is given up."""
-# From so many unknowns on a factor in single precision saves more than its refinements cost.
-_SINGLE_FROM = 450
-# A step passes over one edge, and over one entry of the matrix, in the time of so many operations of a dense
-# factorization.
+"""Factorizations without progress after which it is given up; by bytes per number."""
+_SINGLE_FROM = 450  # unknowns; from here on a factor in float32 saves more than its refinements cost
+# Operations of a dense factorization in the time of a step's pass over one edge, and over one matrix entry:
+# memory decides there, not arithmetic.
 _EDGE_WORK, _SOLVE_WORK = 1000.0, 10.0
 # One call takes about 0.1 s: so long an interrupt may have to wait.
 _OPERATIONS_PER_CALL = 4e9
 
 
-class DenseFactor(NamedTuple):
+class DenseNewtonFactor(NamedTuple):
     """Room for M and its Cholesky factor, and what LAPACK is called with."""
 
     matrix: Any
@@ -74,10 +73,7 @@ class DenseFactor(NamedTuple):
 def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a dense Cholesky factor of nd x nd; as `solve_newton_sparse` otherwise.
-
-    For n up to about a thousand.
-    """
+    """Solve as `solve_newton_sparse` with a dense factor of nd x nd, for n up to about a thousand."""
     problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
@@ -85,7 +81,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = Progress(*measure(problem, iterate))
+        progress = NewtonProgress(*measure_gap(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -93,7 +89,7 @@ def solve_newton_dense(
             done, stalled, after = _newton(
                 problem, iterate, linearization, factor, step, progress, tol, limit, stalled
             )
-            progress = Progress(*after)
+            progress = NewtonProgress(*after)
             count += done
             if is_cancelled(on_iteration, count, progress):
                 break
@@ -102,10 +98,10 @@ def solve_newton_dense(
     return *answer(problem, iterate, progress, tol), count
 
 
-def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFactor:
+def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseNewtonFactor:
     """Return room for a factor of float32 or float64."""
     size = np.dtype(dtype).itemsize
-    return DenseFactor(
+    return DenseNewtonFactor(
         matrix=np.empty((n * d) ** 2, dtype),
         right=np.empty(n * d, dtype),
         diagonal=np.empty((n, d, d)),
@@ -138,7 +134,7 @@ def _newton(
         first, work = progress.gap, cycle_work
         mu = smoothing(progress, progress.mu)
         set_residuals(problem, iterate.t, iterate.r)
-        linearize(problem, iterate, mu, linearization)
+        linearize_program(problem, iterate, mu, linearization)
         if _factorize(problem, linearization, factor) == 0:
             for _ in range(STEPS_PER_FACTOR):
                 previous = progress.gap
@@ -146,12 +142,12 @@ def _newton(
                 target, exact = _propose(problem, iterate, linearization, factor, step, mu, previous)
                 if not exact:
                     break
-                progress = Progress(*take_step(problem, iterate, step, mu, progress, target))
+                progress = NewtonProgress(*take_step(problem, iterate, step, mu, progress, target))
                 work += step_work
                 if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
                     break
             mu = progress.mu
-        progress = Progress(*close_cycle(iterate, progress, mu, first))
+        progress = NewtonProgress(*close_cycle(iterate, progress, mu, first))
         count += 1
         stalled = 0 if progress.gap < 0.9 * first else stalled + 1
         if progress.gap == first and factor.right.itemsize == 4:
@@ -197,7 +193,7 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
         column = factor.matrix[q * order + q : (q + 1) * order]
         rest = c[q:]
         slope = along_c * c[q]
-        for p in range(len(column)):  # of views that begin at 0: an index that may be negative is slow
+        for p in range(len(column)):  # over views that begin at 0: an index that may be negative is slow
             column[p] = slope * rest[p]
         for p in range(0, len(column), len(problem.axes)):
             column[p] += along_axis
@@ -241,11 +237,7 @@ def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
 def _propose(
     problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
-    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
-
-    Returns:
-        lambda+, and whether the refinement converged; the step must not be taken otherwise.
-    """
+    """Return lambda+ of the refined step, and whether D^T y+ = lambda+ c: else do not take it."""
     c, a, nodes, addend = problem.c, linearization.a, step.nodes, step.addend
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
     set_gradient(problem, iterate, linearization, mu, step)

@@ -23,20 +23,18 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.solver.newton.steps import (
     LEAST_MU,
     MU_PER_GAP,
-    Progress,
+    NewtonProgress,
     combine,
     dot,
-    measure,
+    measure_gap,
     scale_to,
     set_residuals,
 )
 
-# Conjugate gradient steps for plain least squares, and for each reweighted problem.
-_FIRST_STEPS, _STEPS = 4, 2
+_FIRST_STEPS, _STEPS = 4, 2  # conjugate gradient steps: for plain least squares, and each reweighted problem
 # Rounds of reweighting: with half of them Newton needs a factorization more, and twice as many gain nothing.
 _ROUNDS = 7
-# The smoothing of the first weights, per mean residual, and its factor per round.
-_EPS, _SHRINK = 0.5, 0.7
+_EPS, _SHRINK = 0.5, 0.7  # smoothing of the first weights, per mean residual; its factor per round
 # The first steps may leave this share of the energy; dense random graphs leave 1e-3, real ones 5e-2.
 _LEFT = 3e-3
 
@@ -59,7 +57,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0
-    floor = max(MU_PER_GAP * Progress(*measure(problem, iterate)).gap, LEAST_MU)
+    floor = max(MU_PER_GAP * NewtonProgress(*measure_gap(problem, iterate)).gap, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):
@@ -72,13 +70,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
 
 @inner_kernel
 def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degrees: Any) -> float:
-    """Write s_e = w_e / sqrt(||r_e||^2 + floor^2), their sums at the cameras, and D^T S r at T.
-
-    An infinite floor stands for s_e = w_e.
-
-    Returns:
-        The mean residual.
-    """
+    """Write s_e (w_e at an infinite floor), their sums at cameras, D^T S r; return the mean residual."""
     edges, v = problem.edges, problem.v
     gradient[:] = 0.0
     degrees[:] = 0.0
@@ -108,8 +100,8 @@ def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degre
 def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhill: Any, steps: int) -> float:
     """Move t by conjugate gradients of the weighted least squares, <c, T> unchanged.
 
-    Returns:
-        About what is left of its energy <T, gradient>, where the preconditioned matrix is about the identity.
+    Returns about what is left of its energy <T, gradient>, where the preconditioned matrix is about the
+    identity.
     """
     direction, product = step.t, step.nodes
     direction[:] = 0.0

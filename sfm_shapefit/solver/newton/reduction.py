@@ -1,7 +1,7 @@
 """The unknowns x of a Newton step, t = A x, and the factored matrix of their equations.
 
 A is the identity (`Reduction` itself), or it places the nodes of rigid groups
-(`sfm_shapefit.solver.rigs.reduced.ReducedFactor`). Along the solution itself the matrix tends to singular
+(`sfm_shapefit.solver.rigs.reduced.RigidReduction`). Along the solution itself the matrix tends to singular
 whatever the data, for the objective is homogeneous. So one pair is pinned: with M = A^T D^T S D A and
 q = A^T D^T of v_e at that pair,
 
@@ -23,10 +23,7 @@ from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 
 
 class Reduction:
-    """The map A from unknowns to locations, and memory for a factor of A^T D^T S D A; here A is the identity.
-
-    A reduction to fewer unknowns overrides all methods.
-    """
+    """The map A from unknowns to locations, here the identity, and memory for a factor of A^T D^T S D A."""
 
     def __init__(self, factor: CholeskyFactor) -> None:
         """Keep the sparse factor behind it, which says what a factorization and a solve cost."""
@@ -95,7 +92,7 @@ def factor_pinned(reduction: Reduction, blocks: FloatArray, c: FloatArray, pin: 
     """Factor the matrix of the blocks with one pair pinned; None if it is not positive definite.
 
     Args:
-        reduction: whose factor is overwritten.
+        reduction: its factor is overwritten.
         blocks: (m, d, d) S_e; tau v v^T is added to the pinned pair's.
         c: A^T D^T (w v), in the shape of x.
         pin: which pair.

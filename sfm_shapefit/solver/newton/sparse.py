@@ -21,12 +21,11 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_pinned
-from sfm_shapefit.solver.newton.steps import Iterate, Linearization, Problem, Progress, Work
+from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 
-# Added to the blocks in turn until the matrix is positive definite, per stiffness of the edge.
-_RIDGES = 0.0, 1e-12, 1e-10
+_RIDGES = 0.0, 1e-12, 1e-10  # added to the blocks, per stiffness of the edge; in turn until M is definite
 
 
 def solve_newton_sparse(
@@ -40,6 +39,9 @@ def solve_newton_sparse(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks.
 
+    Returns locations (n, d), the dual (m, d), and the number of factorizations. UnsolvableError if the
+    directions do not determine any locations.
+
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
         tol: the gap wanted, in units of the objective.
@@ -47,13 +49,8 @@ def solve_newton_sparse(
         on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
-        plan: of the factorization of the graph's Laplacian, or its order of elimination, if there already.
-
-    Returns:
-        locations (n, d), the dual (m, d), and the number of factorizations.
-
-    Raises:
-        UnsolvableError: if the directions do not determine any locations.
+        plan: plan of the factorization of the graph's Laplacian, or its order of elimination, if there
+            already.
     """
     if not isinstance(plan, SymbolicFactor):
         neighbors = adjacency(graph.num_nodes, graph.edges)
@@ -70,10 +67,7 @@ def solve_newton_reduced(
     on_iteration: OnIteration | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program over the unknowns of a reduction, which the pairs determine.
-
-    All else is as in `solve_newton_sparse`.
-    """
+    """Solve the program over the unknowns of a reduction; all else is as in `solve_newton_sparse`."""
     work = steps.allocate(graph)
     problem, iterate = work.problem, work.iterate
     if start is None:
@@ -83,7 +77,7 @@ def solve_newton_reduced(
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     else:
         _begin_at(problem, *start, iterate)
-    progress, count, stalled = Progress(*steps.measure(problem, iterate)), 0, 0
+    progress, count, stalled = NewtonProgress(*steps.measure_gap(problem, iterate)), 0, 0
     while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
         progress = _cycle(work, reduction, progress, tol)
@@ -102,18 +96,18 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
 
 
-def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> Progress:
+def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: float) -> NewtonProgress:
     """Factor once, then step with that factor while it pays."""
     problem, iterate, linearization, step = work
     first = progress.gap
     mu = steps.smoothing(progress, progress.mu)
     steps.set_residuals(problem, iterate.t, iterate.r)
-    steps.linearize(problem, iterate, mu, linearization)
+    steps.linearize_program(problem, iterate, mu, linearization)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorize(problem, linearization, reduction, longest)
     if system is None:
-        return Progress(*steps.close_cycle(iterate, progress, mu, first))
+        return NewtonProgress(*steps.close_cycle(iterate, progress, mu, first))
     factor, edge_work = reduction.factor, steps.EDGE_WORK * len(problem.w)
     step_work = edge_work + steps.SOLVE_WORK * factor.panels.size
     done = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
@@ -123,19 +117,15 @@ def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> 
         target, exact = _propose(work, system, mu, previous)
         if not exact:
             break
-        progress = Progress(*steps.take_step(problem, iterate, step, mu, progress, target))
+        progress = NewtonProgress(*steps.take_step(problem, iterate, step, mu, progress, target))
         done += step_work
         if progress.gap <= tol or not steps.pays(first, previous, progress.gap, done, step_work):
             break
-    return Progress(*steps.close_cycle(iterate, progress, progress.mu, first))
+    return NewtonProgress(*steps.close_cycle(iterate, progress, progress.mu, first))
 
 
 def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:
-    """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
-
-    Returns:
-        lambda+, and whether the refinement converged; the step must not be taken otherwise.
-    """
+    """Return lambda+ of the refined step, and whether A^T D^T y+ = lambda+ A^T c: else do not take it."""
     problem, iterate, linearization, step = work
     reduction = system.reduction
     c = reduction.reduce(problem.c)

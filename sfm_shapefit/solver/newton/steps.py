@@ -6,7 +6,7 @@ dual of the program.
 
 What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while the
 kernel ran would be raised there, and end the process by a segmentation fault: kernels return the scalars of
-`Progress` as a plain tuple, of which `Progress(*...)` makes it again.
+`NewtonProgress` as a plain tuple, of which `NewtonProgress(*...)` makes it again.
 """
 
 from typing import Any, NamedTuple
@@ -23,27 +23,22 @@ from sfm_shapefit.solver.program import scale_functional
 
 # The smoothing relative to the gap; 0.05 to 0.3 need the same number of factorizations.
 MU_PER_GAP = 0.1
-# A cycle that leaves more of the gap than this is the last one with a clipped dual.
-_CLIPS_BELOW = 0.5
-STEPS_PER_FACTOR = 10
+_CLIPS_BELOW = 0.5  # share of the gap; a cycle that leaves more is the last one with a clipped dual
+STEPS_PER_FACTOR = 10  # steps, a bound; a cycle ends once a new factor gains more than another step
 # The least smoothing of S, not of the target: below it M is too ill-conditioned for refinement to converge.
 LEAST_MU = 1e-8
-REFINEMENTS = 3
-# After so many factorizations without progress more will not help.
-STALL = 6
+REFINEMENTS = 3  # refinements of a step; they converge unless M is too ill-conditioned
+STALL = 6  # factorizations without progress; more will not help
 # A step passes over one edge, and over one entry of the factor, in the time of so many operations of a
 # factorization: memory decides there, not arithmetic.
 EDGE_WORK, SOLVE_WORK = 500.0, 5.0
 
 # The allowed violation of D^T y = lambda c, per mean degree: per squared gap, and in any case.
 _EQUALITY, _LEAST_EQUALITY = 1e-3, 5e-13
-# A dual moves so far towards the surface of the ball.
-_TO_BOUNDARY = 0.99
-# A scaled dual stays inside the ball by this fraction of its excess.
-_MARGIN = 0.01
-_HALVINGS = 20
-# A c smaller than this, relative to the sum of weights, is rounding.
-_CANCEL = 1e-12
+_TO_BOUNDARY = 0.99  # share of the way to the surface of the ball; a dual moves so far at most
+_MARGIN = 0.01  # share of its excess by which a scaled dual stays inside the ball; see above
+_HALVINGS = 20  # halvings of a step; a shorter one does not move double precision
+_CANCEL = 1e-12  # c relative to the sum of weights; a smaller one is rounding
 
 
 class Problem(NamedTuple):
@@ -110,7 +105,7 @@ class Step(NamedTuple):
     """(m,) at the point where the step begins."""
 
 
-class Progress(NamedTuple):
+class NewtonProgress(NamedTuple):
     """The scalars of the iteration."""
 
     mu: float
@@ -125,7 +120,7 @@ class Progress(NamedTuple):
 
 
 Scalars = tuple[float, float, float, float, bool]
-"""The fields of `Progress`."""
+"""The fields of `NewtonProgress`."""
 
 
 class Work(NamedTuple):
@@ -138,11 +133,7 @@ class Work(NamedTuple):
 
 
 def allocate(graph: ViewGraph) -> Work:
-    """Return the problem as arrays, and room for the iteration.
-
-    Raises:
-        UnsolvableError: if c is 0 up to rounding.
-    """
+    """Return the problem as arrays, and room for the iteration; UnsolvableError if c is 0 up to rounding."""
     n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
 
     def at_nodes() -> FloatArray:
@@ -164,7 +155,7 @@ def allocate(graph: ViewGraph) -> Work:
     return Work(problem, Iterate(at_nodes(), at_edges(), at_edges(), at_edges()), linearization, step)
 
 
-def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
+def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: NewtonProgress) -> bool:
     """Tell the callback where the solver stands; return whether it asks to stop."""
     bound = progress.objective - progress.gap
     return asks_to_stop(on_iteration, IterationInfo(iteration, progress.objective, bound))
@@ -172,10 +163,7 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
 
 @kernel
 def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
-    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column.
-
-    And S_e = w_e, which makes M the projected Laplacian.
-    """
+    """Write the bases B_e, by reflections of v_e to the first axis, and S_e = w_e: M is the Laplacian."""
     for e in range(len(v)):
         sign = np.copysign(1.0, v[e, 0])
         inverse = 1.0 / (1.0 + abs(v[e, 0]))
@@ -209,7 +197,7 @@ def start_from(problem: Any, a: Any, iterate: Any) -> bool:
 
 
 def answer(
-    problem: Problem, iterate: Iterate, progress: Progress, tol: float
+    problem: Problem, iterate: Iterate, progress: NewtonProgress, tol: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
     if progress.objective <= tol:
@@ -231,7 +219,7 @@ def _set_dual(basis: Any, y: Any, dual: Any) -> None:
 
 
 @kernel
-def measure(problem: Any, iterate: Any) -> Scalars:
+def measure_gap(problem: Any, iterate: Any) -> Scalars:
     """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
     for e in range(len(problem.w)):
@@ -280,7 +268,7 @@ def allowed_violation(problem: Any, gap: float) -> float:
 
 
 @kernel
-def linearize(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
+def linearize_program(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
     """Take S at the iterate."""
     y, r = iterate.y, iterate.r
     floor = max(mu, LEAST_MU)
@@ -385,7 +373,7 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
             keep, gain, reached = 1.0 - beta, beta, multiplier + beta * (target - multiplier)
     if progress.clips and reached <= multiplier:
         keep, gain, reached = 1.0, 0.0, multiplier
-    objective, bound = move(problem, iterate, step, alpha, keep, gain)
+    objective, bound = move_along(problem, iterate, step, alpha, keep, gain)
     if not progress.clips:
         start_again(iterate)
     return mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa, progress.clips
@@ -466,13 +454,12 @@ def add_up(x: Any) -> float:
 
 
 @inner_kernel
-def move(
+def move_along(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
     """T += alpha dT, r += alpha dr, y = y+ clipped to its balls, feasible = keep feasible + gain y+.
 
-    Returns:
-        sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
+    Returns sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
     """
     combine(1.0, iterate.t, alpha, step.t, iterate.t)
     for e in range(len(problem.w)):

@@ -13,12 +13,10 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import REGULAR, REPAIRS, RESIDUAL_FLOOR, STRICT, Certificate
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
-# Locations may be off those of rigid groups by this share of their extent, which is rounding.
-_OFF_GROUPS = 1e-9
-# An equality residual that needs no repair.
-_EXACT = 1e-12
+_OFF_GROUPS = 1e-9  # share of the extent; locations off their rigid groups by less are off by rounding
+_EXACT = 1e-12  # equality residual; a smaller one needs no repair
 
 
 def certify_groups(
@@ -31,16 +29,15 @@ def certify_groups(
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
+    `equality_residual` is the largest violation at a group, or in the equation for the scale with offsets of
+    root mean square 1, relative to the largest weighted degree of a group.
+
     Args:
         graph: a view graph whose pairs connect the groups; those inside a group take no part.
-        groups: of its nodes.
+        groups: groups of its nodes.
         locations: (n, d) in any scale, with L(T) > 0 and the groups' offsets in one common scale.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         uniqueness: also examine whether the optimum is unique.
-
-    Returns:
-        The certificate; its `equality_residual` is the largest violation at a group, or in the equation
-        for the scale with offsets of root mean square 1, relative to the largest weighted degree of a group.
 
     Raises:
         InputError: if an array has the wrong shape or is not finite, the locations have L(T) <= 0, or they
@@ -113,7 +110,7 @@ def _balance(
     blocks = stiffness[:, None, None] * (np.eye(d) - v[:, :, None] * v[:, None, :])
     longest = _longest(graph, locations)
     pin = Pin(longest, graph.edges[longest], v[longest], float(np.mean(stiffness)))
-    system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, pin)
+    system = factor_pinned(RigidReduction(graph.edges, groups), blocks, c, pin)
     if system is None:
         raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
     for _ in range(REPAIRS):
@@ -150,7 +147,7 @@ def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: 
     blocks = w[:, None, None] * conditions
     longest = _longest(graph, locations)
     blocks[longest] += w[longest] * np.outer(v[longest], v[longest])
-    factor = ReducedFactor(graph.edges, groups)
+    factor = RigidReduction(graph.edges, groups)
     try:
         factor.refactor(blocks)
     except UnsolvableError:

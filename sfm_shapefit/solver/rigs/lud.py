@@ -6,7 +6,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 
@@ -21,7 +21,7 @@ def lud_over_groups(graph: ViewGraph, groups: RigidGroups, max_steps: int = _MAX
     of the graph joins two groups, and all groups are connected.
     """
     try:
-        factor = ReducedFactor(graph.edges, groups.normalize())
+        factor = RigidReduction(graph.edges, groups.normalize())
         resources = Resources(factor=factor)
         locations = solve_lud(graph, max_steps, certified=False, resources=resources).locations
     except UnsolvableError:

@@ -18,11 +18,10 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
 from sfm_shapefit.solver.newton.reduction import Reduction
 
-# What is left of s when all groups may move is rounding below this share of eta.
-_LEAST_SCHUR = 1e-13
+_LEAST_SCHUR = 1e-13  # share of eta; less of s, when all groups may move, is rounding
 
 
-class ReducedFactor(Reduction):
+class RigidReduction(Reduction):
     """Memory for the factor of A^T D^T S D A; `refactor` overwrites it, `solve` reads it.
 
     It answers in locations, A (A^T D^T S D A)^-1 A^T g, so that whatever works with a Laplacian of cameras
@@ -32,16 +31,13 @@ class ReducedFactor(Reduction):
     def __init__(
         self, edges: IntArray, groups: RigidGroups, *, threads: int = 1, max_bytes: int | None = None
     ) -> None:
-        """Plan the factorization.
+        """Plan the factorization; UnsolvableError if the factor would take more than `max_bytes`.
 
         Args:
             edges: (m, 2) pairs of nodes, each of two different groups, which they connect.
-            groups: of the nodes; offsets best centered.
-            threads: of the factor; its answers do not depend on it.
-            max_bytes: what the factor may take; predicted before it is allocated.
-
-        Raises:
-            UnsolvableError: if the factor would take more than `max_bytes`.
+            groups: groups of the nodes; offsets best centered.
+            threads: threads of the factor; its answers do not depend on them.
+            max_bytes: limit of the factor; predicted before it is allocated.
         """
         self.groups = groups
         self._ends = np.ascontiguousarray(groups.group_of[edges])
@@ -70,8 +66,7 @@ class ReducedFactor(Reduction):
     def refactor(self, weights: FloatArray, /) -> None:
         """Factor the matrix of the blocks (m, d, d), or of weights (m,) times the identity.
 
-        Raises:
-            UnsolvableError: if it is not positive definite to working precision.
+        UnsolvableError if it is not positive definite to working precision.
         """
         d = self._offsets.shape[1]
         blocks = weights if weights.ndim > 1 else weights[:, None, None] * np.eye(d)

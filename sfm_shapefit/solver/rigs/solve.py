@@ -16,11 +16,10 @@ from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.solve import Choice, run_choice
 
-# A^T c counts as 0 below this size, relative to the sum of weights.
-_DIRECTIONS_CANCEL = 1e-12
+_DIRECTIONS_CANCEL = 1e-12  # A^T c relative to the sum of weights; smaller counts as 0
 
 
 @one_blas_thread()  # more would split, and round, the sums of long vectors differently
@@ -32,18 +31,16 @@ def solve_groups(
 ) -> SolverResult:
     """Solve ShapeFit over groups, with a certificate.
 
+    Returns locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
+    `equality_residual` is as in `certify_groups`.
+
     Args:
         graph: a view graph; pairs inside a group take no part.
-        groups: of its nodes, tied to one another by the pairs between them (`largest_tied`).
-        options: solver settings; the methods are "newton", which "auto" means, and "conic".
+        groups: groups of its nodes, tied to one another by the pairs between them (`largest_tied`).
+        options: solver settings; the methods are "newton", which "auto" means, and "conic", else InputError.
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
 
-    Returns:
-        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
-        `equality_residual` is as in `certify_groups`.
-
     Raises:
-        InputError: if a method is asked for that does not exist over groups.
         UnsolvableError: if no pair joins two groups, the pairs do not determine the groups, or a factor over
             the groups would take more than `options.factor_memory_mb`.
     """
@@ -79,7 +76,9 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
-    factor = ReducedFactor(graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes)
+    factor = RigidReduction(
+        graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes
+    )
 
     def newton(graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None) -> tuple[Any, ...]:
         return solve_newton_reduced(graph, factor, tol, limit, watch)

@@ -20,14 +20,13 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.reduced import RigidReduction
 
-_EPSILON = 1e-10
-_STEPS = 4
-_PROBES = 3
-# Two groups are tied if all null vectors, drawn with unit variance, move them equally to this.
-_ALIKE = 1e-3
-_SEED = 0
+_EPSILON = 1e-10  # shift of the matrix, relative; null vectors grow by its inverse per step
+_STEPS = 4  # steps of inverse iteration; after these nothing but null vectors is left
+_PROBES = 3  # null vectors drawn; groups that move alike in all by chance are improbable
+_ALIKE = 1e-3  # difference of motions; groups are tied if all null vectors, of unit variance, differ by less
+_SEED = 0  # seed of the probes; same input, same answer
 
 
 def largest_tied(
@@ -37,17 +36,14 @@ def largest_tied(
     locations: FloatArray | None = None,
     around: int | None = None,
 ) -> IntArray:
-    """Return the largest set of groups, ascending, that the pairs tie to one another if s is known.
+    """Return the largest set of groups (k,), ascending, that the pairs tie to one another if s is known.
 
     Args:
         edges: (m, 2) pairs of nodes; those inside a group are ignored.
-        groups: of the nodes.
-        sizes: (B,) what counts of each group, such as its number of cameras; sets are compared by their sum.
-        locations: (n, d) where they are asked about; random positions with the groups' offsets if None.
+        groups: groups of the nodes.
+        sizes: (B,) what each group counts, such as its number of cameras; sets are compared by their sum.
+        locations: (n, d) positions; random ones with the groups' offsets if None.
         around: a group; then the set that holds it, whatever its size.
-
-    Returns:
-        (k,) groups; a single one if no pair ties any two.
     """
     used = edges[groups.joins(edges)]
     if locations is None:
@@ -91,7 +87,7 @@ def _null_motions(edges: IntArray, groups: RigidGroups, locations: FloatArray) -
     still = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(locations))
     u = normalized(differences(locations, edges))  # NaN where two nodes coincide, which says nothing
     blocks = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :])
-    factor = ReducedFactor(edges, still)
+    factor = RigidReduction(edges, still)
     try:
         factor.refactor(blocks + _EPSILON * np.eye(d))
     except UnsolvableError:  # regular but for rounding: nothing can be told apart

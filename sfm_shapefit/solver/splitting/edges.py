@@ -27,11 +27,9 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import Workers
 
-_CHUNKS = 4
-# So many edges are gathered and then worked on together.
-_BLOCK = 64
-# For fewer edges, handing work to a thread costs more than the work.
-_EDGES_WORTH_A_THREAD = 20_000
+_CHUNKS = 4  # chunks of edges, whatever the threads; sums have one order
+_BLOCK = 64  # edges that are gathered and then worked on together; short loops on contiguous memory
+_EDGES_WORTH_A_THREAD = 20_000  # edges; for fewer, handing work to a thread costs more than the work
 
 OBJECTIVE, PAIRING, ALONG, CHANGE, INTERIOR = range(5)
 """Columns of the sums of a pass: w ||r(D T)||, <rho u, D T>, <rho u, v>, rho ||x' - x||^2, and the
@@ -107,8 +105,7 @@ class EdgePasses:
     ) -> tuple[FloatArray, FloatArray]:
         """Take one proximal step: x_next = relaxation D t + (1 - relaxation) y + u, written; may be x itself.
 
-        Returns:
-            D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
+        Returns D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
         """
 
         def chunk(k: int, first: int, last: int) -> None:

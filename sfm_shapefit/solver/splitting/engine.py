@@ -32,10 +32,9 @@ from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor
 
-# Renewed penalties are rho_e = _PENALTY w_e / max(r_e, floor mean(r)), with the floors of the successive
-# renewals, of which the last one stays.
-_PENALTY = 0.5
-_FLOORS = (0.1, 0.03, 0.01)
+# Renewed penalties are rho_e = _PENALTY w_e / max(r_e, floor mean(r)).
+_PENALTY = 0.5  # dimensionless; see above
+_FLOORS = (0.1, 0.03, 0.01)  # shares of the mean residual, by renewal; the last one stays
 # While the iteration is accelerated every renewal has this floor: even penalties leave more to acceleration.
 _ANDERSON_FLOOR = 0.3
 # A renewal leaves the scale of the penalties alone where primal over dual residual has this value: with
@@ -44,25 +43,19 @@ _ANDERSON_FLOOR = 0.3
 # smaller penalties free them (community graph of 1e4 cameras to 1e-4: 133 iterations instead of 222).
 _BALANCE = 1.0
 _BALANCES = (_BALANCE, _BALANCE, 4.0, 2.0)
-_ANDERSON_MEMORY = 6
-# Over-relaxation and acceleration get in each other's way.
-_ANDERSON_RELAXATION = 1.0
-# Acceleration can pay from this fraction of edges inside their ball on, if noise has not taken away more than
-# a tenth of the fraction one renewal earlier.
-_ANDERSON_INTERIOR = 0.3
-_ANDERSON_KEPT = 0.9
-# The history is discarded where a step is so many times as long as the one before.
-_ANDERSON_GIVE_UP = 4.0
-# Restart without acceleration above 10 times the first objective, which happens where the history is longer
-# than a tiny problem has dimensions. Exact data begin at rounding: a first objective counts as 1e-6 at least.
+_ANDERSON_MEMORY = 6  # differences kept; each costs a pass over the edges
+_ANDERSON_RELAXATION = 1.0  # none; over-relaxation and acceleration get in each other's way
+_ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball; from here on acceleration can pay, unless ...
+_ANDERSON_KEPT = 0.9  # ... less than this share of the fraction one renewal earlier is left; noise rules then
+_ANDERSON_GIVE_UP = 4.0  # length of a step over the one before; a longer one discards the history
+# Ratio to the first objective above which the iteration restarts without acceleration: the history of a tiny
+# problem may be longer than it has dimensions.
 _ASTRAY_PER_FIRST = 10.0
-_LEAST_FIRST_OBJECTIVE = 1e-6
-# The fixed point is taken to be between so many steps of the present length away.
-_STEPS_LEFT = 10.0
-_MOST_STEPS_LEFT = 1000.0
-# The shrinking of the steps is measured over so many iterations.
-_CONTRACTION_WINDOW = 10
-_STALL_WINDOW = 150
+_LEAST_FIRST_OBJECTIVE = 1e-6  # objective, dimensionless; exact data begin at rounding
+_STEPS_LEFT = 10.0  # steps of the present length to the fixed point, at least: convergence is linear
+_MOST_STEPS_LEFT = 1000.0  # likewise, at most; a stalled iteration has no estimate
+_CONTRACTION_WINDOW = 10  # iterations over which the shrinking of the steps is measured; evens it out
+_STALL_WINDOW = 150  # iterations without a better estimate; then it has stalled
 
 
 class Stop(enum.Enum):
@@ -262,11 +255,7 @@ class Iteration:
         return float(max(abs(objective - dual_value), _STEPS_LEFT * change)) / self.kappa
 
     def _error(self, state: State) -> float:
-        """Return the estimate of the error of the objective, in its own units.
-
-        By Cauchy and Schwarz it is at most the step times the distance to the fixed point, both in the norm
-        in which the iteration contracts.
-        """
+        """Return the objective's error, by Cauchy and Schwarz at most the step times the distance left."""
         return state.steps_left * float(state.sums[CHANGE]) / self.kappa
 
     def _renew(self, state: State, floor: float) -> None:
@@ -308,10 +297,7 @@ def _mean(residuals: FloatArray, weights: FloatArray) -> float:
 
 
 def _steps_left(state: State) -> float:
-    """Return how many steps of the present length are left, if they go on to shrink as they do.
-
-    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. After a renewal the steps jump.
-    """
+    """Return how many steps are left, 1 / (1 - q) if they go on to shrink by q; a renewal lets them jump."""
     if len(state.steps) <= _CONTRACTION_WINDOW:
         return state.steps_left
     now, before = state.steps[-1], state.steps[-1 - _CONTRACTION_WINDOW]

@@ -29,18 +29,15 @@ from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTre
 _FLOPS_PER_EDGE = 150_000
 # A solve shrinks the residual to this share; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some.
 _REDUCTION = 0.1
-# Approximate Cholesky needs 2 to 5 steps for that reduction on every family tried.
-_MAX_STEPS = 60
-# If Jacobi solves a probe to 1e-2 in so many steps, the graph is an expander.
-_JACOBI_STEPS = 8
+_MAX_STEPS = 60  # steps, a bound; approximate Cholesky needs 2 to 5 for that reduction on every family tried
+_JACOBI_STEPS = 8  # steps; if Jacobi solves a probe to 1e-2 in so few, the graph is an expander
 # Ordering so many cameras takes a minute; a rough prediction of the work must do there first.
 _HUGE = 400_000
-# The factor of an expander of so many cameras takes longer than it saves.
-_LARGE = 5_000
+_LARGE = 5_000  # cameras of an expander; its factor takes longer than it saves
 # The factor of fewer cameras is small in any type. It is of float64, as those of other solves are, so that
 # the kernels for float32, 2 s of compiling, are no part of a first run.
 _FEW = 500
-_SEED = 1
+_SEED = 1  # seed of the approximate factor; same input, same answer
 
 
 class LaplacianFactor(Protocol):
@@ -106,7 +103,7 @@ class Prediction(NamedTuple):
     """What is known of a graph's factor before any number: the order of elimination, if one is of use."""
 
     tree: EliminationTree | None
-    """Of the order with the least work that was found; None where no order would help enough."""
+    """Elimination tree of the order with the least work; None where no order would help enough."""
 
     @property
     def flops(self) -> float:
@@ -137,14 +134,10 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 def laplacian_factor(
     graph: ViewGraph, resources: Resources = ONE_THREAD, prediction: Prediction | None = None
 ) -> LaplacianFactor:
-    """Return the factor of the resources; if None, a Cholesky factor of the graph's Laplacian.
+    """Return the factor of the resources; if None, a Cholesky factor of the connected graph's Laplacian.
 
-    Or an iterative solver where that factor would not fit, or would take longer than it saves.
-
-    Args:
-        graph: a connected view graph.
-        resources: threads and memory of the factor.
-        prediction: from `predict_factor` on the same graph, if it is there already.
+    Or an iterative solver where that factor would not fit, or would take longer than it saves. `prediction`
+    is that of `predict_factor` on the same graph, if it is there already.
     """
     if resources.factor is not None:
         return resources.factor

@@ -28,12 +28,11 @@ from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Stop, Tuning
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 
-_LEAST_LENGTH = 1.0
+_LEAST_LENGTH = 1.0  # least <t_i - t_j, v_e> of a pair, which sets the scale; as in the paper
 _TUNING = Tuning(relaxation=1.6, renewals=(), penalty=1.0, accelerate=False)
-_REPAIRS = 12
-# The balance is restored twice to this residual, which makes 1e-14.
-_CG_TOL = 1e-7
-_CG_STEPS = 300
+_REPAIRS = 12  # repairs of the dual; each shrinks its violation
+_CG_TOL = 1e-7  # residual to which the balance is restored; twice, which makes 1e-14
+_CG_STEPS = 300  # conjugate gradient steps; a bound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -31,14 +31,11 @@ from sfm_shapefit.solver.splitting.shapefit import Splitting
 
 # The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
 _FIRST_TARGET_PER_TOL = 0.3
-# Where the certificate misses the tolerance, the splitting goes on to this share of the target before.
-_TARGET_SHRINKAGE = 0.1
-_CERTIFICATES = 4
-_NEWTON_STEPS = 30
-# Where one factorization in blocks takes no more operations than the first number, Newton's method may begin
-# twice, and takes over after so many iterations of the splitting.
-_CHEAP_FLOPS = 4e9
-_SPLITTING_BEFORE_NEWTON = 500
+_TARGET_SHRINKAGE = 0.1  # share of the target before; the splitting goes on to it if the certificate misses
+_CERTIFICATES = 4  # certificates tried; a further target is below rounding
+_NEWTON_STEPS = 30  # Newton steps, a bound; from a good start fewer are needed
+_CHEAP_FLOPS = 4e9  # operations of a factorization in blocks; up to these Newton may begin twice, ...
+_SPLITTING_BEFORE_NEWTON = 500  # ... and takes over after so many iterations: the splitting creeps then
 # Newton steps are not taken where one factorization in blocks takes more operations: about a minute.
 _NEWTON_FLOPS = 2e12
 
@@ -65,11 +62,11 @@ class HybridResult:
     locations: FloatArray
     """(n, d) centered, with L(T) = sum of the weights."""
     certificate: Certificate
-    """Of these locations; its dual is feasible."""
+    """Certificate of these locations; its dual is feasible."""
     iterations: int
-    """Of the splitting."""
+    """Iterations of the splitting."""
     factorizations: int
-    """Of the Newton steps, 0 if there were none."""
+    """Factorizations of the Newton steps, 0 if there were none."""
     stop: HybridStop
     """Why the solver returned."""
 
@@ -90,7 +87,7 @@ def solve_hybrid(
         max_iterations: limit of iterations of the splitting. Newton steps follow a stall, or a few hundred
             iterations where they are cheap, not this limit.
         resources: threads, of the passes over edges and of the factor, and memory of a factor.
-        prediction: of the factor, if it is there already, to save a second ordering.
+        prediction: prediction of the factor, if it is there already, to save a second ordering.
         on_iteration: called after each iteration and each factorization; returning False cancels. What
             has been reached is certified all the same.
 
