@@ -4,14 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
+from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.report.drawing import Points, Poses, build_drawing
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 
 
 def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0):
-    """Return a drawing and what locate.json would say of it."""
+    """Return a drawing and what is told of it."""
     rng = np.random.default_rng(seed)
     names = names or [f"images/IMG_{k:05d}.jpg" for k in range(num_cameras)]
     centers, rotations = _ring(num_cameras, rng)
@@ -94,46 +97,85 @@ def _pair(e, names, centers, rng):
 
 
 def _facts(names):
-    return {
-        "inputs": {
-            "model": "project/sparse/0",
-            "database": "project/database.db",
-            "directions": "inlier matches",
-        },
-        "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
-        "residual_level_deg": 0.07,
-        "num_placed": len(names) - 1,
-        "num_images": len(names),
-        "figures": {
-            "pair_error_deg": 0.08,
-            "pair_error_px": 1.4,
-            "sigma": 0.015,
-            "sigma_of_extent": 0.0007,
-            "sigma_unit": "of the input's units",
-        },
-        "sigma_of": "adjusted: noise, rotations, calibration; relative to the model's mean position",
-        "mean_reprojection_error_px": 0.62,
-        "scale": "input: scale and origin of the input's centers",
-        "loose_groups": [{"cameras": list(names[:2]), "cause": "two agreeing pairs or fewer hold it"}],
-        "pieces": [
-            {
-                "num_cameras": len(names),
-                "scale": "input",
-                "hinges": [names[0]],
-                "folder": ".",
-                "num_placed": len(names) - 1,
-            },
-            {"num_cameras": 4, "scale": "unit", "hinges": [names[0]], "folder": "pieces/1", "num_placed": 4},
+    n, start = len(names), "LUD"
+    return ModelFacts(
+        inputs=ModelInputs(
+            model="project/sparse/0", database="project/database.db", directions="inlier matches"
+        ),
+        verdict=ModelVerdict(grade=Grade.LOOK, cameras=(names[0],), reasons=()),
+        options={"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
+        num_images=n,
+        num_placed=n - 1,
+        figures=KeyFigures(
+            pair_error_deg=0.08,
+            pair_error_px=1.4,
+            sigma=0.015,
+            sigma_of_extent=0.0007,
+            sigma_unit="of the input's units",
+        ),
+        num_pairs=120,
+        num_pairs_rejected=18,
+        sigma_of="adjusted: noise, rotations, calibration; relative to the model's mean position",
+        residual_level_deg=0.07,
+        residuals_deg={},
+        pieces=[
+            Piece(num_cameras=n, scale="input", hinges=[names[0]], folder=".", num_placed=n - 1),
+            Piece(num_cameras=4, scale="unit", hinges=[names[0]], folder="pieces/1", num_placed=4),
         ],
-        "verdict": {
-            "grade": "look",
-            "statement": "look at 1 camera (images/IMG_00000.jpg)",
-            "cameras": [names[0]],
-            "reasons": [],
-        },
-        "delivered": {"statement": "ShapeFit's optimum is certified to 3.0e-09; delivered: that optimum"},
-        "solve": {"objective": 0.02, "gap": 3e-9, "unique": True, "status": "converged"},
-        "timings_s": {"read": 0.11, "directions": 0.4, "solve": 0.3, "structure": 0.5},
-        "warnings": ["3 cameras are uncertain by more than 5% of the extent"],
-        "versions": {"sfm_shapefit": "0.1.0", "pycolmap": "4.2.1"},
-    }
+        loose_groups=[LooseGroup(cameras=list(names[:2]), cause="two agreeing pairs or fewer hold it")],
+        delivered=Delivered(
+            statement="ShapeFit's optimum is certified to 3.0e-09; delivered: that optimum",
+            from_certified_median=0.0,
+            from_certified_max=0.0,
+        ),
+        solve=Solve(
+            status="converged",
+            objective=0.02,
+            dual_bound=0.02,
+            gap=3e-9,
+            equality_residual=0.0,
+            unique=True,
+            iterations=9,
+            seconds=0.1,
+            method="newton",
+            method_reason="small",
+        ),
+        finish=Finish(
+            start=start,
+            refined=True,
+            reason="the better one",
+            disagreement=None,
+            costs={start: 1.0},
+            levels_deg=[0.1],
+            moved_median=0.0,
+            moved_max=0.0,
+            num_turned_pairs=0,
+            num_put_back=0,
+            lud=None,
+        ),
+        timings_s={"read": 0.11, "directions": 0.4, "solve": 0.3, "structure": 0.5},
+        warnings=["3 cameras are uncertain by more than 5% of the extent"],
+        versions={"sfm_shapefit": "0.1.0", "pycolmap": "4.2.1"},
+        not_trusted={},
+        few_points={},
+        pairs={"usable": 102, "outlier": 18},
+        agreement=EvidenceShares(pairs=0.8, observations=None, contradicting=None),
+        num_points=500,
+        mean_reprojection_error_px=0.62,
+        num_points_as_nodes=0,
+        scale="input: scale and origin of the input's centers",
+        scale_sigma=None,
+        known_distances=(),
+        control_points=(),
+        datum=None,
+        rigid_groups=None,
+        intrinsics=(),
+        refined_rigs=(),
+        line_sigma=None,
+        num_doubtful_pairs=0,
+        loops=(),
+        adjustment=None,
+        rotation_refinement=None,
+        bundle_adjustment=None,
+        join=None,
+    )

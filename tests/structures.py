@@ -10,11 +10,11 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate as triangulate_matches
-from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
 from sfm_shapefit.files.colmap.images import images_of, put_images
-from sfm_shapefit.files.colmap.own_tracks import triangulate_own_tracks
+from sfm_shapefit.files.colmap.own_tracks import TrackRules, triangulate_own_tracks
 from sfm_shapefit.files.colmap.points import ModelPictures, add_points, points_of
 from sfm_shapefit.files.colmap.seed import copy_without_points
+from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
 
 
@@ -43,15 +43,15 @@ def matches_between(model, image_ids, batches):
 
 def filtered(model, options=None):
     """A copy without the points that violate the options."""
-    options, copy = options or StructureOptions(), pycolmap.Reconstruction(model)
-    filter_in_place(copy, rules_of(options))
+    return with_points(model, points_of(model, posed_images(model)), options, model)
+
+
+def with_points(model, points, options=None, colors=None):
+    """A copy with these points instead of its own, filtered."""
+    images, copy = posed_images(model), copy_without_points(model)
+    kept = filter_points(points, images, ModelPictures(model, images), options or StructureOptions())
+    add_points(copy, images, kept, colors)
     return copy
-
-
-def rules_of(options):
-    return PointRules(
-        options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
-    )
 
 
 def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None, executor=None):
@@ -61,10 +61,11 @@ def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None,
     if own is None:
         points = triangulate_matches(images, tracks, options, advance, executor)
     else:
-        points = triangulate_own_tracks(seed, images, own, rules_of(options), advance, executor)
-    copy = copy_without_points(seed)
-    add_points(copy, images, points, own)
-    return filtered(copy, options)
+        rules = TrackRules(
+            options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
+        )
+        points = triangulate_own_tracks(own, images, rules, advance, executor)
+    return with_points(seed, points, options, own)
 
 
 class AdjustedModel(NamedTuple):
@@ -72,12 +73,10 @@ class AdjustedModel(NamedTuple):
     estimate: Estimate
 
 
-def placed(seed, estimate, points=None, colors=None):
+def placed(seed, estimate):
     """A copy of a seed where an estimate has it."""
     copy = copy_without_points(seed)
     put_images(copy, estimate.images)
-    if points is not None:
-        add_points(copy, estimate.images, points, colors)
     return AdjustedModel(copy, estimate)
 
 
@@ -85,8 +84,8 @@ def bundle_adjusted(seed, tracks, options=None, given=None):
     links = links_of(seed, tracks)
     estimate, points = bundle_adjustment.bundle_adjust(posed_images(seed), links, options, given)
     colors = tracks if isinstance(tracks, pycolmap.Reconstruction) else None
-    found = placed(seed, estimate, points, colors)
-    return found._replace(reconstruction=filtered(found.reconstruction, options))
+    found = placed(seed, estimate)
+    return found._replace(reconstruction=with_points(found.reconstruction, points, options, colors))
 
 
 def adjusted_thinly(seed, tracks, **given):

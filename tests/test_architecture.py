@@ -43,7 +43,6 @@ DOORS = {
     "pycolmap": {
         "files/",
         "pairs/essential.py",
-        "judgement/support.py",  # until it takes arrays
         "synthetic/workspace.py",
         "synthetic/models.py",
         "synthetic/rendered_workspace.py",

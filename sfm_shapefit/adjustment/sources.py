@@ -118,7 +118,8 @@ def _look_up(
     ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
     for k, (begin, end) in enumerate(itertools.pairwise(ends)):
         own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
-        pixels, rays = pictures.look_up(k, keypoints[own])
+        pixels = pictures.pixels(k, keypoints[own])
+        rays = pictures.rays(k, pixels)
         if lens.is_adjustable:
             seen[own], on_plane[own] = pixels, rays[:, :2] / rays[:, 2:]
             continue

@@ -5,8 +5,8 @@ The report is drawn by a layer above this one, which says here how.
 
 import html
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 _MOST_TEXT = 300  # characters; a longer value of a table is counted instead
 _MOST_BYTES = 8_000_000
@@ -17,14 +17,54 @@ _FRAME_HEIGHT_PX = 720  # pixels; as high as a notebook shows at once
 _drawers: list[Callable[[Any], str]] = []
 
 
+class Row(NamedTuple):
+    """A label, and what is told under it, a line each; without lines nothing is told."""
+
+    label: str
+    lines: Sequence[str]
+
+
+def row(label: str, text: str) -> Row:
+    """Return a row of one line, or of none if there is nothing to tell."""
+    return Row(label, [text] if text else [])
+
+
+class NextStep(NamedTuple):
+    """What to do next, and the command that does it.
+
+    In the command, {out} stands for the folder of the result, and {out_further} for one beside it.
+    """
+
+    text: str
+    command: str
+
+
+class Telling(NamedTuple):
+    """What is told of a result in a terminal."""
+
+    counted: str
+    """What was looked at, as "8 images"."""
+    figures: Sequence[Row]
+    """What everybody should see: how much is placed, how well, what is not and why, warnings."""
+    details: Sequence[Row] = ()
+    """What `--verbose` adds, before the figures."""
+    elsewhere: str = "see cameras.csv"
+    """Where lines stand that are too many to be shown."""
+    written: str = ""
+    """What stands in OUT beside the report."""
+    step: NextStep = NextStep("", "")
+    folder: str = "."
+    """The folder in OUT that the next step is about, which has the report."""
+
+
 class Displayed:
     """A result with a one-line `repr`, a `summary`, and a table in notebooks made of it."""
 
     __slots__ = ()
 
-    @abstractmethod
-    def summary(self) -> dict[str, Any]:
+    def summary(self: Any) -> dict[str, Any]:
         """Return the result in plain values, as it stands in JSON."""
+        return dict(self.facts.summary())
 
     @abstractmethod
     def _headline(self) -> str:
@@ -44,13 +84,14 @@ def draw_pages_by(draw: Callable[[Any], str]) -> None:
     _drawers[:] = [draw]
 
 
-def report_in_notebook(found: Any, rows: Iterable[tuple[str, str]]) -> str:
-    """Return the verdict on a result, a table of labels and texts, and the page of its report.
+def report_in_notebook(found: Any, rows: Iterable[Row]) -> str:
+    """Return the verdict on a result, what is told of it, and the page of its report.
 
     The page runs in a frame that can reach nothing. It is left out where it is too large, or nobody draws it.
     """
     color, statement = _COLORS[found.verdict.grade.value], html.escape(found.verdict.statement)
-    table = _table_rows(rows, " style='text-align:left'")
+    told = ((label, "\n".join(lines)) for label, lines in rows if lines)
+    table = _table_rows(told, " style='text-align:left;white-space:pre-line'")
     shown = f"<b style='color:{color}'>{statement}</b><table>{table}</table>"
     page = _drawers[0](found) if _drawers else ""
     if page and len(page) <= _MOST_BYTES:

@@ -1,10 +1,12 @@
-"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: float64 arrays, numpy alone."""
+"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: float64 arrays."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.record import Record
 
 SIGMA_PER_MEDIAN = 1.4826
 """Standard deviation of a normal x over the median of |x|: 1 / Phi^-1(3 / 4)."""
@@ -73,6 +75,20 @@ class Similarity:
     def apply(self, points: FloatArray) -> FloatArray:
         """Map points of shape (n, d)."""
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    @property
+    def facts(self) -> "Alignment":
+        """The map in plain values."""
+        rotation, translation = self.rotation.tolist(), self.translation.tolist()
+        return Alignment(scale=self.scale, rotation=rotation, translation=translation)
+
+
+class Alignment(Record):
+    """A similarity of the world: scale * rotation @ center + translation."""
+
+    scale: Annotated[float, "Units of the one world in one of the other."]
+    rotation: Annotated[list[list[float]], "3 rows."]
+    translation: Annotated[list[float], "In units of the world that is mapped to."]
 
 
 def invert(similarity: Similarity) -> Similarity:

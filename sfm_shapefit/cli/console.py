@@ -8,26 +8,23 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from sfm_shapefit.base.display import Row
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
-    from sfm_shapefit.facts.grade import ModelVerdict
+    from sfm_shapefit.judgement.grade import ModelVerdict
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
-Rows = list[tuple[str, str]]
-"""A two-column table: label and what stands beside it."""
-
 EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130
 NAMES_SHOWN = 8
-SEE_JSON = "see --json"
 
 # With less address space, loading the libraries or their first call fails (measured).
 _LIBRARIES_BYTES = 850_000_000
@@ -219,8 +216,14 @@ def _say_stage(stage: str, done: int, total: int) -> None:
         _say(stage)
 
 
-def print_table(title: str, rows: Rows) -> None:
-    """Print a two-column table on stdout; warnings have a color where the terminal has."""
+def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
+    """Print a two-column table on stdout; warnings have a color where the terminal has.
+
+    Args:
+        title: what stands above it.
+        rows: labels and lines; those without lines are left out.
+        elsewhere: where more lines stand than are shown; if empty, all are shown.
+    """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -229,10 +232,13 @@ def print_table(title: str, rows: Rows) -> None:
     table = Table(title=Text(_encodable(title), overflow="fold"), show_header=False, title_justify="left")
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for label, value in rows:
-        style = _WARNING_STYLE if label.strip() == "warning" else ""
-        text = "\n".join(_encodable(line) for line in value.split("\n"))
-        table.add_row(Text(label, style), Text(text, style))
+    for label, lines in rows:
+        style = _WARNING_STYLE if label == "warning" else ""
+        more = len(lines) - NAMES_SHOWN
+        shown = [*lines[:NAMES_SHOWN], f"and {more} more, {elsewhere}"] if elsewhere and more > 0 else lines
+        text = "\n".join(_encodable(line) for line in "\n".join(shown).split("\n"))
+        if lines:
+            table.add_row(Text(label, style), Text(text, style))
     Console().print(table)
 
 
@@ -259,7 +265,7 @@ def print_steps(steps: Iterable[str]) -> None:
 
 def print_json(summary: dict[str, Any]) -> None:
     """Print a summary as JSON on stdout; one that is no UTF-8 gets escapes, which mean the same."""
-    from sfm_shapefit.facts.tables import dumps
+    from sfm_shapefit.base.record import dumps
 
     text = dumps(summary)
     try:
@@ -273,9 +279,3 @@ def _encodable(text: str) -> str:
     """Return printable text with escapes for what stdout, perhaps an ASCII one, cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
     return make_printable(text).encode(encoding, "backslashreplace").decode(encoding)
-
-
-def shorten(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:
-    """Return the first lines, and how many there are more and where."""
-    more = [f"and {len(lines) - NAMES_SHOWN} more, {elsewhere}"] if len(lines) > NAMES_SHOWN else []
-    return "\n".join([*lines[:NAMES_SHOWN], *more])

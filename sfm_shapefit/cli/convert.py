@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
@@ -48,4 +49,4 @@ def convert_command(
 
         written = convert(source, target, target_format=target_format, overwrite=overwrite)  # type: ignore[arg-type]
         if not quiet:
-            print_table(str(source), [("format", written), ("written to", str(target))])
+            print_table(str(source), [row("format", written), row("written to", str(target))])

@@ -5,14 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import rounded
-from sfm_shapefit.cli.console import SEE_JSON, Rows, print_json, print_table, report_errors, shorten
+from sfm_shapefit.cli.console import print_json, print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
-    from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, Recall
+    from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, PositionFacts, Recall
     from sfm_shapefit.scene.pose_errors import ErrorSummary
 
 _ROUNDING = 1e-9
@@ -79,51 +80,47 @@ def evaluate_command(
             print_json(errors.summary())
         else:
             title = f"{source} against {truth}"
-            print_table(title, _rows_of(errors))
+            print_table(title, _told(errors), "see --json")
 
 
-def _rows_of(errors: "Evaluation | PositionEvaluation") -> Rows:
+def _told(errors: "Evaluation | PositionEvaluation") -> list[Row]:
     """Return the errors against a model or known positions."""
     from sfm_shapefit.scene.evaluation import Evaluation
 
-    return _evaluation_table(errors) if isinstance(errors, Evaluation) else _position_table(errors)
+    common = f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"
+    rows = _evaluation_rows(errors) if isinstance(errors, Evaluation) else _position_rows(errors.facts)
+    return [row("cameras", common), *rows]
 
 
-def _position_table(errors: "PositionEvaluation") -> Rows:
+def _position_rows(facts: "PositionFacts") -> list[Row]:
     """Return the errors against known positions."""
-    rows = [
-        ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
-        ("compared", errors.statement),
+    scale, aligned = facts.ref_from_model.scale, _describe(facts.aligned_position_error)
+    return [
+        row("compared", facts.statement),
+        row("position error", _describe(facts.position_error) if facts.position_error else ""),
+        row("median offset", ", ".join(map(rounded, facts.median_offset or ()))),
+        row("after alignment", f"{aligned}; scale {scale:.6g}"),
     ]
-    if errors.position is not None:
-        offset = ", ".join(rounded(value) for value in errors.summary()["median_offset"])
-        rows += [("position error", _describe(errors.position)), ("median offset", offset)]
-    scale = errors.ref_from_model.scale
-    return [*rows, ("after alignment", f"{_describe(errors.aligned)}; scale {scale:.6g}")]
 
 
-def _evaluation_table(errors: "Evaluation") -> Rows:
+def _evaluation_rows(errors: "Evaluation") -> list[Row]:
     """Return the errors in the reference's units."""
     smallest = _ROUNDING * errors.extent
     worst = [
-        f"{row['name']}: {rounded(row['position_error'], smallest)}, {rounded(row['rotation_error_deg'])} deg"
-        for row in errors.worst(_WORST_SHOWN)
+        f"{one.name}: {rounded(one.position_error, smallest)}, {rounded(one.rotation_error_deg)} deg"
+        for one in errors.worst(_WORST_SHOWN)
     ]
     aucs = [f"{100.0 * auc.auc:.1f} at {auc.threshold_deg:g} deg" for auc in errors.relative_pose_aucs]
+    extent = f"(the reference's cameras extend over {errors.extent:.4g})"
     return [
-        ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
-        *([("missing", shorten(errors.missing, SEE_JSON))] if errors.missing else []),
-        (
-            "position error",
-            f"{_describe(errors.position, smallest)}\n"
-            f"(the reference's cameras extend over {errors.extent:.4g})",
-        ),
-        ("rotation error", f"{_describe(errors.rotation_deg)} deg"),
-        ("relative pose AUC", ", ".join(aucs)),
+        Row("missing", errors.missing),
+        Row("position error", [_describe(errors.position, smallest), extent]),
+        row("rotation error", f"{_describe(errors.rotation_deg)} deg"),
+        row("relative pose AUC", ", ".join(aucs)),
         *_trajectory_rows(errors, smallest),
-        ("within", "\n".join(map(_describe_recall, errors.recalls))),
-        ("worst cameras", "\n".join(worst)),
-        *[("warning", warning) for warning in errors.warnings],
+        row("within", "\n".join(map(_describe_recall, errors.recalls))),
+        Row("worst cameras", worst),
+        *(row("warning", warning) for warning in errors.warnings),
     ]
 
 
@@ -143,13 +140,13 @@ def _describe_recall(recall: "Recall") -> str:
     )
 
 
-def _trajectory_rows(errors: "Evaluation", smallest: float) -> Rows:
+def _trajectory_rows(errors: "Evaluation", smallest: float) -> list[Row]:
     """Return ATE and RPE, if they were asked for."""
     found = errors.trajectory
     if found is None:
         return []
     turned = rounded(found.rpe_rotation_deg.rms)
     return [
-        ("ATE", f"rms {rounded(found.ate.rms, smallest)}, {_describe(found.ate, smallest)}"),
-        ("RPE", f"rms {rounded(found.rpe.rms, smallest)} and {turned} deg, per image"),
+        row("ATE", f"rms {rounded(found.ate.rms, smallest)}, {_describe(found.ate, smallest)}"),
+        row("RPE", f"rms {rounded(found.rpe.rms, smallest)} and {turned} deg, per image"),
     ]

@@ -1,5 +1,7 @@
 """The frame of the commands that make OUT: it is claimed, errors are caught, progress and results shown."""
 
+import re
+import shlex
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Generic
 
 import typer
 
+from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
-    Rows,
     catch_termination,
     print_ending,
     print_json,
@@ -23,29 +25,13 @@ from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
-    from sfm_shapefit.facts.grade import ModelVerdict
+    from sfm_shapefit.facts.map_result import MapResult
+    from sfm_shapefit.facts.result import GraphResult, LocateResult
     from sfm_shapefit.pipeline.clock import Progress
 
 
 _NOTICED_S = 1.0
 """Seconds of compiling that are worth a word."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """What a command tells of its result."""
-
-    figures: Rows
-    """What everybody should see: how much is placed, how well, what is not and why, warnings."""
-    details: Rows
-    """What `--verbose` adds, before the figures."""
-    verdict: "ModelVerdict"
-    steps: Iterable[str]
-    """What to do next, a line each."""
-    timings_s: dict[str, float]
-    """Seconds per stage."""
-    written: str
-    """Where the output is, and what it holds."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -70,23 +56,43 @@ class Run(Generic[Options]):
         how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
         return how | {"protect": self.protect}
 
-    def show(self, title: str, facts: dict[str, Any], told: "Callable[[], Told]") -> None:
-        """Print the facts as JSON, or what is told of them, or nothing, once the output is complete."""
-        if self.flags.json:
-            self.shown = lambda: print_json(facts)
-        elif not self.flags.quiet:
-            self.shown = lambda: self._tell(title, told())
+    def show(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
+        """Print the facts as JSON, or what is told of them, or nothing, once the output is complete.
 
-    def _tell(self, title: str, told: "Told") -> None:
+        The command ends with exit code 4, if that was asked for and the model is not to be used.
+        """
+        self.is_unusable = self.flags.strict and found.verdict.is_bad
+        if self.flags.json:
+            self.shown = lambda: print_json(found.summary())
+        elif not self.flags.quiet:
+            self.shown = lambda: self._tell(found, source, out)
+
+    def _tell(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
         """Print a table, with details if they are wanted, then the verdict and what to do next."""
+        told = found.told
+        page = ", report.html" if self.flags.report and told.folder == "." else ""
         rows = [
-            *(told.details if self.flags.verbose else []),
+            *(told.details if self.flags.verbose else ()),
             *told.figures,
-            ("time", self._describe_time(told.timings_s)),
-            ("written to", told.written),
+            row("warning", self._missing_pictures(found.image_names)),
+            row("time", self._describe_time(found.timings_s)),
+            row("written to", f"{out}: {told.written}{page}"),
         ]
-        print_table(title, rows)
-        print_ending(told.verdict, told.steps)
+        print_table(f"{told.counted} of {source}", rows, told.elsewhere)
+        print_ending(found.verdict, self._next_steps(told.step.command, out / told.folder))
+
+    def _missing_pictures(self, names: Iterable[str]) -> str:
+        """Warn if pictures were asked for, and the folder has none of the images."""
+        folder = Path(self.flags.images)
+        if not self.flags.images or not self.flags.report or any((folder / name).is_file() for name in names):
+            return ""
+        return f"{folder} has none of the images, so the report has no pictures"
+
+    def _next_steps(self, command: str, out: Path) -> list[str]:
+        """Return what to do next, a line each: look at the report, then the command that the report names."""
+        filled = re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
+        opened = [f"open {shlex.quote(str(out / 'report.html'))}"] if self.flags.report else []
+        return [*opened, filled]
 
     def _describe_time(self, timings_s: dict[str, float]) -> str:
         """Say how long the command took, how much of it went into compiling, and, in detail, each stage."""
@@ -96,10 +102,6 @@ class Run(Generic[Options]):
             total += f", of which {compiling:.0f} s compiling kernels, once"
         stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
         return f"{total} ({stages})" if self.flags.verbose else total
-
-    def heed(self, verdict: "ModelVerdict") -> None:
-        """End with exit code 4, if that was asked for and the model is not to be used."""
-        self.is_unusable = self.flags.strict and verdict.is_bad
 
 
 def refuse_swapped(source: Path, target: Path, order: str) -> None:

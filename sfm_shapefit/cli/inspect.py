@@ -2,30 +2,23 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import (
-    NAMES_SHOWN,
-    SEE_JSON,
-    Rows,
     catch_termination,
     print_json,
     print_steps,
     print_table,
     report_errors,
-    shorten,
     show_progress,
 )
 from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import LocateOptions
-
-if TYPE_CHECKING:
-    from sfm_shapefit.pipeline.inspect import Inspection
 
 _INSPECTED = (
     "directions",
@@ -73,38 +66,10 @@ def inspect_command(
             print_json(found.summary())
         else:
             what = "node" if source.is_file() else "image"
-            print_table(f"{counted(found.num_images, what)} of {source}", _inspection_table(found))
+            told = found.told
+            print_table(f"{counted(found.num_images, what)} of {source}", told.figures, told.elsewhere)
             if not found.diagnosis.obstacle:
                 command = "place" if what == "node" else "locate"
                 print_steps([f"sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)
-
-
-def _inspection_table(found: "Inspection") -> Rows:
-    """Return the diagnosis, label by label."""
-    seen = found.diagnosis
-    statuses = "\n".join(f"{count} {status}" for status, count in found.statuses.items())
-    sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
-    sizes += ", ..." if len(seen.components) > NAMES_SHOWN else ""
-    pieces = [
-        counted(piece.num_cameras, "camera")
-        + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
-        for piece in seen.pieces
-    ]
-    left_out = [f"{name}: {reason}" for name, reason in seen.left_out.items()]
-    weak = [f"{camera.name}: {'; '.join(camera.reasons)}" for camera in seen.weak]
-    return [
-        ("directions", found.directions),
-        ("pairs", statuses),
-        ("points as nodes", found.points),
-        ("rigs", found.rigs),
-        ("components", f"{len(seen.components)} (of {sizes} cameras)"),
-        *([("rigid pieces", shorten(pieces, SEE_JSON))] if pieces else []),
-        *([("not placed", shorten(left_out, SEE_JSON))] if left_out else []),
-        *([("weak cameras", shorten(weak, SEE_JSON))] if weak else []),
-        ("contradicting", seen.corruption.statement),
-        *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
-        *([("finish", seen.plan.finish)] if seen.plan else []),
-        *([("will take", found.expected.statement)] if found.expected else []),
-    ]

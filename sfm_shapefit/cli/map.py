@@ -1,12 +1,10 @@
 """`sfm-shapefit map DATABASE OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from sfm_shapefit.base.wording import counted
-from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
     ExecutorName,
     GroupedCommand,
@@ -17,22 +15,9 @@ from sfm_shapefit.cli.flags import (
     one_path,
     takes,
 )
-from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import (
-    control_point_rows,
-    describe_adjustment,
-    describe_points,
-    intrinsics_rows,
-    next_steps,
-    picture_rows,
-    rig_rows,
-    scene_rows,
-)
+from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import MapOptions
-
-if TYPE_CHECKING:
-    from sfm_shapefit.facts.map_result import MapResult
 
 
 @app.command(
@@ -65,53 +50,4 @@ def map_command(
         with open_executor(executor, run.options.num_threads()) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
         write_result(found, target, **run.writing)
-        title = f"{counted(found.num_images, 'image')} of {source}"
-        run.heed(found.models[0].located.verdict)
-        run.show(title, found.summary(), lambda: _tell(found, target, run.flags))
-
-
-def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
-    """Say what each model has, what was left out, and where it is."""
-    from sfm_shapefit.facts.key_figures import figure_rows
-
-    several = len(found.models) > 1
-    figures: Rows = []
-    details: Rows = [("pairs", f"{counted(found.num_pairs, 'pair')} with a relative rotation")]
-    for number, model in enumerate(found.models):
-        located, facts = model.located, model.located.summary()
-        title = [(f"model {number}", located.verdict.statement)] if several else []
-        figures += [
-            *title,
-            *figure_rows(facts),
-            ("points", describe_points(facts)),
-            *intrinsics_rows(facts),
-            *rig_rows(facts),
-            *control_point_rows(facts),
-            *scene_rows(facts),
-            *[("warning", warning) for warning in located.warnings],
-        ]
-        details += [
-            *title,
-            ("rotations", model.averaging.statement),
-            ("centers", located.placement.refined.statement()),
-            ("scale", located.gauge.statement),
-            *([("bundle adjustment", describe_adjustment(located.adjusted))] if located.adjusted else []),
-            ("certificate", located.departure.statement),
-        ]
-    folders = [*map(str, range(len(found.models))), *(one.folder for one in found.joined)]
-    left_out = [f"{name}: {reason}" for name, reason in found.left_out.items()]
-    return Told(
-        figures=[
-            *figures,
-            *[("joined" if join.join else "not joined", join.statement) for join in found.joins],
-            *[(one.folder, one.facts["verdict"]["statement"]) for one in found.joined],
-            *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
-            *[("warning", warning) for warning in found.warnings],
-            *picture_rows(flags, [name for model in found.models for name in model.located.model.names]),
-        ],
-        details=details,
-        verdict=found.models[0].located.verdict,
-        steps=next_steps(dict(found.models[0].located.summary()), out / "0", flags),
-        timings_s=found.timings_s,
-        written=f"{out}: {'models' if several else 'a model'} in {', '.join(folders)}, map.json",
-    )
+        run.show(found, source, target)

@@ -1,20 +1,14 @@
 """`sfm-shapefit place GRAPH OUT`, or by its other name `solve`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from sfm_shapefit.base.wording import counted
-from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
-from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import further_piece_rows, next_steps
+from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
-
-if TYPE_CHECKING:
-    from sfm_shapefit.facts.result import GraphResult
 
 
 @app.command("solve", cls=GroupedCommand, hidden=True, epilog="Example: sfm-shapefit place graph.txt out")
@@ -82,42 +76,4 @@ def place_command(
         )
         files = export_files(found, g2o=g2o, onedsfm=onedsfm)
         write_result(found, target, further_files=files, **run.writing)
-        title = f"{counted(found.placement.graph.num_nodes, 'node')} of {source}"
-        run.heed(found.verdict)
-        run.show(title, found.summary(), lambda: _tell(found, target, run.flags))
-
-
-def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
-    """Say what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.facts.key_figures import figure_rows
-
-    placement, facts = found.placement, found.summary()
-    left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
-    rejected = counted(len(placement.rejected_pairs), "pair")
-    return Told(
-        figures=[
-            *figure_rows(facts),
-            *([("not placed", shorten(left_out))] if left_out else []),
-            *further_piece_rows(facts),
-            *[("warning", warning) for warning in facts["warnings"]],
-        ],
-        details=[
-            ("directions", found.statement),
-            ("dimension", str(placement.graph.dimension)),
-            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution"),
-            ("residuals", _describe_residuals(facts["residuals_deg"])),
-            ("locations", placement.refined.statement()),
-            ("certificate", found.departure.statement),
-        ],
-        verdict=found.verdict,
-        steps=next_steps(facts, out, flags),
-        timings_s=found.timings_s,
-        written=f"{out}: locate.json, cameras.csv, pairs.csv{', report.html' * flags.report}",
-    )
-
-
-def _describe_residuals(found: dict[str, float]) -> str:
-    """Say how far the placed pairs are off the solution."""
-    quantiles = [f"{found[f'quantile_{q}']:.3g}" for q in (25, 50, 75, 90)]
-    beyond = [f"{found[f'share_beyond_{angle}']:.1%} beyond {angle}" for angle in (1, 2, 5, 10, 30, 90)]
-    return f"25/50/75/90 % of the pairs within {' / '.join(quantiles)} deg\n{', '.join(beyond)} deg"
+        run.show(found, source, target)

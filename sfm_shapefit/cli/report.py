@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import (
     catch_termination,
     print_steps,
@@ -72,7 +73,7 @@ def _report_output(folder: Path, images: Path | None) -> None:
     pictures = _pictures(drawn, images)
     try:
         write_report(drawn, facts, folder / "report.html", pictures)
-        print_table(str(folder), [("written", "report.html")])
+        print_table(str(folder), [row("written", "report.html")])
         print_steps([f"open {shlex.quote(str(folder / 'report.html'))}"])
     except OSError as error:
         what = f"{folder} cannot be written ({error.strerror})"
@@ -102,7 +103,7 @@ def _report_model(
         raise InputError(f"{page} cannot be written ({error.strerror}); choose another place") from error
     said = banner(drawn, facts)
     verdict = f"{said['headline']}. {said['sentence']}".strip()
-    print_table(str(folder), [("verdict", verdict), ("written", str(page))])
+    print_table(str(folder), [row("verdict", verdict), row("written", str(page))])
     print_steps([f"open {shlex.quote(str(page))}"])
 
 

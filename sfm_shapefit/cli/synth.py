@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputPath, one_path, read_options, takes
@@ -35,10 +36,10 @@ def synth_command(
         if not images and render != RenderOptions():
             raise InputError("the options of drawing need --images; add it, or leave them out")
         rows = _write_drawn(scene, render, target, workspace) if images else _write(scene, target, workspace)
-        print_table(f"{scene.shape}, seed {scene.seed}", [*rows, ("written to", str(target))])
+        print_table(f"{scene.shape}, seed {scene.seed}", [*rows, row("written to", str(target))])
 
 
-def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[tuple[str, str]]:
+def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[Row]:
     """Write a workspace whose keypoints are projected points; return what to print of it."""
     from sfm_shapefit.synthetic import make_scene
     from sfm_shapefit.synthetic.workspace import write_workspace
@@ -46,25 +47,25 @@ def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> 
     scene = make_scene(options)
     write_workspace(scene, target, workspace)
     return [
-        ("images", str(len(scene.keypoints))),
-        ("points", str(len(scene.points))),
-        ("pairs", f"{len(scene.pairs)}, of which {int(scene.pair_is_corrupted.sum())} wrong"),
+        row("images", str(len(scene.keypoints))),
+        row("points", str(len(scene.points))),
+        row("pairs", f"{len(scene.pairs)}, of which {int(scene.pair_is_corrupted.sum())} wrong"),
     ]
 
 
 def _write_drawn(
     options: SceneOptions, render: RenderOptions, target: Path, workspace: WorkspaceOptions
-) -> list[tuple[str, str]]:
+) -> list[Row]:
     """Write a workspace with images; return what to print of it."""
     from sfm_shapefit.synthetic import make_rendered_scene
     from sfm_shapefit.synthetic.rendered_workspace import judge_matches, write_rendered_workspace
 
     scene = make_rendered_scene(options, render)
     write_rendered_workspace(scene, target, workspace)
-    rows = [("images", str(scene.num_images))]
+    rows = [row("images", str(scene.num_images))]
     if workspace.database:
         judged = judge_matches(scene, target / "database.db")
         wrong = int(judged.pair_is_wrong.sum())
-        rows.append(("matches", f"{len(judged.is_right)}, of which {int((~judged.is_right).sum())} wrong"))
-        rows.append(("pairs", f"{len(judged.pair_is_wrong)}, of which {wrong} wrong"))
+        rows.append(row("matches", f"{len(judged.is_right)}, of which {int((~judged.is_right).sum())} wrong"))
+        rows.append(row("pairs", f"{len(judged.pair_is_wrong)}, of which {wrong} wrong"))
     return rows

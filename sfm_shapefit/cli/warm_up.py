@@ -1,5 +1,6 @@
 """`sfm-shapefit warm-up`."""
 
+from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import print_table, report_errors, say_now_and_then, show_progress
 from sfm_shapefit.cli.flags import GroupedCommand, Quiet
 from sfm_shapefit.cli.root import app
@@ -29,4 +30,4 @@ def warm_up_command(*, quiet: Quiet = False) -> None:
             raise WarmUpError("; ".join(done.failures))
         if not quiet:
             ready = f"{done.num_kernels} ready on disk" if done.num_kernels else "ready on disk since before"
-            print_table("warm-up", [("kernels", ready)])
+            print_table("warm-up", [row("kernels", ready)])

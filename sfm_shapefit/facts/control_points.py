@@ -1,13 +1,42 @@
 """What is told of ground control points: a row for each, warnings, and one sentence on all."""
 
 from collections.abc import Iterator, Sequence
+from typing import Annotated, Literal
 
 import numpy as np
 
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.json_types import ControlPoint
 from sfm_shapefit.placement.control_points import ControlFit, TriangulatedControl
 from sfm_shapefit.scene.given import ControlPoints
+
+
+class ControlPoint(Record):
+    """A ground control point, and where the model has it."""
+
+    name: Annotated[str, "As the file calls it, or else its coordinates."]
+    use: Annotated[
+        Literal["control", "check", "unused"],
+        "Whether it sets scale and axes, only checks the model, or contradicts the others or has no place.",
+    ]
+    known: Annotated[list[float], "Where it is, in the output's axes."]
+    residual: Annotated[list[float] | None, "The model's position minus the known one; null if it has none."]
+    error: Annotated[float | None, "Length of the residual."]
+    error_px: Annotated[float | None, "Mean distance of its marks from the point in the model, in pixels."]
+    num_marks: Annotated[int, "Images of the model in which it is marked."]
+    num_agreeing_marks: Annotated[int, "Of these, placed ones whose marks agree."]
+
+    @property
+    def cells(self) -> list[str]:
+        """Name, use, error and its axes, pixels and marks, as the report has them in a row."""
+        return [
+            self.name,
+            self.use,
+            "" if self.error is None else f"{self.error:.3g}",
+            ", ".join(f"{value:.3g}" for value in self.residual or ()),
+            "" if self.error_px is None else f"{self.error_px:.2g}",
+            f"{self.num_agreeing_marks} of {self.num_marks}",
+        ]
 
 
 def control_rows(
@@ -15,7 +44,7 @@ def control_rows(
 ) -> list[ControlPoint]:
     """Return what stands of each point in locate.json."""
     fitted = fit if isinstance(fit, ControlFit) else None
-    rows: list[ControlPoint] = []
+    rows = []
     for k, name in enumerate(known.names):
         own = known.points == k
         residual = np.full(3, np.nan) if fitted is None else fitted.residuals[k]
@@ -23,16 +52,16 @@ def control_rows(
         errors = found.errors_px[own & found.agreeing]
         sets = fitted is not None and bool(fitted.fitting[k])
         rows.append(
-            {
-                "name": name,
-                "use": "check" if known.is_check[k] else "control" if sets else "unused",
-                "known": known.positions[k].tolist(),
-                "residual": residual.tolist() if there else None,
-                "error": float(np.linalg.norm(residual)) if there else None,
-                "error_px": float(np.mean(errors)) if len(errors) else None,
-                "num_marks": int(own.sum()),
-                "num_agreeing_marks": int(np.sum(own & found.agreeing)),
-            }
+            ControlPoint(
+                name=name,
+                use="check" if known.is_check[k] else "control" if sets else "unused",
+                known=known.positions[k].tolist(),
+                residual=residual.tolist() if there else None,
+                error=float(np.linalg.norm(residual)) if there else None,
+                error_px=float(np.mean(errors)) if len(errors) else None,
+                num_marks=int(own.sum()),
+                num_agreeing_marks=int(np.sum(own & found.agreeing)),
+            )
         )
     return rows
 
@@ -72,28 +101,14 @@ def describe_control_points(rows: Sequence[ControlPoint]) -> str:
     """Say how far the model is off control points and check points; empty where there are none."""
     parts = []
     for use, noun in (("control", "control point"), ("check", "check point")):
-        own = [row for row in rows if row["use"] == use and row["error"] is not None]
+        own = [row for row in rows if row.use == use and row.error is not None]
         if own:
-            errors = [row["error"] or 0.0 for row in own]
-            worst = own[int(np.argmax(errors))]["name"]
+            errors = [row.error or 0.0 for row in own]
+            worst = own[int(np.argmax(errors))].name
             typical = float(np.sqrt(np.mean(np.square(errors))))
             off = f"off by {typical:.3g} (root mean square), {worst} most, by {max(errors):.3g}"
             parts.append(f"{counted(len(own), noun)} {off}")
-    unused = sum(row["use"] == "unused" for row in rows)
+    unused = sum(row.use == "unused" for row in rows)
     if unused:
         parts.append(f"{unused} not used")
     return "; ".join(parts)
-
-
-def control_cells(row: ControlPoint) -> list[str]:
-    """Return the cells of a point's row: name, use, error and its axes, pixels, marks."""
-    residual, error, pixels = row["residual"], row["error"], row["error_px"]
-    axes = ", ".join(f"{value:.3g}" for value in residual) if residual else ""
-    return [
-        row["name"],
-        row["use"],
-        "" if error is None else f"{error:.3g}",
-        axes,
-        "" if pixels is None else f"{pixels:.2g}",
-        f"{row['num_agreeing_marks']} of {row['num_marks']}",
-    ]

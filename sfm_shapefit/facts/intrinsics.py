@@ -1,15 +1,15 @@
 """What became of intrinsics that were in doubt: which, why, how they changed, and how sure that is."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import UNREFINED, RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of
-from sfm_shapefit.facts.json_types import CameraIntrinsics
 from sfm_shapefit.files.colmap.intrinsics import Origin
 
 if TYPE_CHECKING:
@@ -21,6 +21,52 @@ _UNCHANGED = 1e-12
 _FOUND = ("adjusted", "view graph")
 
 How = Literal["adjusted", "view graph", "undetermined", "held"]
+
+
+class CameraIntrinsics(Record):
+    """A camera whose intrinsics were in doubt, and what became of them."""
+
+    camera: Annotated[int, "Its id in the model."]
+    num_images: Annotated[int, "Placed images that it took."]
+    model: Annotated[str, "COLMAP's name of its model."]
+    origin: Annotated[str, "Where what was given comes from: a guess, EXIF data, or given."]
+    decided_by: Annotated[
+        How,
+        "What decided about its focal length: the adjustments; the fundamental matrices alone; the matches "
+        "do not tell it, so that it stays as given, and only the distortion may change; it was not to be "
+        "changed.",
+    ]
+    given_focal_px: Annotated[float, "Mean focal length as given."]
+    focal_px: Annotated[float, "Mean focal length of the output."]
+    focal_sigma_px: Annotated[float | None, "Its standard deviation by the noise alone; null if not known."]
+    given_parameters: Annotated[list[float], "All parameters as given, in COLMAP's order."]
+    parameters: Annotated[list[float], "All parameters of the output."]
+
+    @property
+    def statement(self) -> str:
+        """What the camera was given, what it has, and why."""
+        head = f"camera {self.camera}: focal length {self.given_focal_px:,.1f} px ({self.origin})"
+        if self.decided_by == "undetermined":
+            return f"{head} kept, the matches do not tell it{self._distortion()}"
+        if self.decided_by == "held":
+            return f"{head} kept"
+        by = "by the view graph" if self.decided_by == "view graph" else "by adjustment"
+        doubt = "" if self.focal_sigma_px is None else f" +- {self.focal_sigma_px:,.1f}"
+        return f"{head} became {self.focal_px:,.1f}{doubt} px ({self.change:+.1%}) {by}{self._distortion()}"
+
+    @property
+    def change(self) -> float:
+        """By which share the focal length became larger."""
+        return self.focal_px / self.given_focal_px - 1.0
+
+    def _distortion(self) -> str:
+        """Say how the distortion changed, if it did."""
+        before, after = np.array(self.given_parameters), np.array(self.parameters)
+        is_distortion = np.abs(after) < 10.0  # lengths in pixels are larger
+        changed = is_distortion & (np.abs(after - before) > _UNCHANGED)
+        if not changed.any():
+            return ""
+        return ", distortion " + ", ".join(f"{value:.4f}" for value in after[is_distortion])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,18 +107,18 @@ class Intrinsics:
     def _row(self, camera: int, found: "pycolmap.Camera", num_images: int) -> CameraIntrinsics:
         given, sigma = self.given[camera], self.refined.sigmas.get(camera, np.nan)
         known = self.how(camera) == "adjusted" and np.isfinite(sigma)
-        return {
-            "camera": camera,
-            "num_images": num_images,
-            "model": found.model_name,
-            "origin": self.origins[camera].value,
-            "decided_by": self.how(camera),
-            "given_focal_px": _focal_px(given),
-            "focal_px": _focal_px(found),
-            "focal_sigma_px": float(sigma) * _focal_px(found) if known else None,
-            "given_parameters": given.params.tolist(),
-            "parameters": found.params.tolist(),
-        }
+        return CameraIntrinsics(
+            camera=camera,
+            num_images=num_images,
+            model=found.model_name,
+            origin=self.origins[camera].value,
+            decided_by=self.how(camera),
+            given_focal_px=_focal_px(given),
+            focal_px=_focal_px(found),
+            focal_sigma_px=float(sigma) * _focal_px(found) if known else None,
+            given_parameters=given.params.tolist(),
+            parameters=found.params.tolist(),
+        )
 
 
 NO_DOUBTS = Intrinsics()
@@ -84,17 +130,12 @@ def _focal_px(camera: "pycolmap.Camera") -> float:
     return float(np.mean(camera.params[indices])) if len(indices) else float(camera.params[0])
 
 
-def describe_intrinsics(rows: list[CameraIntrinsics]) -> list[str]:
+def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     """Return a sentence for each camera in doubt, most images first; of many, one for all."""
-    if len(rows) > _NAMED:
-        return [_describe_together(rows)]
-    return [_describe(row) for row in sorted(rows, key=lambda row: (-row["num_images"], row["camera"]))]
-
-
-def _describe_together(rows: list[CameraIntrinsics]) -> str:
-    """Say what became of many cameras."""
-    changes = [row["focal_px"] / row["given_focal_px"] - 1.0 for row in rows if row["decided_by"] in _FOUND]
-    unknown = sum(row["decided_by"] == "undetermined" for row in rows)
+    if len(rows) <= _NAMED:
+        return [row.statement for row in sorted(rows, key=lambda row: (-row.num_images, row.camera))]
+    changes = [row.change for row in rows if row.decided_by in _FOUND]
+    unknown = sum(row.decided_by == "undetermined" for row in rows)
     held = len(rows) - len(changes) - unknown
     parts = [f"{len(changes)} of {len(rows)} cameras in doubt have another focal length now"]
     if changes:
@@ -102,38 +143,12 @@ def _describe_together(rows: list[CameraIntrinsics]) -> str:
         parts = [f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%})"]
     parts += [f"{unknown} kept what was given, as the matches do not tell it"] if unknown else []
     parts += [f"{held} were not to be changed"] if held else []
-    return "; ".join(parts) + "; each stands in locate.json"
+    return ["; ".join(parts) + "; each stands in locate.json"]
 
 
-def _describe(row: CameraIntrinsics) -> str:
-    """Say what a camera was given, what it has, and why."""
-    given, found = row["given_focal_px"], row["focal_px"]
-    head = f"camera {row['camera']}: focal length {given:,.1f} px ({row['origin']})"
-    if row["decided_by"] == "undetermined":
-        return f"{head} kept, the matches do not tell it{_describe_distortion(row)}"
-    if row["decided_by"] == "held":
-        return f"{head} kept"
-    by = "by the view graph" if row["decided_by"] == "view graph" else "by adjustment"
-    sigma = row["focal_sigma_px"]
-    doubt = "" if sigma is None else f" +- {sigma:,.1f}"
-    return (
-        f"{head} became {found:,.1f}{doubt} px ({found / given - 1.0:+.1%}) {by}{_describe_distortion(row)}"
-    )
-
-
-def _describe_distortion(row: CameraIntrinsics) -> str:
-    """Say how the distortion changed, if it did."""
-    before, after = (np.array(row[key]) for key in ("given_parameters", "parameters"))
-    is_distortion = np.abs(after) < 10.0  # lengths in pixels are larger
-    changed = is_distortion & (np.abs(after - before) > _UNCHANGED)
-    if not changed.any():
-        return ""
-    return ", distortion " + ", ".join(f"{value:.4f}" for value in after[is_distortion])
-
-
-def intrinsics_warnings(intrinsics: Intrinsics, rows: list[CameraIntrinsics]) -> Iterator[str]:
+def intrinsics_warnings(intrinsics: Intrinsics, rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     """Yield which cameras keep a focal length that was never measured."""
-    guessed = [row for row in rows if intrinsics.origins[row["camera"]] is not Origin.CALIBRATION]
+    guessed = [row for row in rows if intrinsics.origins[row.camera] is not Origin.CALIBRATION]
     for how, what in (
         (
             "undetermined",
@@ -141,7 +156,7 @@ def intrinsics_warnings(intrinsics: Intrinsics, rows: list[CameraIntrinsics]) ->
         ),
         ("held", "which stays as it is: --intrinsics auto, and an adjustment, would refine it"),
     ):
-        cameras = [str(row["camera"]) for row in guessed if row["decided_by"] == how]
+        cameras = [str(row.camera) for row in guessed if row.decided_by == how]
         if cameras:
             noun = "cameras" if len(cameras) > 1 else "camera"
             yield (

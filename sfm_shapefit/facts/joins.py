@@ -1,15 +1,29 @@
 """What `map` says of models beside the largest: joined to another, how and how surely, or why not."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Annotated
 
-from sfm_shapefit.facts.json_types import Join, JoinedSummary
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.base.geometry import Alignment
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.placement.join import ModelJoin
 
-if TYPE_CHECKING:
-    import pycolmap
+
+class JoinFacts(Record):
+    """A model of `map` beside the largest, and what came of joining it to a larger one."""
+
+    model: Annotated[str, "Its folder."]
+    to: Annotated[str, "The folder of the model that it was to be joined to."]
+    joined: Annotated[bool, "Whether it was."]
+    folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."]
+    statement: Annotated[str, "How and how surely, or why not, in words."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."]
+    turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."]
+    center_sigma: Annotated[
+        float | None,
+        "Standard deviation of where its cameras come to lie, median, in units of the model that it is "
+        "joined to.",
+    ]
+    similarity: Annotated[Alignment | None, "From its world to that of the model that it is joined to."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,47 +51,17 @@ class Joined:
             f"{join.center_sigma:.2g} units of model {self.to}"
         )
 
-    def summary(self, folder: str | None) -> Join:
+    def facts(self, folder: str | None) -> JoinFacts:
         """Return what stands in map.json and in the model's locate.json."""
         join = self.join
-        return {
-            "model": str(self.model),
-            "to": str(self.to),
-            "joined": join is not None,
-            "folder": folder,
-            "statement": self.statement,
-            "scale_sigma": None if join is None else join.scale_sigma,
-            "turn_sigma_deg": None if join is None else join.turn_sigma_deg,
-            "center_sigma": None if join is None else join.center_sigma,
-            "similarity": None
-            if join is None
-            else {
-                "scale": join.first_from_second.scale,
-                "rotation": join.first_from_second.rotation.tolist(),
-                "translation": join.first_from_second.translation.tolist(),
-            },
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JoinedModel:
-    """Models in one world, and what can be said of them together."""
-
-    reconstruction: "pycolmap.Reconstruction"
-    models: tuple[int, ...]
-    """Their numbers; the world is that of the first, scaled if known distances between them tell."""
-    cameras: Sequence[CameraRow]
-    """One row per image of these models."""
-    pairs: Sequence[PairRow]
-    """One row per pair of these that was looked at."""
-    facts: JoinedSummary
-    """What stands in its locate.json."""
-
-    def summary(self) -> dict[str, Any]:
-        """Return what stands in its locate.json."""
-        return dict(self.facts)
-
-    @property
-    def folder(self) -> str:
-        """Where it stands in OUT."""
-        return f"joined_{self.models[0]}"
+        return JoinFacts(
+            model=str(self.model),
+            to=str(self.to),
+            joined=join is not None,
+            folder=folder,
+            statement=self.statement,
+            scale_sigma=None if join is None else join.scale_sigma,
+            turn_sigma_deg=None if join is None else join.turn_sigma_deg,
+            center_sigma=None if join is None else join.center_sigma,
+            similarity=None if join is None else join.first_from_second.facts,
+        )

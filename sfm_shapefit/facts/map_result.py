@@ -6,18 +6,23 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 """
 
 import html
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING
 
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Displayed, Row, Telling, row
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.joins import Joined, JoinedModel
-from sfm_shapefit.facts.json_types import Averaging, LocateSummary, MapSummary
+from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, JoinedFacts, MapFacts
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import SCHEMA_VERSION
+from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.judgement.grade import ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
+
+if TYPE_CHECKING:
+    import pycolmap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,6 +33,26 @@ class MappedModel:
     averaging: AveragedRotations
     """The rotations it started from, of the images in `names`."""
     names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JoinedModel:
+    """Models in one world, and what can be said of them together."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    models: tuple[int, ...]
+    """Their numbers; the world is that of the first, scaled if known distances between them tell."""
+    cameras: Sequence[CameraRow]
+    """One row per image of these models."""
+    pairs: Sequence[PairRow]
+    """One row per pair of these that was looked at."""
+    facts: JoinedFacts
+    """What stands in its locate.json."""
+
+    @property
+    def folder(self) -> str:
+        """Where it stands in OUT."""
+        return f"joined_{self.models[0]}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -58,32 +83,60 @@ class MapResult(Displayed):
         """Number of cameras in all models."""
         return sum(int(model.located.kept.sum()) for model in self.models)
 
-    def summary(self) -> dict[str, Any]:
-        """Return what stands in map.json."""
-        facts: MapSummary = {
-            "schema_version": SCHEMA_VERSION,
-            "inputs": {"database": str(self.database)},
-            "options": asdict(self.options),
-            "num_images": self.num_images,
-            "num_placed": self.num_placed,
-            "num_video_frames": self.num_video_frames,
-            "num_pairs": self.num_pairs,
-            "models": [
-                {
-                    "folder": str(number),
-                    "num_images": len(model.names),
-                    "num_placed": int(model.located.kept.sum()),
-                    "averaging": cast("Averaging", model.averaging.summary()),
-                    "located": cast("LocateSummary", model.located.summary()),
-                }
+    @property
+    def verdict(self) -> ModelVerdict:
+        """Whether the largest model can be used, and why."""
+        return self.models[0].located.verdict
+
+    @property
+    def facts(self) -> MapFacts:
+        """What is told of the run: each figure of map.json."""
+        return MapFacts.taken_from(
+            self,
+            inputs=DatabaseInputs(database=str(self.database)),
+            options=asdict(self.options),
+            models=[
+                Component(
+                    folder=str(number),
+                    num_images=len(model.names),
+                    num_placed=int(model.located.kept.sum()),
+                    averaging=Averaging(**model.averaging.summary()),
+                    located=model.located.facts,
+                )
                 for number, model in enumerate(self.models)
             ],
-            "joins": [join.summary(self.folder_of_join(join)) for join in self.joins],
-            "left_out": self.left_out,
-            "timings_s": self.timings_s,
-            "warnings": list(self.warnings),
-        }
-        return dict(facts)
+            joins=[join.facts(self.folder_of_join(join)) for join in self.joins],
+        )
+
+    @property
+    def told(self) -> Telling:
+        """What the terminal says: of each model, of joins, and of what was left out."""
+        largest, figures = self.models[0].located.facts, list[Row]()
+        details = [row("pairs", f"{counted(self.num_pairs, 'pair')} with a relative rotation")]
+        for number, model in enumerate(self.models):
+            title = row(f"model {number}", model.located.verdict.statement if len(self.models) > 1 else "")
+            told = model.located.facts.told((), model.located.placement.refined.statement())
+            figures += [title, *told.figures]
+            details += [title, row("rotations", model.averaging.statement), *told.details]
+        figures += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        figures += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
+        figures += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
+        figures += [row("warning", warning) for warning in self.warnings]
+        folders = ", ".join([*map(str, range(len(self.models))), *(one.folder for one in self.joined)])
+        return Telling(
+            counted(self.num_images, "image"),
+            figures,
+            details,
+            elsewhere="see map.json",
+            written=f"{'models' if len(self.models) > 1 else 'a model'} in {folders}, map.json",
+            step=largest.next_step,
+            folder="0",
+        )
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of all images of the models."""
+        return tuple(name for model in self.models for name in model.located.image_names)
 
     def folder_of_join(self, join: Joined) -> str | None:
         """Return where the models of a join stand in one world; None if they were not joined."""
@@ -102,7 +155,7 @@ def tell_joins(result: MapResult) -> MapResult:
     """Return the result whose models know what came of joining them."""
     models = list(result.models)
     for join in result.joins:
-        facts = join.summary(result.folder_of_join(join))
+        facts = join.facts(result.folder_of_join(join))
         models[join.model] = replace(
             models[join.model], located=replace(models[join.model].located, join=facts)
         )

@@ -1,31 +1,50 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed, report_in_notebook
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.certified import Departure, compare_with_certified
-from sfm_shapefit.facts.columns import Column, TableName, table_of
-from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
+from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import Intrinsics
-from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
-from sfm_shapefit.facts.key_figures import figure_rows
+from sfm_shapefit.facts.joins import JoinFacts
+from sfm_shapefit.facts.model import (
+    BundleAdjustment,
+    EarthDatum,
+    EvidenceShares,
+    GroupFacts,
+    ModelFacts,
+    ModelInputs,
+    PlacementAdjustment,
+    RotationRefinement,
+)
 from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.placed import (
+    IN_MEMORY,
+    SOLVER_UNITS,
+    UNITS,
+    Delivered,
+    GraphFacts,
+    GraphInputs,
+    facts_of_placement,
+)
+from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
-from sfm_shapefit.facts.summary import summarize_graph, summarize_model
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.scene import Loop, told_distances
+from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
+from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -42,6 +61,7 @@ if TYPE_CHECKING:
 
 
 NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
+_SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 CARRIED_FIXED = "fixed; no pair of it takes part"
 CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
 
@@ -59,23 +79,14 @@ class Inputs:
     left_out: PairNames = frozenset()
     """Pairs that are taken for unmatched."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Loop:
-    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
-
-    first: tuple[str, str]
-    """The first and the last frame of the earlier stretch."""
-    second: tuple[str, str]
-    """Those of the later one."""
-    num_pairs: int
-    num_matches: int
-    num_refused: int
-    """Pairs that were left out, because they do not agree with the chain of pairs near in time."""
-    angle_deg: float
-    """Median angle between the relative rotations of these pairs and those of the chain."""
-    tolerance_deg: float
-    """Up to where they agree with it."""
+    @property
+    def facts(self) -> ModelInputs:
+        """What is told of them."""
+        return ModelInputs(
+            model=str(self.folder or IN_MEMORY),
+            database=None if self.database is None else str(self.database),
+            directions=self.statement,
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -145,16 +156,55 @@ class LocateResult(Displayed):
     """Ground control points with their residuals, where some are given."""
     suspicions: tuple[str, ...] = ()
     """What those who gave the rotations saw that speaks against the model, for its verdict."""
-    join: Join | None = None
+    join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
 
-    def summary(self) -> dict[str, Any]:
-        """Return what stands in locate.json."""
-        return dict(self._summary)
-
     @cached_property
-    def _summary(self) -> LocateSummary:
-        return summarize_model(self)
+    def facts(self) -> ModelFacts:
+        """What is told of the model: each figure of locate.json, terminal and report."""
+        placement, model, gauge = self.placement, self.reconstruction, self.gauge
+        solved = [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in (self, *self.further)]
+        measures = (float(np.median(self.model.focal_lengths_px)), UNITS[gauge.scale])
+        facts = facts_of_placement(placement, self.cameras, solved, measures) | {
+            "num_images": len(self.image_names),
+            "num_placed": model.num_reg_images(),
+            "num_pairs": len(self.directions.pairs),
+        }
+        facts["num_pairs_rejected"] += len(self.directions.pairs) - placement.num_pairs
+        return ModelFacts.taken_from(
+            self,
+            **facts,
+            options=asdict(self.options),
+            inputs=self.inputs.facts,
+            not_trusted=self._not_trusted(),
+            few_points={self.model.names[camera]: count for camera, count in self.few_points.items()},
+            pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
+            | {"outlier": len(placement.rejected_pairs)},
+            agreement=EvidenceShares(
+                pairs=self.agreeing_pairs,
+                observations=self.agreeing_observations,
+                contradicting=self.contradicting_observations,
+            ),
+            num_points=model.num_points3D(),
+            mean_reprojection_error_px=model.compute_mean_reprojection_error(),
+            num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
+            scale=gauge.statement,
+            scale_sigma=gauge.scale_sigma,
+            known_distances=told_distances(self.options.known_distance, model),
+            datum=EarthDatum.of(gauge.datum),
+            rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
+            intrinsics=tuple(self.intrinsics.rows(model)),
+            refined_rigs=self.rigs,
+            num_doubtful_pairs=len(self.doubtful_pairs),
+            adjustment=PlacementAdjustment.of_estimate(self.adjustment),
+            rotation_refinement=RotationRefinement.of_turns(self.turned_deg),
+            bundle_adjustment=BundleAdjustment.of(self.adjusted),
+        )
+
+    @property
+    def told(self) -> Telling:
+        """What the terminal says."""
+        return self.facts.told(_left_out(self.cameras), self.placement.refined.statement())
 
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
@@ -162,8 +212,7 @@ class LocateResult(Displayed):
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
-        warnings = [("warning", warning) for warning in self.warnings]
-        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, self.told.figures)
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -174,17 +223,25 @@ class LocateResult(Displayed):
         """Names of all images of the input, posed or not."""
         return tuple(image.name for image in self.model.reconstruction.images.values())
 
-    @cached_property
-    def departure(self) -> Departure:
+    @property
+    def delivered(self) -> Delivered:
         """What is certified, what is delivered, and how far apart they are."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        return compare_with_certified(self.placement, centers, adjusted=self.adjusted is not None)
+        return Delivered.compare(self.placement, self._centers, adjusted=self.adjusted is not None)
 
     @cached_property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
-        return judge_model(self)
+        shares = Shares(
+            self.agreeing_observations,
+            self.contradicting_observations,
+            self.agreeing_pairs,
+            float(np.mean(self.kept)),
+        )
+        outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
+        lenses = (f"the matches of camera {d.camera} prefer another focal length" for d in self.focal_doubts)
+        repeats = tuple(match_warnings(self.directions))[:1]
+        names = [self.model.names[camera] for camera in outside]
+        return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions))
 
     @property
     def certified(self) -> SolverResult:
@@ -197,14 +254,19 @@ class LocateResult(Displayed):
         return self.placement.pieces
 
     @cached_property
+    def _centers(self) -> FloatArray:
+        """Centers (k, 3) of the placement's cameras in the output, NaN for those that are not in it."""
+        ids = self.model.image_ids[self.placement.cameras]
+        centers = np.full((len(ids), 3), np.nan)
+        images = (self.reconstruction.image(image_id) for image_id in ids[self.kept].tolist())
+        centers[self.kept] = [image.projection_center() for image in images]
+        return centers
+
+    @cached_property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        solved_pieces = [piece.placement for piece in self.further]
-        rows = camera_rows(
-            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
-        )
+        scale, solved_pieces = self.gauge.similarity.scale, [piece.placement for piece in self.further]
+        rows = camera_rows(self.placement, self._centers, scale, solved_pieces, self.gauge.axes)
         for camera, reason in without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
         for camera, center in self._carried().items():
@@ -222,9 +284,7 @@ class LocateResult(Displayed):
     @cached_property
     def own_cameras(self) -> list[CameraRow]:
         """One row per camera of the piece that is placed."""
-        image_ids = self.model.image_ids[self.placement.cameras]
-        centers = _centers_of(self.reconstruction, image_ids, self.kept)
-        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+        return own_camera_rows(self.placement, self._centers, self.gauge.similarity.scale)
 
     @property
     def agreeing_pairs(self) -> float:
@@ -252,6 +312,16 @@ class LocateResult(Displayed):
     def cameras_without_support(self) -> list[int]:
         """The images hardly any of whose matches makes a point with a third image, in the output or not."""
         return np.flatnonzero(np.isin(self.model.image_ids, list(self.unsupported))).tolist()
+
+    def _not_trusted(self) -> dict[str, str]:
+        """Return the images that are left out because they are not trusted, and why."""
+        placement, few = self.placement, self.few_points
+        left_out = {int(placement.cameras[k]): k for k in np.flatnonzero(~self.kept).tolist()}
+        return {
+            placement.graph.name_of(camera): placement.assessment.reasons[k]
+            for camera, k in left_out.items()
+            if camera not in few
+        }
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
@@ -281,16 +351,14 @@ class LocateResult(Displayed):
                 strict=True,
             )
         ]
+        columns: dict[str, FloatArray] = {}
         if self.triplet_scores is not None and self.matched_shares is not None:
-            scores = score_pairs(self.triplet_scores, self.matched_shares)
-            columns = (self.triplet_scores.tolist(), self.matched_shares.tolist(), scores.tolist())
-            rows = [
-                replace(row, triplet_score=triplet, matched_share=share, pair_score=score)
-                for row, triplet, share, score in zip(rows, *columns, strict=True)
-            ]
+            columns |= {"triplet_score": self.triplet_scores, "matched_share": self.matched_shares}
+            columns["pair_score"] = score_pairs(self.triplet_scores, self.matched_shares)
         if self.prior_angles is not None:
-            angles = self.prior_angles.angles_deg.tolist()
-            rows = [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
+            columns["prior_angle_deg"] = self.prior_angles.angles_deg
+        for name, values in columns.items():
+            rows = [replace(row, **{name: value}) for row, value in zip(rows, values.tolist(), strict=True)]
         return rows
 
     @cached_property
@@ -313,6 +381,11 @@ class LocateResult(Displayed):
         rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
         used = [row for row in rows if row.verdict == Verdict.INLIER.value]
         return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
+
+
+def _left_out(cameras: list[CameraRow]) -> list[str]:
+    """Return the cameras that are not placed, with the reason."""
+    return [f"{row.name}: {row.reason}" for row in cameras if not row.placed]
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
@@ -339,13 +412,26 @@ class GraphResult(Displayed):
     rotations: FloatArray | None = None
     """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
-    def summary(self) -> dict[str, Any]:
-        """Return what stands in locate.json."""
-        return dict(self._summary)
-
     @cached_property
-    def _summary(self) -> GraphSummary:
-        return summarize_graph(self)
+    def facts(self) -> GraphFacts:
+        """What is told of the graph: each figure of locate.json, terminal and report."""
+        placement = self.placement
+        solved = [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *self.further)]
+        return GraphFacts(
+            **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
+            verdict=self.verdict,
+            options=asdict(self.options),
+            delivered=Delivered.compare(placement, placement.locations, adjusted=False),
+            timings_s=self.timings_s,
+            warnings=list(graph_warnings(placement)),
+            inputs=GraphInputs(graph=str(self.path), directions=self.statement),
+            dimension=placement.graph.dimension,
+        )
+
+    @property
+    def told(self) -> Telling:
+        """What the terminal says."""
+        return self.facts.told(_left_out(self.cameras), self.placement.refined.statement())
 
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
@@ -353,22 +439,21 @@ class GraphResult(Displayed):
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
-        warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, self.told.figures)
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
         return table_of(self, name, self.placement.graph.dimension)
 
-    @cached_property
-    def departure(self) -> Departure:
-        """What is certified, what is delivered, and how far apart they are."""
-        return compare_with_certified(self.placement, self.placement.locations, adjusted=False)
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """None: nodes have no images."""
+        return ()
 
     @cached_property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
-        return judge_graph(self)
+        return judge_graph(self.placement)
 
     @property
     def certified(self) -> SolverResult:
@@ -385,12 +470,3 @@ class GraphResult(Displayed):
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)
-
-
-def _centers_of(
-    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
-) -> FloatArray:
-    """Return the centers (k, 3) of images, NaN for those that are not kept."""
-    centers = np.full((len(kept), 3), np.nan)
-    centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
-    return centers

@@ -1,18 +1,37 @@
 """What a refinement of rigs made of them: how far each sensor turned and moved, and how sure that is."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from sfm_shapefit.adjustment.free_sensors import SensorSigma
 from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.facts.json_types import RefinedSensor
+from sfm_shapefit.base.record import Record
 
 if TYPE_CHECKING:
     import pycolmap
 
     from sfm_shapefit.base.arrays import FloatArray
+
+
+class RefinedSensor(Record):
+    """A sensor whose pose in its rig was refined."""
+
+    camera: Annotated[int, "The id of its camera in the model."]
+    turned_deg: Annotated[float, "By how much its rotation changed."]
+    moved: Annotated[float, "How far it moved in its rig, in units of the output."]
+    distance: Annotated[float, "From the reference sensor, in units of the output."]
+    turn_sigma_deg: Annotated[float, "Standard deviation of its rotation per axis, by the noise alone."]
+    place_sigma: Annotated[float, "Standard deviation of its place per axis, by the noise alone."]
+
+    @property
+    def statement(self) -> str:
+        """How far it turned and moved, and how sure that is."""
+        return (
+            f"camera {self.camera} turned by {self.turned_deg:.3g} deg (+- {self.turn_sigma_deg:.2g}) and "
+            f"moved by {self.moved:.3g} (+- {self.place_sigma:.2g}), {self.distance:.4g} from the reference"
+        )
 
 
 def refined_rigs(
@@ -36,14 +55,14 @@ def _row(
 ) -> RefinedSensor:
     turn = given.rotation.matrix().T @ found.rotation.matrix()
     before, after = (_center(pose) for pose in (given, found))
-    return {
-        "camera": camera,
-        "turned_deg": float(rotation_angles_deg(turn[None])[0]),
-        "moved": float(np.linalg.norm(after - before)),
-        "distance": float(np.linalg.norm(after)),
-        "turn_sigma_deg": float(np.degrees(sigma.turn_rad)),
-        "place_sigma": sigma.place,
-    }
+    return RefinedSensor(
+        camera=camera,
+        turned_deg=float(rotation_angles_deg(turn[None])[0]),
+        moved=float(np.linalg.norm(after - before)),
+        distance=float(np.linalg.norm(after)),
+        turn_sigma_deg=float(np.degrees(sigma.turn_rad)),
+        place_sigma=sigma.place,
+    )
 
 
 def _center(sensor_from_rig: "pycolmap.Rigid3d") -> "FloatArray":
@@ -52,8 +71,4 @@ def _center(sensor_from_rig: "pycolmap.Rigid3d") -> "FloatArray":
 
 def describe_rigs(rows: Sequence[RefinedSensor]) -> list[str]:
     """Return a sentence for each refined sensor, the one that changed most first."""
-    return [
-        f"camera {row['camera']} turned by {row['turned_deg']:.3g} deg (+- {row['turn_sigma_deg']:.2g}) and "
-        f"moved by {row['moved']:.3g} (+- {row['place_sigma']:.2g}), {row['distance']:.4g} from the reference"
-        for row in sorted(rows, key=lambda row: -row["turned_deg"])
-    ]
+    return [row.statement for row in sorted(rows, key=lambda row: -row.turned_deg)]

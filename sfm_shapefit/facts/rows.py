@@ -1,4 +1,4 @@
-"""One row per camera, per pair and per rigid piece of a placed graph."""
+"""One row per camera and one per pair of a placed graph."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.facts.json_types import Piece
+from sfm_shapefit.facts.placed import folder_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -20,7 +20,6 @@ from sfm_shapefit.placement.place import count_large
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _OUTSIDE = "outside the pieces that are solved"
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
-_NOT_SOLVED = "free: its directions determine no placement"
 
 
 def camera_rows(
@@ -111,9 +110,8 @@ def covariance_of(row: CameraRow) -> FloatArray:
     """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
     d = len(row.sigma)
     correlations = np.eye(d)
-    if row.correlation:  # which earlier outputs lack
-        i, j = np.triu_indices(d, k=1)
-        correlations[i, j] = correlations[j, i] = row.correlation
+    i, j = np.triu_indices(d, k=1)
+    correlations[i, j] = correlations[j, i] = row.correlation
     sigmas = np.array(row.sigma)
     found = np.zeros((max(d, 3), max(d, 3)))
     found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
@@ -174,31 +172,6 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
     return rows
 
 
-def piece_rows(placement: Judged, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
-    """Return what locate.json says of each parallel-rigid piece of three cameras or more, and of the largest.
-
-    Args:
-        placement: the graph and its largest piece.
-        solved: number, scale and number of placed cameras of each piece that is solved.
-    """
-    facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
-    large = max(count_large(placement.pieces, placement.num_cameras), 1)
-    rows: list[Piece] = []
-    for k, piece in enumerate(placement.pieces[:large]):
-        scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
-        hinges = piece.hinges[piece.hinges < placement.num_cameras]
-        rows.append(
-            {
-                "num_cameras": int(np.sum(piece.nodes < placement.num_cameras)),
-                "scale": scale,
-                "hinges": [placement.graph.name_of(hinge) for hinge in hinges.tolist()],
-                "folder": folder_of(k) if k in facts else "",
-                "num_placed": num_placed,
-            }
-        )
-    return rows
-
-
 def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:
     """Say, for the cameras none of whose pairs has a usable direction, what became of their pairs."""
     causes: dict[int, Counter[str]] = {c: Counter() for c in np.flatnonzero(graph.degrees() == 0).tolist()}
@@ -212,8 +185,3 @@ def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int,
             total = counter.total()
             reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
     return reasons
-
-
-def folder_of(piece: int) -> str:
-    """Return where a piece stands in the output."""
-    return f"pieces/{piece}" if piece else "."

@@ -1,12 +1,10 @@
-"""What `locate` found as tables: one row per camera, one per pair, and the summary in locate.json.
+"""What `locate` found as tables: one row per camera and one per pair, as CSV and as columns of arrays.
 
-The formats are part of the interface (`cameras.csv`, `pairs.csv`, `locate.json`, schema version 1):
-columns and keys may be added, never renamed.
+`cameras.csv` and `pairs.csv` are part of the interface: columns may be added, never renamed.
 """
 
 import csv
 import itertools
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -14,13 +12,15 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import refuse_irregular_file
 from sfm_shapefit.judgement.verdicts import Verdict
 
-SCHEMA_VERSION: Literal[1] = 1
-IN_MEMORY = "in memory"
-"""What stands in locate.json in the place of a model's path where there is none."""
+TableName = Literal["cameras", "pairs"]
+Column = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,8 @@ class PairRow:
     """Angle between the direction and the baseline of the position priors, where both cameras have one."""
 
 
-Row = TypeVar("Row", CameraRow, PairRow)
+TableRow = TypeVar("TableRow", CameraRow, PairRow)
+_ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
 """Of the columns of a vector, one per axis, or per two axes."""
 _PARSERS: dict[Any, Callable[[str], Any]] = {
@@ -97,8 +98,6 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
-_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score", "prior_angle_deg", "correlation"}
-"""What earlier outputs lack."""
 
 
 def write_rows(
@@ -107,22 +106,18 @@ def write_rows(
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
     names = [field.name for field in fields(row_type)]
     values_of = attrgetter(*names)
-    widths = [len(columns_of_field(name, dimension)) if name in _PREFIXES else 0 for name in names]
+    empty = [("",) * len(columns_of_field(name, dimension)) for name in names]
 
     def cells(row: CameraRow | PairRow) -> list[object]:
-        found: list[object] = []
-        for value, width in zip(values_of(row), widths, strict=True):
-            if width:
-                found.extend(map(_cell, value) if value else ("",) * width)
-            else:
-                found.append(_cell(value))
-        return found
+        values = zip(values_of(row), empty, strict=True)
+        spread = (((value or none) if isinstance(value, tuple) else (value,)) for value, none in values)
+        return [_cell(value) for some in spread for value in some]
 
     columns = [column for name in names for column in columns_of_field(name, dimension)]
     _write_csv(columns, map(cells, rows), path)
 
 
-def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
+def read_rows(row_type: type[TableRow], dimension: int, path: Path) -> list[TableRow]:
     """Return the rows that `write_rows` wrote.
 
     Raises:
@@ -141,13 +136,7 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
 
     with path.open(newline="", encoding="utf-8") as stream:
         return [
-            row_type(
-                **{
-                    item.name: value(cells, item.name, item.type)
-                    for item in fields(row_type)
-                    if item.name not in _ADDED_COLUMNS or columns[item.name][0] in cells
-                }
-            )
+            row_type(**{item.name: value(cells, item.name, item.type) for item in fields(row_type)})
             for cells in csv.DictReader(stream)
         ]
 
@@ -188,21 +177,6 @@ def _write_csv(columns: Sequence[str], rows: Iterable[list[object]], path: Path)
         raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
 
 
-def write_json(summary: dict[str, Any], path: Path) -> None:
-    """Write a summary as JSON, with null for numbers that are not finite."""
-    path.write_text(dumps(summary) + "\n", encoding="utf-8")
-
-
-def dumps(summary: dict[str, Any], *, only_ascii: bool = False) -> str:
-    """Return a summary as JSON text that UTF-8 can encode, or ASCII, with escapes for all else.
-
-    NaN and infinities, which JSON has not, become null. Bytes of a path that are no UTF-8 become the escape
-    \\udcXX, from which `os.fsencode` of the parsed text gives them back.
-    """
-    text = json.dumps(_finite(summary), indent=2, ensure_ascii=only_ascii, allow_nan=False)
-    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")  # Python's escape is JSON's
-
-
 def _cell(value: object) -> object:
     if isinstance(value, float):
         return repr(float(value)) if math.isfinite(value) else ""
@@ -211,11 +185,49 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+def table_of(found: object, name: TableName, dimension: int) -> dict[str, Column]:
+    """Return the cameras or the pairs of a result, which it has as rows, as columns.
+
+    Raises:
+        ValueError: if there is no table of this name.
+    """
+    if name not in _ROW_TYPES:
+        raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
+    return columns_of(getattr(found, name), _ROW_TYPES[name], dimension)
+
+
+def columns_of(
+    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type[CameraRow] | type[PairRow], dimension: int
+) -> dict[str, Column]:
+    """Return an array for each column of cameras.csv or pairs.csv, by its name there.
+
+    Args:
+        rows: n rows of one type.
+        row_type: their type, also if there are none.
+        dimension: of the locations; a vector has so many columns, correlations one per two axes.
+
+    Returns:
+        n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
+        none; texts are objects.
+    """
+    found: dict[str, Column] = {}
+    for item in fields(row_type):
+        values = [getattr(row, item.name) for row in rows]
+        names = columns_of_field(item.name, dimension)
+        if names != [item.name]:
+            nothing = (math.nan,) * len(names)
+            whole = np.array([value or nothing for value in values], dtype=np.float64)
+            whole = whole.reshape(-1, len(names))
+            found |= {name: whole[:, k] for k, name in enumerate(names)}
+        else:
+            found[item.name] = _column(values, item.type)
+    return found
+
+
+def _column(values: list[Any], kind: Any) -> Column:
+    """Return values of a field's type as an array."""
+    if kind is str:
+        return np.array(values, dtype=object)
+    if kind in (bool, int):
+        return np.array(values, dtype=np.bool_ if kind is bool else np.int64)
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)

@@ -4,17 +4,15 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt
-from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
-from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
 
@@ -23,10 +21,6 @@ _ALARMING_SHARE = 0.5
 _ALARMING_LEVEL_DEG = 5.0
 # If no more pairs contradict refined locations, it does not matter that one of the convex starts collapsed.
 _FEW_REJECTED = 0.1
-# Cameras within so many median distances of the median say how large the scene is.
-_INSIDE = 30.0
-# A camera is uncertain if its standard deviation is more than this share of the extent of all.
-_UNCERTAIN_SHARE = 0.05
 _TWOFOLD_SHARE = 0.05
 """Of pairs on two directions among those on one or two. It was at most 0.005 on eight real scenes and 0.04 in
 drawn courtyards, which are placed well, and 0.31 before drawn facades of one house again and again, where
@@ -59,26 +53,14 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
         yield placement.second_configuration.statement()
 
 
-def uncertain_cameras(placement: Judged) -> IntArray:
-    """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
-    if len(placement.cameras) < SMALLEST_PIECE:
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
-
-
-def _largest_sigmas(placement: Judged) -> FloatArray:
-    """Return the largest of each camera's standard deviations along the axes."""
-    return np.asarray(standard_deviations(placement.covariances).max(axis=1))
-
-
 def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
-    largest, uncertain = _largest_sigmas(placement), uncertain_cameras(placement)
+    largest, uncertain = largest_sigmas(placement), uncertain_cameras(placement)
     if np.isnan(largest).any():
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        share, see = f"{_UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
+        share, see = f"{UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
         if len(uncertain) == 1:
             yield f"{worst} is uncertain by more than {share} of the extent; {see}"
         else:
@@ -86,13 +68,6 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
                 f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
                 f"{worst}; {see}"
             )
-
-
-def _extent(locations: FloatArray) -> float:
-    """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
-    distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
-    inside = locations[distances <= _INSIDE * median_spread(locations)]
-    return float(np.linalg.norm(np.ptp(inside, axis=0)))
 
 
 def match_warnings(directions: PairDirections) -> Iterator[str]:

@@ -1,17 +1,17 @@
 """What a model's points say of its images: which see too few, and what share of the matches agrees."""
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.joining import sampson_px
 
 _FEWEST_FRAMES = 3  # frames; so many stay whatever they see, as a model of fewer is none
@@ -21,26 +21,29 @@ _CHECKED_BY = 2  # matches of a keypoint in other images; with as many its track
 _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 
 
-def deregister_of_few_points(
-    structure: pycolmap.Reconstruction, least: int, fixed_frames: Collection[int] = ()
-) -> dict[int, int]:
-    """Deregister the frames each of whose images sees fewer than `least` points, with their observations.
+def images_of_few_points(points: Points, images: Images, least: int, fixed: BoolArray) -> IntArray:
+    """Return how many points images see that are to leave, -1 for those that stay, (i,).
 
-    An image that goes takes observations along, which may leave others with too few; three frames, and the
-    `fixed_frames`, stay. Returns the number of points that each such image saw then, by its id.
+    A frame leaves if each of its images sees fewer than `least` points. It takes its observations along,
+    which may leave others with too few; three frames stay.
+
+    Args:
+        points: of the images.
+        images: some of them posed; others have no part.
+        least: points.
+        fixed: (f,) frames that stay whatever they see.
     """
-    gone: dict[int, int] = {}
+    gone, frame_of = np.full(images.num_images, -1), images.frame_of
     while True:
-        counts: dict[int, dict[int, int]] = {}
-        for image in map(structure.image, sorted(structure.reg_image_ids())):
-            counts.setdefault(image.frame_id, {})[image.image_id] = image.num_points3D
-        poor = [frame for frame, seen in counts.items() if max(seen.values()) < least]
-        poor = [frame for frame in poor if frame not in fixed_frames]
-        if not poor or len(counts) - len(poor) < _FEWEST_FRAMES:
+        there = images.is_posed & (gone < 0)
+        seen = points.taken(points.paired(there[points.images])).count_seen(images.num_images)
+        most = np.full(len(images.frames.ids), -1)
+        np.maximum.at(most, frame_of[there], seen[there])
+        poor = (most >= 0) & (most < least) & ~fixed
+        if not poor.any() or np.sum((most >= 0) & ~poor) < _FEWEST_FRAMES:
             return gone
-        for frame in poor:
-            gone |= counts[frame]
-            structure.deregister_frame(frame)
+        leaving = there & poor[frame_of]
+        gone[leaving] = seen[leaving]
 
 
 class ObservationShares(NamedTuple):
@@ -54,38 +57,30 @@ class ObservationShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
-    """Numbers of keypoints that are matched in two or more other images, of n registered images."""
+    """Of i images, the keypoints that are matched in two or more other posed ones; 0 of one that is not."""
 
-    image_ids: IntArray
-    """(n,)"""
     checked: IntArray
-    """(n,) their number."""
+    """(i,) all of them."""
     agreeing: IntArray
-    """(n,) number that sees a 3D point."""
+    """(i,) those that see a 3D point."""
     contradicting: IntArray
-    """(n,) number that sees none, and most of whose matches miss the epipolar lines of the cameras."""
+    """(i,) those that see none, and most of whose matches miss the epipolar lines of the cameras."""
 
-    def shares(self) -> ObservationShares:
-        """Return the shares of all images together."""
-        total = int(self.checked.sum())
+    def shares(self, chosen: BoolArray) -> ObservationShares:
+        """Return the shares of some of the images (i,) together."""
+        total = int(self.checked[chosen].sum())
         if not total:
             return ObservationShares(math.nan, math.nan)
-        return ObservationShares(int(self.agreeing.sum()) / total, int(self.contradicting.sum()) / total)
-
-    def subset(self, chosen: BoolArray) -> "ObservationCounts":
-        """Return the counts of some of the images."""
-        return ObservationCounts(
-            image_ids=self.image_ids[chosen],
-            checked=self.checked[chosen],
-            agreeing=self.agreeing[chosen],
-            contradicting=self.contradicting[chosen],
-        )
+        both = self.agreeing[chosen].sum(), self.contradicting[chosen].sum()
+        return ObservationShares(*(int(part) / total for part in both))
 
 
 def count_observations(
-    structure: pycolmap.Reconstruction,
-    model: PosedModel,
+    points: Points,
+    images: Images,
+    num_keypoints: IntArray,
     batches: Iterable[MatchBatch],
+    rotations: FloatArray,
     max_error_px: float,
 ) -> ObservationCounts:
     """Return how many observations of each image agree with the cameras, and how many contradict them.
@@ -94,64 +89,54 @@ def count_observations(
     epipolar line and yet not where another image has them.
 
     Args:
-        structure: triangulated from these matches.
-        model: model of the given rotations, whose images the batches' pairs index.
-        batches: matches of all pairs, the rays in world axes by the given rotations.
+        points: triangulated from these matches.
+        images: some of them posed.
+        num_keypoints: (i,)
+        batches: matches of all pairs of images.
+        rotations: (i, 3, 3) cam_from_world by which the rays of the matches are in world axes.
         max_error_px: distance from the epipolar line (of both images together, to first order) from which a
             match contradicts.
     """
-    registered = np.isin(model.image_ids, list(structure.reg_image_ids()))
-    images = [
-        structure.image(i) if is_in else None for i, is_in in zip(model.image_ids, registered, strict=True)
-    ]
-    begins = np.append(0, np.cumsum([0 if image is None else image.num_points2D() for image in images]))
-    counts = np.zeros((int(begins[-1]), 3), dtype=np.int32)
-    centers, turns = np.zeros((len(images), 3)), np.tile(np.eye(3), (len(images), 1, 1))
-    for k, image in enumerate(images):
-        if image is not None:
-            pose = image.cam_from_world()
-            centers[k] = image.projection_center()
-            turns[k] = pose.rotation.matrix().T @ model.rotations[k]
+    posed = images.is_posed
+    sizes = np.where(posed, num_keypoints, 0)
+    begins, image_of = np.append(0, np.cumsum(sizes)), np.repeat(np.arange(len(sizes)), sizes)
+    counts = np.zeros((len(image_of), 3), dtype=np.int32)
+    centers = np.where(posed[:, None], images.centers, 0.0)
+    turns = np.where(posed[:, None, None], images.rotations.transpose(0, 2, 1) @ rotations, np.eye(3))
     for batch in batches:
         baselines = centers[batch.pairs[:, 1]] - centers[batch.pairs[:, 0]]
         lengths = np.maximum(np.linalg.norm(baselines, axis=1), np.finfo(np.float64).tiny)
         _count_misses(
             batch.pairs, batch.offsets, batch.keypoints, np.ascontiguousarray(batch.rays_i),
             np.ascontiguousarray(batch.rays_j), turns, baselines / lengths[:, None], batch.pixel_angles,
-            max_error_px, registered, begins, counts,
+            max_error_px, posed, begins, counts,
         )  # fmt: skip
-    rows = []
-    for image, own in zip(images, np.split(counts, begins[1:-1]), strict=True):
-        if image is not None:
-            checked = own[:, 0] >= _CHECKED_BY
-            sees = np.zeros_like(checked)
-            sees[image.get_observation_point2D_idxs()] = True
-            misses = 2 * own[:, 1] > own[:, 0]
-            found = checked, checked & sees, checked & ~sees & misses
-            rows.append([image.image_id, *map(np.count_nonzero, found)])
-    columns = np.array(rows, dtype=np.int64).reshape(-1, 4).T
-    return ObservationCounts(
-        image_ids=columns[0], checked=columns[1], agreeing=columns[2], contradicting=columns[3]
-    )
+    checked, sees = counts[:, 0] >= _CHECKED_BY, np.zeros(len(image_of), dtype=np.bool_)
+    sees[begins[points.images] + points.keypoints] = True
+    misses = 2 * counts[:, 1] > counts[:, 0]
+    parts = (checked, checked & sees, checked & ~sees & misses)
+    columns = (np.bincount(image_of[part], minlength=len(sizes)).astype(np.int64) for part in parts)
+    return ObservationCounts(**dict(zip(("checked", "agreeing", "contradicting"), columns, strict=True)))
 
 
-def images_without_support(
-    structure: pycolmap.Reconstruction, counts: ObservationCounts, fixed_frames: Collection[int] = ()
-) -> dict[int, int]:
-    """Return the images of frames whose matches could make points with those of others, and hardly make any.
+def images_without_support(counts: ObservationCounts, images: Images, fixed: BoolArray) -> BoolArray:
+    """Return the images (i,) of frames whose matches could make points with those of others, and hardly do.
 
     Directions can agree with a wrong pose, of an image on a repeated structure for one: points, which need
-    three images, do not. The value is the number of points of each such image, by its id; `fixed_frames` are
-    left out, and all are if fewer than three frames have points.
+    three images, do not. If fewer than three frames have points, none is returned.
+
+    Args:
+        counts: of the images.
+        images: some of them posed.
+        fixed: (f,) frames that are not asked.
     """
     could = counts.checked >= _FEWEST_CHECKED
     does = could & (counts.agreeing >= _LEAST_AGREEING * counts.checked)
-    frames = np.array([structure.image(i).frame_id for i in counts.image_ids.tolist()], dtype=np.int64)
-    lost = set(frames[could].tolist()) - set(frames[does].tolist()) - set(fixed_frames)
-    if len(set(frames.tolist())) - len(lost) < _FEWEST_FRAMES:
-        return {}
-    images = [structure.image(i) for i in sorted(structure.reg_image_ids())]
-    return {image.image_id: image.num_points3D for image in images if image.frame_id in lost}
+    posed, lost, support = np.zeros((3, len(images.frames.ids)), dtype=np.bool_)
+    posed[images.frame_of[images.is_posed]] = True
+    lost[images.frame_of[could]], support[images.frame_of[does]] = True, True
+    lost &= ~support & ~fixed
+    return images.is_posed & (lost & (np.sum(posed & ~lost) >= _FEWEST_FRAMES))[images.frame_of]
 
 
 @kernel

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.control_points import control_rows, control_warnings
-from sfm_shapefit.facts.json_types import ControlPoint
+from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
 from sfm_shapefit.files.colmap.model import PosedModel

@@ -24,7 +24,7 @@ whose wide lenses hardly tell. Of cameras moved by 1 %, 35 % or more of the pair
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,11 +32,13 @@ from sfm_shapefit import __version__
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
-from sfm_shapefit.facts.key_figures import key_figures
+from sfm_shapefit.facts.model import ExaminedFacts
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.points import ModelPictures, points_of
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -61,15 +63,14 @@ class Examined(NamedTuple):
     cameras: list[CameraRow]
     """Those with a pose first."""
     pairs: list[PairRow]
-    facts: dict[str, Any]
-    """In the form of locate.json."""
+    facts: ExaminedFacts
     quality: ImageQuality
 
 
 def examine(
     folder: Path, database: Path | None = None, *, progress: Progress | None = None
-) -> tuple[Drawing, dict[str, Any]]:
-    """Return the drawing of a model, and what the report says of it, in the form of locate.json.
+) -> tuple[Drawing, ExaminedFacts]:
+    """Return the drawing of a model, and what the report says of it.
 
     Args:
         folder: a COLMAP model, as for `locate`.
@@ -107,7 +108,8 @@ def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -
     """
     model = matches.model
     with clock("points"):
-        quality = image_quality(model)
+        points = points_of(model.reconstruction, model.images)
+        quality = image_quality(points, model.images, ModelPictures(model.reconstruction, model.images))
     with clock("directions"):
         try:
             directions = measure(matches, options, clock).directions
@@ -115,15 +117,28 @@ def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -
             directions = None
     pairs, level_deg = _pair_rows(model, directions)
     cameras = _camera_rows(model, quality, pairs)
-    focal_length_px = float(np.median(model.focal_lengths_px))
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
-    facts = _facts(matches.inputs, cameras, pairs, level_deg) | {
-        "figures": key_figures(cameras, error_deg, focal_length_px, "of the model's units"),
-        "sigma_of": "",
-        "mean_reprojection_error_px": _mean(quality.point_errors_px),
-        "median_track_length": _median(quality.point_track_lengths.tolist()),
-        "timings_s": clock.seconds,
-    }
+    measures = (float(np.median(model.focal_lengths_px)), "of the model's units")
+    facts = ExaminedFacts(
+        inputs=matches.inputs.facts,
+        options={},
+        verdict=_judge(cameras, pairs),
+        num_images=len(cameras),
+        num_placed=model.num_images,
+        num_pairs=len(pairs),
+        num_points=model.reconstruction.num_points3D(),
+        figures=KeyFigures.of_cameras(cameras, error_deg, *measures),
+        sigma_of="",
+        residual_level_deg=level_deg,
+        mean_reprojection_error_px=_mean(quality.point_errors_px),
+        median_track_length=_median(quality.point_track_lengths.tolist()),
+        scale="input: those of the model",
+        pieces=[],
+        loose_groups=[],
+        timings_s=clock.seconds,
+        warnings=[],
+        versions={"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
+    )
     return Examined(cameras, pairs, facts, quality)
 
 
@@ -228,26 +243,12 @@ def _columns(quality: ImageQuality, num_cameras: int) -> tuple[CameraColumn, ...
     )
 
 
-def _facts(
-    inputs: Inputs, cameras: list[CameraRow], pairs: list[PairRow], level_deg: float
-) -> dict[str, Any]:
-    """Return what the page says of a model, in the form of locate.json."""
+def _judge(cameras: list[CameraRow], pairs: list[PairRow]) -> ModelVerdict:
+    """Return the verdict on a model as it stands."""
     usable = [pair for pair in pairs if pair.direction]
-    weak = [row.name for row in cameras if row.placed and row.reason]
+    weak = tuple(row.name for row in cameras if row.placed and row.reason)
     share = np.mean([pair.verdict == Verdict.INLIER.value for pair in usable]) if usable else 1.0
-    grade, reasons = "look" if weak else "good", []
     if share < _LEAST_AGREEING:
-        grade, reasons = "do not use", [f"only {share:.0%} of the pairs agree with its positions"]
-    facts: dict[str, Any] = {
-        "examined": True,
-        "inputs": {
-            "model": str(inputs.folder),
-            "database": None if inputs.database is None else str(inputs.database),
-            "directions": inputs.statement,
-        },
-        "verdict": {"grade": grade, "cameras": weak, "reasons": reasons},
-        "residual_level_deg": level_deg,
-        "scale": "input: those of the model",
-        "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
-    }
-    return facts | {"options": {}, "pieces": [], "warnings": [], "loose_groups": []}
+        reasons = (f"only {share:.0%} of the pairs agree with its positions",)
+        return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=weak, reasons=reasons)
+    return ModelVerdict(grade=Grade.LOOK if weak else Grade.GOOD, cameras=weak, reasons=())

@@ -1,12 +1,11 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.inspected import Inspection
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.graph_text import read_graph
@@ -22,42 +21,12 @@ from sfm_shapefit.pipeline.measure import (
     measure,
     wants_points,
 )
-from sfm_shapefit.pipeline.memory import Forecast, describe_work, forecast
+from sfm_shapefit.pipeline.memory import describe_work, forecast
 from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
-from sfm_shapefit.placement.diagnosis import Diagnosis, diagnose
+from sfm_shapefit.placement.diagnosis import diagnose
 
 if TYPE_CHECKING:
     import pycolmap
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Inspection(Displayed):
-    """All that `inspect` reports."""
-
-    directions: str
-    """Where directions come from, and why."""
-    num_images: int
-    """Images or nodes of the input, with a rotation or without."""
-    statuses: dict[str, int]
-    """How many pairs have a usable direction, and why others have none."""
-    points: str
-    """Whether 3D points join the view graph, and why."""
-    diagnosis: Diagnosis
-    expected: Forecast | None = None
-    """The memory that `locate` will take; None for a bare graph."""
-    rigs: str = "none: every image is a frame of its own"
-    """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
-
-    def summary(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        facts = asdict(self)
-        if self.expected is not None:
-            facts["expected"] |= {"peak_mb": self.expected.peak_mb}
-        return facts
-
-    def _headline(self) -> str:
-        obstacle = self.diagnosis.obstacle
-        return f"{self.num_images} images, {obstacle or 'which can be placed'}"
 
 
 def inspect(

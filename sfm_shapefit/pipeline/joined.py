@@ -18,17 +18,17 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
-from sfm_shapefit.facts.grade import Grade, ModelVerdict
-from sfm_shapefit.facts.joins import Joined, JoinedModel
-from sfm_shapefit.facts.json_types import EarthDatum, JoinedSummary, JudgedModel
-from sfm_shapefit.facts.key_figures import UNITS, key_figures
-from sfm_shapefit.facts.map_result import MappedModel
+from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
 from sfm_shapefit.facts.options import KnownDistance
+from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
-from sfm_shapefit.facts.summary import told_distances, told_verdict
-from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION, CameraRow
+from sfm_shapefit.facts.scene import told_distances
+from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import choose_inputs, see_matches
@@ -95,36 +95,33 @@ def tell_group(
     found = examine_source(see_matches(matches, model, inputs), located.options, own)
     weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
     cameras = list(_camera_rows(found.cameras, group, models))
-    verdict = _judge(weak, tuple(found.facts["verdict"]["reasons"]), group, models)
-    focal_length_px, unit = float(np.median(model.focal_lengths_px)), UNITS[gauge.scale]
-    error_deg = found.facts["figures"]["pair_error_deg"]
-    facts: JoinedSummary = {
-        "schema_version": SCHEMA_VERSION,
-        "examined": True,
-        "inputs": {"model": IN_MEMORY, "database": str(database), "directions": inputs.statement},
-        "options": asdict(located.options) | {"known_distance": tuple(known)},
-        "verdict": verdict,
-        "models": [str(number) for number in group.world_from],
-        "joins": [join.summary(f"joined_{next(iter(group.world_from))}") for join in group.joins],
-        "num_images": len(cameras),
-        "num_placed": group.reconstruction.num_reg_images(),
-        "num_pairs": len(found.pairs),
-        "num_points": group.reconstruction.num_points3D(),
-        "figures": key_figures(cameras, np.nan if error_deg is None else error_deg, focal_length_px, unit),
-        "sigma_of": _SIGMA_OF,
-        "residual_level_deg": found.facts["residual_level_deg"],
-        "mean_reprojection_error_px": found.facts["mean_reprojection_error_px"],
-        "median_track_length": found.facts["median_track_length"],
-        "scale": gauge.statement,
-        "scale_sigma": gauge.scale_sigma,
-        "known_distances": told_distances(known, group.reconstruction),
-        "datum": None if gauge.datum is None else cast("EarthDatum", gauge.datum._asdict()),
-        "pieces": [],
-        "loose_groups": [],
-        "timings_s": own.seconds,
-        "warnings": [gauge.warning] if gauge.warning else [],
-        "versions": found.facts["versions"],
-    }
+    seen, measures = found.facts, (float(np.median(model.focal_lengths_px)), UNITS[gauge.scale])
+    first = next(iter(group.world_from))
+    facts = JoinedFacts(
+        inputs=inputs.facts,
+        options=asdict(located.options) | {"known_distance": tuple(known)},
+        verdict=_judge(weak, seen.verdict.reasons, group, models),
+        models=[str(number) for number in group.world_from],
+        joins=[join.facts(f"joined_{first}") for join in group.joins],
+        num_images=len(cameras),
+        num_placed=group.reconstruction.num_reg_images(),
+        num_pairs=len(found.pairs),
+        num_points=group.reconstruction.num_points3D(),
+        figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
+        sigma_of=_SIGMA_OF,
+        residual_level_deg=seen.residual_level_deg,
+        mean_reprojection_error_px=seen.mean_reprojection_error_px,
+        median_track_length=seen.median_track_length,
+        scale=gauge.statement,
+        scale_sigma=gauge.scale_sigma,
+        known_distances=told_distances(known, group.reconstruction),
+        datum=EarthDatum.of(gauge.datum),
+        pieces=[],
+        loose_groups=[],
+        timings_s=own.seconds,
+        warnings=[gauge.warning] if gauge.warning else [],
+        versions=seen.versions,
+    )
     return JoinedModel(
         reconstruction=group.reconstruction,
         models=tuple(group.world_from),
@@ -211,7 +208,7 @@ def _errors(
 
 def _judge(
     weak: Sequence[str], reasons: tuple[str, ...], group: Group, models: Sequence[MappedModel]
-) -> JudgedModel:
+) -> ModelVerdict:
     """Return the verdict: what was seen of the joined model, and those of its models."""
     verdicts = {number: models[number].located.verdict for number in group.world_from}
     grades = [verdict.grade for verdict in verdicts.values()]
@@ -219,5 +216,4 @@ def _judge(
     worst = max(grades, key=list(Grade).index)
     cameras = dict.fromkeys([*(name for verdict in verdicts.values() for name in verdict.cameras), *weak])
     said = tuple(f"model {k}: {reason}" for k, verdict in verdicts.items() for reason in verdict.reasons)
-    verdict = ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*reasons, *said))
-    return told_verdict(verdict)
+    return ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*reasons, *said))

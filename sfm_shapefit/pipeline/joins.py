@@ -9,8 +9,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose
-from sfm_shapefit.facts.joins import Joined, JoinedModel
-from sfm_shapefit.facts.map_result import MappedModel
+from sfm_shapefit.facts.joins import Joined
+from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import with_parameters
 from sfm_shapefit.files.colmap.merge import merge_models

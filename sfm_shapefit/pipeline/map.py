@@ -24,7 +24,8 @@ from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
-from sfm_shapefit.facts.result import Inputs, LocateResult, Loop
+from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.files.colmap.intrinsics import differ_in_rays, with_parameters

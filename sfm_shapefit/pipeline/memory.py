@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.inspected import Forecast
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -114,28 +115,10 @@ ECONOMIES = tuple(_list_economies())
 """The cheapest first."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Forecast:
-    """Peak memory of `locate`, by stage."""
-
-    memory_mb: dict[str, float]
-    """Peak of each stage in millions of bytes."""
-
-    @property
-    def peak_mb(self) -> float:
-        """The largest of all stages."""
-        return max(self.memory_mb.values())
-
-    @property
-    def statement(self) -> str:
-        """What to expect, a sentence for the user."""
-        worst = max(self.memory_mb, key=self.memory_mb.__getitem__)
-        return f"about {self.peak_mb:.0f} MB at most (while {worst})"
-
-
 def forecast(work: Workload, economy: Economy = ECONOMIES[0]) -> Forecast:
     """Return what a run will take, if so much is given up for memory."""
-    return Forecast(memory_mb={stage: size / _MB for stage, size in _peaks(work, economy).items()})
+    memory_mb = {stage: size / _MB for stage, size in _peaks(work, economy).items()}
+    return Forecast(memory_mb=memory_mb, peak_mb=max(memory_mb.values()))
 
 
 def choose_economy(

@@ -15,10 +15,8 @@ from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
-from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PosedModel
-from sfm_shapefit.files.colmap.own_tracks import triangulate_own_tracks
+from sfm_shapefit.files.colmap.own_tracks import TrackRules, triangulate_own_tracks
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
 from sfm_shapefit.files.colmap.points import ModelPictures, add_points, points_of
 from sfm_shapefit.files.colmap.seed import build_seed, transform_model, turn_model
@@ -26,7 +24,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
     ObservationShares,
     count_observations,
-    deregister_of_few_points,
+    images_of_few_points,
     images_without_support,
 )
 from sfm_shapefit.pipeline.clock import Clock
@@ -36,6 +34,8 @@ from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.links import MatchedKeypoints
 
 if TYPE_CHECKING:
@@ -68,10 +68,14 @@ class Located(NamedTuple):
 
     def given_of(self, posed: "PosedPart", model: PosedModel) -> GivenPoses:
         """Return what is known of the frames of some posed images of the model."""
+        return self.given._replace(fixed=self.fixed_frames(model)).of(posed.frames)
+
+    def fixed_frames(self, model: PosedModel) -> BoolArray:
+        """Return which frames of the model keep their poses, (f,)."""
         fixed = np.zeros(len(model.images.frames.ids), dtype=np.bool_)
         if self.fixed is not None:
             fixed[model.images.frame_of[self.fixed]] = True
-        return self.given._replace(fixed=fixed).of(posed.frames)
+        return fixed
 
 
 class Seeded(NamedTuple):
@@ -114,65 +118,76 @@ def build_seeded_model(
     from matches take the colors of the input's, if it had any. An executor shares out the tracks that are
     triangulated where nothing is adjusted.
     """
-    gauge = located.gauge
-    frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
-    seeded, adjusted = _make_points(source, located, options, clock)
-    hand_back_memory()  # of the tracks, before their matches are read again
-    poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
-    shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
-    if source.has_database:  # points of the model's own tracks have their colors already
-        batches = source.view.batches()
-        counts = count_observations(seeded, source.model, batches, options.max_reprojection_error_px)
-        unsupported = images_without_support(seeded, counts, frames)
+    model, gauge, view = source.model, located.gauge, source.view
+    images, points, adjusted = _make_points(source, located, options, clock)
+    hand_back_memory()  # of the links, before their matches are read again
+    fixed = located.fixed_frames(model)
+    seen = images_of_few_points(points, images, options.min_points_per_image, fixed)
+    images, points = _leave_out(seen >= 0, images, points)
+    unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
+    if source.has_database:
+        limit_px = options.max_reprojection_error_px
+        counts = count_observations(
+            points, images, view.num_keypoints, view.batches(), model.rotations, limit_px
+        )
+        unsupported = images_without_support(counts, images, fixed)
         if options.min_trust > 0.0:
-            poor |= unsupported
-            for frame in {seeded.image(image_id).frame_id for image_id in unsupported}:
-                seeded.deregister_frame(frame)
-        shares = counts.subset(np.isin(counts.image_ids, list(seeded.reg_image_ids()))).shares()
-        with clock("colors"):
-            seeded = seeded if colors is None else color_points(seeded, colors, in_place=True)
-    if poor:
-        lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
-        located = located._replace(kept=located.kept & ~lost)
-    is_held = located.given.centers is not None
-    if (adjusted is not None or poor) and not is_held:
-        seeded, gauge = _set_gauge(seeded, source.model, located)
+            seen = np.where(unsupported, points.count_seen(len(seen)), seen)
+            images, points = _leave_out(unsupported, images, points)
+        shares = counts.shares(images.is_posed)
+    with clock("colors"):
+        seeded = build_seed(model, images, view.keypoints if source.has_database else None)
+        add_points(seeded, images, points, None if source.has_database else model.reconstruction)
+        if source.has_database and colors is not None:  # points of own tracks have theirs already
+            seeded = color_points(seeded, colors, in_place=True)
+    located = located._replace(kept=located.kept & images.is_posed[located.placement.cameras])
+    if (adjusted is not None or (seen >= 0).any()) and located.given.centers is None:
+        seeded, gauge = _set_gauge(seeded, model, located)
     elif gauge.axes is not None:
         seeded = turn_model(seeded, gauge.axes)
-    return Seeded(seeded, gauge, adjusted, poor, frozenset(unsupported), shares)
+    poor = {int(images.ids[k]): int(seen[k]) for k in np.flatnonzero(seen >= 0)}
+    return Seeded(seeded, gauge, adjusted, poor, frozenset(images.ids[unsupported].tolist()), shares)
 
 
 def _make_points(
     source: MatchSource, located: Located, options: LocateOptions, clock: Clock
-) -> "tuple[pycolmap.Reconstruction, Estimate | None]":
-    """Return the seed with points, filtered, and how bundle adjustment went, if it was asked for."""
-    model, adjusted, links = source.model, None, None
-    own = None if source.has_database else model.reconstruction
-    rules = PointRules(
-        options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
-    )
+) -> tuple[Images, Points, Estimate | None]:
+    """Return the images of the model with points, filtered, and how bundle adjustment went, if asked for."""
+    model, adjusted, links, advance = source.model, None, None, clock.advance
+    images = pose_images(model, located)
+    posed = posed_part(images)
+    own = not source.has_database
     with clock("structure"):
-        images = pose_images(model, located)
-        seed = build_seed(model, images, source.view.keypoints if source.has_database else None)
-        posed = posed_part(images)
-        if own is None or options.adjust == "full":
-            links = read_links(source, located, posed, clock.advance)
+        if not own or options.adjust == "full":
+            links = read_links(source, located, posed, advance)
     with clock("bundle adjustment" if options.adjust == "full" else "triangulation"):
-        if options.adjust == "full":  # which triangulates at the seed's poses itself
+        if options.adjust == "full":  # which triangulates at the poses of the start itself
             assert links is not None
             adjusted, points = bundle_adjust(posed.images, links, options, located.given_of(posed, model))
-            put_images(seed, adjusted.images)
-        elif own is not None:
-            points = triangulate_own_tracks(seed, posed.images, own, rules, clock.advance, clock.executor)
+            posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
+        elif own:
+            rules = TrackRules(
+                options.max_reprojection_error_px,
+                options.min_triangulation_angle_deg,
+                options.min_track_length,
+            )
+            points = triangulate_own_tracks(
+                model.reconstruction, posed.images, rules, advance, clock.executor
+            )
         else:
             assert isinstance(links, MatchedKeypoints)
-            points = triangulate(posed.images, links, options, clock.advance, clock.executor)
+            points = triangulate(posed.images, links, options, advance, clock.executor)
         del links
-        add_points(seed, posed.images, points, own)
-        filter_in_place(seed, rules)
+        points = filter_points(points, posed.images, pictures_of(source, posed), options)
     if adjusted is not None:
-        adjusted = replace(adjusted, final_error_px=seed.compute_mean_reprojection_error())
-    return seed, adjusted
+        assert points.errors_px is not None
+        adjusted = replace(adjusted, final_error_px=float(points.errors_px.mean()))
+    return images, replace(points, images=posed.rows[points.images]), adjusted
+
+
+def _leave_out(gone: BoolArray, images: Images, points: Points) -> tuple[Images, Points]:
+    """Return the images without a pose of some (i,), and the points that the others see."""
+    return images.without(gone), points.taken(points.paired(~gone[points.images]))
 
 
 def _set_gauge(
@@ -229,10 +244,7 @@ def pose_images(model: PosedModel, located: Located) -> Images:
     """Return the images of the model where they are placed, fixed ones as they were; NaN where neither."""
     locations = located.placement.locations[located.kept]
     placed = model.images.placed(located.cameras, located.gauge.similarity.apply(locations))
-    if located.fixed is None:
-        return placed
-    frames, fixed = placed.frames, np.zeros((len(placed.frames.ids), 1), dtype=np.bool_)
-    fixed[model.images.frame_of[located.fixed]] = True
+    fixed, frames = located.fixed_frames(model)[:, None], placed.frames
     return placed.posed(frames.rotations, np.where(fixed, model.images.frames.centers, frames.centers))
 
 
@@ -243,6 +255,13 @@ def posed_part(images: Images) -> PosedPart:
     return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
 
 
+def pictures_of(source: MatchSource, posed: PosedPart) -> ModelPictures:
+    """Return the keypoints of placed images: those of the database, where it has any, and their lenses."""
+    rows, view = posed.rows.tolist(), source.view
+    keypoints = (lambda k: view.keypoints(rows[k])) if source.has_database else None
+    return ModelPictures(source.model.reconstruction, posed.images, keypoints)
+
+
 def read_links(
     source: MatchSource, located: Located, posed: PosedPart, advance: Callable[[int, int], None]
 ) -> Links:
@@ -251,11 +270,9 @@ def read_links(
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
     model, placement, view = source.model, located.placement, source.view
+    pictures = pictures_of(source, posed)
     if not source.has_database:
-        pictures = ModelPictures(model.reconstruction, posed.images)
         return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
-    rows = posed.rows.tolist()
-    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: view.keypoints(rows[k]))
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)

@@ -12,12 +12,13 @@ from typing import Any
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.base.display import draw_pages_by
+from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
-from sfm_shapefit.facts.joins import JoinedModel
-from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.map_result import JoinedModel, MapResult
+from sfm_shapefit.facts.placed import folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.facts.rows import folder_of, own_camera_rows
-from sfm_shapefit.facts.tables import CameraRow, PairRow, write_json, write_rows
+from sfm_shapefit.facts.rows import own_camera_rows
+from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
 
 
@@ -84,7 +85,7 @@ def _inputs_of(found: LocateResult | GraphResult | MapResult) -> list[Path]:
 
 def _write_files(found: LocateResult | GraphResult, folder: Path, options: WriteOptions) -> None:
     """Write the files of one placed model or graph."""
-    dimension, facts = found.placement.graph.dimension, found.summary()
+    dimension = found.placement.graph.dimension
     if isinstance(found, LocateResult):
         write_model(found.reconstruction, folder)
     for piece in found.further:
@@ -101,7 +102,7 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
     if isinstance(found, LocateResult) and found.doubtful_pairs:
         write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
-    write_json(facts, folder / MARKER)
+    write_json(found.facts.summary(), folder / MARKER)
     if options.report:
         _report(found, folder, options)
 
@@ -111,7 +112,7 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_model(found.reconstruction, folder)
     write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
     write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
-    write_json(found.summary(), folder / MARKER)
+    write_json(found.facts.summary(), folder / MARKER)
     if options.report:
         _report(found, folder, options)
 
@@ -121,7 +122,7 @@ def draw_page(found: LocateResult | GraphResult) -> str:
     from sfm_shapefit.report.page import report_html
     from sfm_shapefit.report.read_back import draw_result
 
-    return report_html(draw_result(found), found.summary())
+    return report_html(draw_result(found), found.facts)
 
 
 draw_pages_by(draw_page)
@@ -136,5 +137,5 @@ def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, optio
     if isinstance(found, JoinedModel):
         drawing, facts = read_output(folder)
     else:
-        drawing, facts = draw_result(found), found.summary()
+        drawing, facts = draw_result(found), found.facts
     write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))

@@ -16,7 +16,6 @@ A camera most of whose matches contradict the given rotations is named as well. 
 right cameras are among these, unless the pairs' own relative rotations (`judgement.turns`) confirm them.
 """
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -24,6 +23,7 @@ from scipy.sparse import coo_array
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -43,16 +43,14 @@ _CONTRADICTED_SHARE = 0.5  # share of a camera's pairs; if more contradict trian
 _SMALLEST_CHECKED = 3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PieceDiagnosis:
+class PieceDiagnosis(Record):
     """A parallel-rigid piece of three cameras or more."""
 
     num_cameras: Annotated[int, "Cameras of it."]
     hinges: Annotated[tuple[str, ...], "Names of the cameras that it shares with other pieces."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WeakCamera:
+class WeakCamera(Record):
     """A camera that would be placed, and may be placed badly."""
 
     name: Annotated[str, "Of its image."]
@@ -63,8 +61,7 @@ class WeakCamera:
     reasons: Annotated[tuple[str, ...], "Why it may be placed badly, in words."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Corruption:
+class Corruption(Record):
     """An estimate from the directions alone of how many pairs are wrong."""
 
     share: Annotated[
@@ -74,8 +71,7 @@ class Corruption:
     statement: Annotated[str, "The same in words."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlannedPlacement:
+class PlannedPlacement(Record):
     """What a placement of the largest piece would do."""
 
     solver: Annotated[str, "The solver that would run."]
@@ -84,8 +80,7 @@ class PlannedPlacement:
     finish: Annotated[str, "What becomes of the starts, a sentence."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Diagnosis:
+class Diagnosis(Record):
     """Properties of a view graph that are known without solving."""
 
     dimension: Annotated[int, "Of the locations."]

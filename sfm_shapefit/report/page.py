@@ -23,10 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.facts.control_points import control_cells
-from sfm_shapefit.facts.json_types import ControlPoint, LoopOfVideo
+from sfm_shapefit.base.record import plain
+from sfm_shapefit.facts.model import ModelFacts
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.facts.scene_words import loop_cells
+from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.report.charts import (
     MOST_CELLS,
     Bars,
@@ -36,10 +36,10 @@ from sfm_shapefit.report.charts import (
     view_graph_matrix,
 )
 from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, Points, input_centers
-from sfm_shapefit.report.first_screen import banner, input_of, scene_name, tiles
+from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.sentences import (
+    MAX_TEXT,
     Hint,
-    expert_sentences,
     first_looks,
     shorten,
     summary_sentences,
@@ -70,18 +70,18 @@ _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js
 
 
 def write_report(
-    drawing: Drawing, facts: dict[str, Any], path: Path, thumbnails: dict[int, str] | None = None
+    drawing: Drawing, facts: Facts, path: Path, thumbnails: dict[int, str] | None = None
 ) -> None:
     """Write the report of a result; see `report_html`."""
     path.write_text(report_html(drawing, facts, thumbnails), encoding="utf-8", newline="\n")
 
 
-def report_html(drawing: Drawing, facts: dict[str, Any], thumbnails: dict[int, str] | None = None) -> str:
+def report_html(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None) -> str:
     """Return the page.
 
     Args:
         drawing: what is drawn.
-        facts: those of locate.json.
+        facts: what is told of it.
         thumbnails: data URLs of pictures by row of the cameras, as of `read_thumbnails`; none if None.
     """
     data, script = page_data(drawing, facts, thumbnails), _script()
@@ -96,9 +96,7 @@ def report_html(drawing: Drawing, facts: dict[str, Any], thumbnails: dict[int, s
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], _asset("page.html"))
 
 
-def page_data(
-    drawing: Drawing, facts: dict[str, Any], thumbnails: dict[int, str] | None = None
-) -> dict[str, Any]:
+def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
     # Cameras of unknown trust come last; of these, those with a reason come first.
@@ -116,7 +114,7 @@ def page_data(
         "banner": {name: shorten(text, 1000) for name, text in banner(drawing, facts).items()},
         "tiles": tiles(drawing, facts),
         "summary": summary_sentences(drawing, facts),
-        "expertFacts": expert_sentences(facts),
+        "expertFacts": [shorten(text, 4 * MAX_TEXT) for text in facts.expert_sentences()],
         "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
         "noun": drawing.noun,
         "dimension": drawing.dimension,
@@ -136,7 +134,7 @@ def page_data(
         "pairsNote": _pairs_note(drawing),
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
         "highTrust": _HIGH_TRUST,
-        "minTrust": float(facts["options"].get("min_trust", 0.0)),
+        "minTrust": float(facts.options.get("min_trust", 0.0)),
         "histogram": {
             "edges": histogram.edges_deg.tolist(),
             "counts": {state: values.tolist() for state, values in histogram.counts.items()},
@@ -146,14 +144,14 @@ def page_data(
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
-        "control": [[shorten(cell) for cell in control_cells(row)] for row in _control_points(facts)],
-        "loops": [[shorten(cell) for cell in loop_cells(loop)] for loop in _loops(facts)],
-        "pieces": [_piece(k, piece) for k, piece in enumerate(facts["pieces"])],
-        "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
-        "options": _options(facts["options"]),
+        "control": _control_points(facts),
+        "loops": _loops(facts),
+        "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
+        "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts.timings_s.items()],
+        "options": _options(facts.options),
         "versions": [
             [shorten(str(name)), shorten(_option(value), 400)]
-            for name, value in (facts["versions"] | facts["inputs"]).items()
+            for name, value in (facts.versions | plain(facts.inputs)).items()
         ],
     }
 
@@ -284,24 +282,26 @@ def _convergence(drawing: Drawing) -> dict[str, Any]:
     }
 
 
-def _loops(facts: dict[str, Any]) -> list[LoopOfVideo]:
-    """Return the loops of videos, which earlier outputs lack, those that were refused first."""
-    loops: list[LoopOfVideo] = facts.get("loops", [])
-    return sorted(loops, key=lambda loop: (-loop["num_refused"], -loop["num_matches"]))[:_MAX_LOOPS]
+def _loops(facts: Facts) -> list[list[str]]:
+    """Return the cells of the loops of videos, those that were refused first."""
+    loops = facts.loops if isinstance(facts, ModelFacts) else ()
+    ordered = sorted(loops, key=lambda loop: (-loop.num_refused, -loop.num_matches))
+    return [[shorten(cell) for cell in loop.cells] for loop in ordered[:_MAX_LOOPS]]
 
 
-def _control_points(facts: dict[str, Any]) -> list[ControlPoint]:
-    """Return the ground control points, which earlier outputs lack, the farthest off first."""
-    rows: list[ControlPoint] = facts.get("control_points", [])
-    return sorted(rows, key=lambda row: -(row["error"] or 0.0))[:_MAX_CONTROL_POINTS]
+def _control_points(facts: Facts) -> list[list[str]]:
+    """Return the cells of the ground control points, the farthest off first."""
+    points = facts.control_points if isinstance(facts, ModelFacts) else ()
+    ordered = sorted(points, key=lambda point: -(point.error or 0.0))
+    return [[shorten(cell) for cell in point.cells] for point in ordered[:_MAX_CONTROL_POINTS]]
 
 
 # --- words -----------------------------------------------------------------------------------------
 
 
-def _subtitle(facts: dict[str, Any]) -> str:
-    dimensions = "" if "model" in facts["inputs"] else f", in {facts.get('dimension', 3)} dimensions"
-    return shorten(input_of(facts) + dimensions, 400)
+def _subtitle(facts: Facts) -> str:
+    dimensions = f", in {facts.dimension} dimensions" if isinstance(facts, GraphFacts) else ""
+    return shorten(facts.inputs.path + dimensions, 400)
 
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
@@ -425,17 +425,17 @@ def _convergence_note(drawing: Drawing) -> str:
     return "The splitting method has no bound on the way; its certificate is computed at the end."
 
 
-def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
-    hinges = [shorten(name, 60) for name in piece["hinges"][:_MAX_HINGES]]
-    if len(piece["hinges"]) > _MAX_HINGES:
-        hinges.append(f"and {len(piece['hinges']) - _MAX_HINGES:,} more")
+def _piece(k: int, piece: Piece) -> dict[str, Any]:
+    hinges = [shorten(name, 60) for name in piece.hinges[:_MAX_HINGES]]
+    if len(piece.hinges) > _MAX_HINGES:
+        hinges.append(f"and {len(piece.hinges) - _MAX_HINGES:,} more")
     return {
         "number": k,
-        "cameras": piece["num_cameras"],
-        "placed": piece["num_placed"],
+        "cameras": piece.num_cameras,
+        "placed": piece.num_placed,
         "hinges": ", ".join(hinges),
-        "scale": shorten(piece["scale"]),
-        "folder": piece["folder"],
+        "scale": shorten(piece.scale),
+        "folder": piece.folder,
     }
 
 

@@ -5,12 +5,13 @@ import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.model import FactsOfModel, read_facts
+from sfm_shapefit.facts.placed import Facts, GraphFacts
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, read_rows
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
@@ -42,7 +43,7 @@ def draw_model(model: PosedModel) -> Drawing:
     return build_drawing(rows, [], poses=poses_of(model, model.names), points=model.reconstruction)
 
 
-def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
+def read_output(folder: Path) -> tuple[Drawing, Facts]:
     """Return the drawing of an output folder, and the contents of its locate.json.
 
     The convex optimum and its iterations are not in the files, and the input's centers only where the input
@@ -58,20 +59,20 @@ def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
     if not (folder / MARKER).is_file():
         raise InputError(f"{folder} has no {MARKER}; give a folder that locate or place wrote")
     try:
-        facts = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-        dimension = int(facts.get("dimension", 3))
+        facts = read_facts(json.loads((folder / MARKER).read_text(encoding="utf-8")))
+        dimension = facts.dimension if isinstance(facts, GraphFacts) else 3
         cameras = read_rows(CameraRow, dimension, folder / "cameras.csv")
         pairs = read_rows(PairRow, dimension, folder / "pairs.csv")
         poses, points = None, None
-        if "graph" not in facts["inputs"]:
+        if not isinstance(facts, GraphFacts):
             model, names = read_model(folder), [row.name for row in cameras]
-            points, given, before = model.reconstruction, Path(facts["inputs"]["model"]), None
+            points, given, before = model.reconstruction, Path(facts.inputs.path), None
             with suppress(InputError):
                 before = read_model(given) if given.is_dir() else None
             poses = replace(poses_of(model, names), centers=poses_of(before, names).centers)
         drawing = replace(
             build_drawing(cameras, pairs, poses=poses, points=points),
-            input_is_aligned=str(facts.get("scale", "")).startswith("input:"),
+            input_is_aligned=isinstance(facts, FactsOfModel) and facts.scale.startswith("input:"),
             dimension=dimension,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:

@@ -8,14 +8,12 @@ Sentences are plain text. Names in them come from strangers: whoever shows a sen
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
-from sfm_shapefit.facts.intrinsics import describe_intrinsics
-from sfm_shapefit.facts.rigs import describe_rigs
-from sfm_shapefit.facts.scene_words import describe_doubtful_pairs, describe_line, describe_loops
+from sfm_shapefit.facts.model import FactsOfModel
+from sfm_shapefit.facts.placed import Facts
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160
@@ -24,7 +22,7 @@ MAX_TEXT = 160
 _FAR_DEG = 1.0
 # Below this trust, reasons are given.
 _LOW_TRUST = 0.75
-_SOLVER_SCALE = "solver: the solver's own units, the centroid at the origin"
+_SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 # Of fewer pairs it says nothing that most are of one camera.
 _FEW_PAIRS = 4
 # So many items of a kind are among the first things to look at.
@@ -51,35 +49,24 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
-def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
-    """Return what was placed and how certain it is, a sentence each; the facts are those of locate.json."""
+def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
+    """Return what was placed, how certain it is, and what else is told of the scene, a sentence each."""
+    stated = facts.scale if isinstance(facts, FactsOfModel) else _SOLVER_SCALE
+    _, _, units = stated.partition(": ")  # after the option's value
     return [
         placed_sentence(drawing),
         _pairs(drawing),
         *_certainty(drawing, facts),
-        _units(facts),
-        *_intrinsics(facts),
-        *_rigs(facts),
-        *_loops(facts),
+        f"Units and axes: {shorten(units or stated, 2 * MAX_TEXT)}.",
+        *(
+            f"{label[:1].upper()}{label[1:]}: {shorten('; '.join(lines), 4 * MAX_TEXT)}."
+            for label, lines in facts.scene_rows()
+            if lines
+        ),
     ]
 
 
-def expert_sentences(facts: dict[str, Any]) -> list[str]:
-    """Return what only those who know the method ask for."""
-    level = facts["residual_level_deg"]
-    said = [f"Pairs that agree are off by a standard deviation of {level:.2g} degrees per axis."]
-    if not np.isfinite(level):
-        said = []
-    if "delivered" in facts:  # which earlier outputs lack
-        said.append(f"The certificate: {facts['delivered']['statement']}.")
-    adjustment = facts.get("adjustment")
-    if adjustment:
-        statement = shorten(adjustment["statement"], 4 * MAX_TEXT)
-        said.append(f"{statement[:1].upper()}{statement[1:]}.")
-    return said
-
-
-def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
+def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
     cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing)]
     return [
@@ -117,14 +104,14 @@ def _pairs(drawing: Drawing) -> str:
     return text + "."
 
 
-def _certainty(drawing: Drawing, facts: dict[str, Any]) -> Iterator[str]:
+def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     sigmas = drawing.cameras.sigmas[drawing.cameras.placed]
     known = np.isfinite(sigmas)
     if not known.any() or drawing.extent <= 0.0:
         return
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     median = float(np.median(sigmas[known]))
-    meaning = f" ({shorten(facts['sigma_of'])})" if facts.get("sigma_of") else ""
+    meaning = f" ({shorten(facts.sigma_of)})" if facts.sigma_of else ""
     yield (
         f"The median standard deviation of a position is {median:.2g} units, "
         f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
@@ -132,43 +119,10 @@ def _certainty(drawing: Drawing, facts: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what became of intrinsics in doubt, which earlier outputs lack."""
-    lines = describe_intrinsics(facts.get("intrinsics", []))
-    if lines:
-        yield f"Intrinsics: {'; '.join(lines)}."
-
-
-def _rigs(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what became of rigs that were refined, which earlier outputs lack."""
-    lines = describe_rigs(facts.get("refined_rigs", []))
-    if lines:
-        yield f"Rigs: {'; '.join(lines)}."
-
-
-def _loops(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what there is to say of loops, straight drives and doubtful pairs; earlier outputs lack them."""
-    said = describe_loops(facts.get("loops", []))
-    if said:
-        yield f"Video: {shorten(said, 2 * MAX_TEXT)}."
-    line = describe_line(facts.get("line_sigma"))
-    if line:
-        yield f"{line[:1].upper()}{line[1:]}."
-    doubtful = describe_doubtful_pairs(facts.get("num_doubtful_pairs", 0))
-    if doubtful:
-        yield f"{doubtful}."
-
-
-def _units(facts: dict[str, Any]) -> str:
-    """Say what a unit is; the statement of the scale begins with the option's value."""
-    stated = facts.get("scale") or _SOLVER_SCALE
-    return f"Units and axes: {shorten(stated.partition(': ')[2] or stated, 2 * MAX_TEXT)}."
-
-
-def _warnings(drawing: Drawing, facts: dict[str, Any], told: set[int | None]) -> Iterator[Hint]:
+def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator[Hint]:
     """Yield warnings, but for those of a camera of which something is told anyway."""
     names = {name: row for row, name in enumerate(drawing.cameras.names) if not name.isdigit()}
-    for warning in facts["warnings"]:
+    for warning in facts.warnings:
         # The longest name wins, as "11.jpg" is in "111.jpg".
         named = max((name for name in names if name in warning), key=len, default=None)
         camera = None if named is None else names[named]
@@ -252,11 +206,11 @@ def _are(count: int) -> str:
     return "is" if count == 1 else "are"
 
 
-def _loose(facts: dict[str, Any]) -> Iterator[Hint]:
-    for group in facts["loose_groups"][:_SHOWN]:
-        names = ", ".join(shorten(name, 40) for name in group["cameras"][:_SHOWN])
-        more = f" and {len(group['cameras']) - _SHOWN:,} more" if len(group["cameras"]) > _SHOWN else ""
-        yield Hint(text=f"{names}{more}: loose, {shorten(group['cause'])}")
+def _loose(facts: Facts) -> Iterator[Hint]:
+    for group in facts.loose_groups[:_SHOWN]:
+        names = ", ".join(shorten(name, 40) for name in group.cameras[:_SHOWN])
+        more = f" and {len(group.cameras) - _SHOWN:,} more" if len(group.cameras) > _SHOWN else ""
+        yield Hint(text=f"{names}{more}: loose, {shorten(group.cause)}")
 
 
 def _unchecked(drawing: Drawing) -> Iterator[Hint]:

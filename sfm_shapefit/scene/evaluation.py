@@ -12,8 +12,8 @@ a camera that the model misses counts as a failure. AUC of relative poses, ATE a
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Annotated, Any, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -21,12 +21,14 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import (
+    Alignment,
     Similarity,
     fit_similarity_l1,
     mean_rotation_l1,
     median_spread,
     rotation_angles_deg,
 )
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.pose_errors import (
     ComparedPoses,
     ErrorSummary,
@@ -71,8 +73,7 @@ class CameraPoses(NamedTuple):
     """(n, 3) in world axes."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recall:
+class Recall(Record):
     """The share of the reference's cameras that are placed to within a threshold."""
 
     threshold: Annotated[float, "Position error, in the reference's units."]
@@ -84,14 +85,69 @@ class Recall:
     auc: Annotated[float, "Area under the recall up to the threshold, divided by it, in [0, 1]."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelativePoseAuc:
+class RelativePoseAuc(Record):
     """How well the relative poses of all pairs of the reference's cameras are known."""
 
     threshold_deg: Annotated[float, "The larger of the angles of rotation and of translation direction."]
     auc: Annotated[
         float, "Area under the recall up to the threshold, divided by it; pairs that the model misses fail."
     ]
+
+
+class WorstCamera(Record):
+    """A camera that is farthest off."""
+
+    name: Annotated[str, "Of its image."]
+    position_error: Annotated[float, "In the reference's units."]
+    rotation_error_deg: Annotated[float, "What remains after the best global rotation."]
+
+
+class EvaluationFacts(Record):
+    """What `sfm-shapefit evaluate --json` prints."""
+
+    num_reference: Annotated[int, "Cameras of the reference."]
+    num_model: Annotated[int, "Cameras of the model."]
+    num_common: Annotated[int, "Cameras of both, by name."]
+    num_missing: Annotated[int, "Cameras that the model lacks."]
+    num_extra: Annotated[int, "Cameras that the reference lacks."]
+    missing: Annotated[tuple[str, ...], "Names of the cameras that the model lacks."]
+    extra: Annotated[tuple[str, ...], "Names of the cameras that the reference lacks."]
+    extent: Annotated[float, "Diagonal of the reference's cameras."]
+    position_error: Annotated[ErrorSummary, "In the reference's units."]
+    rotation_error_deg: Annotated[ErrorSummary, "What remains after the best global rotation."]
+    recall: Annotated[
+        tuple[Recall, ...], "At shares of the extent, then at the thresholds that were asked for."
+    ]
+    relative_pose_auc: Annotated[
+        tuple[RelativePoseAuc, ...],
+        "Over all pairs of the reference's cameras, at 0.5, 1, 5 and 10 degrees.",
+    ]
+    trajectory: Annotated[
+        TrajectoryErrors | None,
+        "ATE and RPE in the order of the names; null unless --trajectory asks for them.",
+    ]
+    worst: Annotated[list[WorstCamera], "The ten cameras with the largest position errors, the worst first."]
+    ref_from_model: Annotated[Alignment, "From the model's world to the reference's."]
+    rotation_ref_from_model: Annotated[list[list[float]], "The rotations' own alignment, 3 rows."]
+    degenerate: Annotated[bool, "Whether the centers lie on a line."]
+    warnings: Annotated[tuple[str, ...], "What the user should know, a sentence each."]
+
+
+class PositionFacts(Record):
+    """What `sfm-shapefit evaluate --json` prints against a table of known positions."""
+
+    statement: Annotated[str, "What is compared with what, in words."]
+    num_reference: Annotated[int, "Cameras of the table."]
+    num_common: Annotated[int, "Cameras of both, by name."]
+    missing: Annotated[tuple[str, ...], "Names of the cameras that the model lacks."]
+    position_error: Annotated[
+        ErrorSummary | None, "As they stand, in the table's units; null if the model has no datum."
+    ]
+    median_offset: Annotated[
+        list[float] | None, "Model minus table as they stand, the median of each axis; else null."
+    ]
+    aligned_position_error: Annotated[ErrorSummary, "After the robust similarity that fits best."]
+    ref_from_model: Annotated[Alignment, "From the model's world to the table's."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -142,45 +198,37 @@ class Evaluation(Displayed):
         """Statistics of the rotation errors, in degrees."""
         return summarize_errors(self.rotation_errors_deg)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
-        return {
-            "num_reference": len(self.names) + len(self.missing),
-            "num_model": len(self.names) + len(self.extra),
-            "num_common": len(self.names),
-            "num_missing": len(self.missing),
-            "num_extra": len(self.extra),
-            "missing": list(self.missing),
-            "extra": list(self.extra),
-            "extent": self.extent,
-            "position_error": asdict(self.position),
-            "rotation_error_deg": asdict(self.rotation_deg),
-            "recall": [asdict(recall) for recall in self.recalls],
-            "relative_pose_auc": [asdict(auc) for auc in self.relative_pose_aucs],
-            "trajectory": None if self.trajectory is None else asdict(self.trajectory),
-            "worst": self.worst(),
-            "ref_from_model": {
-                "scale": self.ref_from_model.scale,
-                "rotation": self.ref_from_model.rotation.tolist(),
-                "translation": self.ref_from_model.translation.tolist(),
-            },
-            "rotation_ref_from_model": self.rotation_ref_from_model.tolist(),
-            "degenerate": self.degenerate,
-            "warnings": list(self.warnings),
-        }
+    @property
+    def facts(self) -> EvaluationFacts:
+        """The figures, as they stand in JSON."""
+        return EvaluationFacts.taken_from(
+            self,
+            num_reference=len(self.names) + len(self.missing),
+            num_model=len(self.names) + len(self.extra),
+            num_common=len(self.names),
+            num_missing=len(self.missing),
+            num_extra=len(self.extra),
+            position_error=self.position,
+            rotation_error_deg=self.rotation_deg,
+            recall=self.recalls,
+            relative_pose_auc=self.relative_pose_aucs,
+            worst=self.worst(),
+            ref_from_model=self.ref_from_model.facts,
+            rotation_ref_from_model=self.rotation_ref_from_model.tolist(),
+        )
 
     def _headline(self) -> str:
         median, worst = self.position.median, self.position.max
         return f"{len(self.names)} cameras in common, position error {median:.3g} (median), {worst:.3g} (max)"
 
-    def worst(self, count: int = _WORST) -> list[dict[str, Any]]:
-        """Return name, position error and rotation error in degrees of the cameras that are farthest off."""
+    def worst(self, count: int = _WORST) -> list[WorstCamera]:
+        """Return the cameras that are farthest off."""
         return [
-            {
-                "name": self.names[k],
-                "position_error": float(self.position_errors[k]),
-                "rotation_error_deg": float(self.rotation_errors_deg[k]),
-            }
+            WorstCamera(
+                name=self.names[k],
+                position_error=float(self.position_errors[k]),
+                rotation_error_deg=float(self.rotation_errors_deg[k]),
+            )
             for k in np.argsort(-self.position_errors, kind="stable")[:count].tolist()
         ]
 
@@ -392,22 +440,20 @@ class PositionEvaluation(Displayed):
         """Statistics of the distances after the alignment."""
         return summarize_errors(self.aligned_errors)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
-        return {
-            "statement": self.statement,
-            "num_reference": len(self.names) + len(self.missing),
-            "num_common": len(self.names),
-            "missing": list(self.missing),
-            "position_error": None if self.position is None else asdict(self.position),
-            "median_offset": None if self.offsets is None else np.median(self.offsets, axis=0).tolist(),
-            "aligned_position_error": asdict(self.aligned),
-            "ref_from_model": {
-                "scale": self.ref_from_model.scale,
-                "rotation": self.ref_from_model.rotation.tolist(),
-                "translation": self.ref_from_model.translation.tolist(),
-            },
-        }
+    @property
+    def facts(self) -> PositionFacts:
+        """The figures, as they stand in JSON."""
+        offsets = self.offsets
+        return PositionFacts(
+            statement=self.statement,
+            num_reference=len(self.names) + len(self.missing),
+            num_common=len(self.names),
+            missing=self.missing,
+            position_error=self.position,
+            median_offset=None if offsets is None else np.median(offsets, axis=0).tolist(),
+            aligned_position_error=self.aligned,
+            ref_from_model=self.ref_from_model.facts,
+        )
 
     def _headline(self) -> str:
         return (

@@ -166,6 +166,26 @@ class Images:
         moved[frames] = (centers - self.offsets[rows])[first]
         return self.posed(self.frames.rotations, moved)
 
+    def without(self, gone: BoolArray) -> "Images":
+        """Return the images with the frames of some (i,) not placed."""
+        centers = self.frames.centers.copy()
+        centers[self.frame_of[gone]] = np.nan
+        return self.posed(self.frames.rotations, centers)
+
+    def updated(self, part: "Images") -> "Images":
+        """Return the images with frames, lenses and sensors as a part of them has them now."""
+        rows = np.searchsorted(self.frames.ids, part.frames.ids)
+        lenses = {lens.id: k for k, lens in enumerate(self.lenses)}
+        own = [lenses[lens.id] for lens in part.lenses]
+        frames, sensors, found = self.frames, self.sensors, list(self.lenses)
+        moved = [frames.rotations.copy(), frames.centers.copy()]
+        turned = [sensors.rotations.copy(), sensors.translations.copy()]
+        moved[0][rows], moved[1][rows] = part.frames.rotations, part.frames.centers
+        turned[0][own], turned[1][own] = part.sensors.rotations, part.sensors.translations
+        for k, lens in zip(own, part.lenses, strict=True):
+            found[k] = lens
+        return self.posed(*moved).with_sensors(*turned).with_lenses(found)
+
     def with_lenses(self, lenses: Sequence[Lens]) -> "Images":
         """Return the images with other parameters of their lenses."""
         return replace(self, lenses=tuple(lenses))
@@ -176,12 +196,23 @@ class Images:
 
 
 class Pictures(Protocol):
-    """The keypoints of images, by the images' rows."""
+    """The keypoints of images and what their lenses do with rays, by the images' rows."""
 
     def count(self, image: int) -> int:
         """Return how many keypoints an image has."""
         ...
 
-    def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (k, 2) and rays (k, 3), of any length, of keypoints; NaN for pixels without a ray."""
+    def pixels(self, image: int, keypoints: IntArray | Int32Array) -> FloatArray:
+        """Return where keypoints are, (k, 2)."""
+        ...
+
+    def rays(self, image: int, pixels: FloatArray) -> FloatArray:
+        """Return rays (k, 3) of pixels, of any length; NaN where there is none."""
+        ...
+
+    def project(self, image: int, positions: FloatArray, *, ahead: bool = True) -> FloatArray:
+        """Return the pixels (k, 2) of points (k, 3) in axes of the camera.
+
+        NaN for those that it does not see; not `ahead`: where the formula of the lens leads, even behind it.
+        """
         ...

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -22,6 +22,8 @@ class Points:
     """(o,) which of the image's keypoints it is."""
     ids: IntArray
     """(x,)"""
+    errors_px: FloatArray | None = None
+    """(x,) mean reprojection errors; None if unknown."""
 
     @property
     def num_points(self) -> int:
@@ -35,6 +37,36 @@ class Points:
     def points_seen(self) -> IntArray:
         """Return the point of each observation, (o,)."""
         return np.repeat(np.arange(self.num_points), self.lengths())
+
+    def count_seen(self, num_images: int) -> IntArray:
+        """Return how many observations each of so many images has, (i,)."""
+        return np.bincount(self.images, minlength=num_images).astype(np.int64)
+
+    def rows_of_images(self, num_images: int) -> list[IntArray]:
+        """Return the observations of each of so many images, ascending."""
+        order = np.argsort(self.images, kind="stable")
+        return np.split(order, np.searchsorted(self.images[order], np.arange(1, num_images)))
+
+    def paired(self, chosen: BoolArray) -> BoolArray:
+        """Return which observations (o,) are chosen with another one of their point."""
+        return chosen & (self._count(chosen) >= 2)[self.points_seen()]
+
+    def taken(self, chosen: BoolArray) -> "Points":
+        """Return the points with some of their observations (o,); those that keep none are gone."""
+        lengths = self._count(chosen)
+        kept = lengths > 0
+        return Points(
+            xyz=self.xyz[kept],
+            offsets=np.append(0, np.cumsum(lengths[kept])),
+            images=self.images[chosen],
+            keypoints=self.keypoints[chosen],
+            ids=self.ids[kept],
+            errors_px=None if self.errors_px is None else self.errors_px[kept],
+        )
+
+    def _count(self, chosen: BoolArray) -> IntArray:
+        """Return how many observations of each point are chosen, (x,)."""
+        return np.diff(np.append(0, np.cumsum(chosen))[self.offsets])
 
 
 def number_points(parts: Sequence[Points]) -> Points:

@@ -13,13 +13,13 @@ Q_k, ATE is the distance of the centers, and RPE the translation and the angle o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, rotation_angles_deg
+from sfm_shapefit.base.record import Record
 
 MOST_COMPARED_PAIRS = 2_000_000
 """Of more pairs so many are drawn, by a fixed seed."""
@@ -27,8 +27,7 @@ MOST_COMPARED_PAIRS = 2_000_000
 _COINCIDENT = 1e-9
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorSummary:
+class ErrorSummary(Record):
     """Statistics of one kind of error over the common cameras."""
 
     median: Annotated[float, "Of all errors."]
@@ -37,8 +36,7 @@ class ErrorSummary:
     max: Annotated[float, "The largest error."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryErrors:
+class TrajectoryErrors(Record):
     """Errors of cameras that follow one another in the order of their names, as evo defines them."""
 
     ate: Annotated[ErrorSummary, "Absolute trajectory error, in the reference's units."]

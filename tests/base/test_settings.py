@@ -10,10 +10,9 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.base.settings import _fits, merge_options, setting_groups
-from sfm_shapefit.facts import key_figures
-from sfm_shapefit.facts.columns import columns_of
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.placed import UNITS
+from sfm_shapefit.facts.tables import CameraRow, columns_of
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.solver.options import SolverOptions
@@ -175,7 +174,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
 
 
 def test_every_scale_has_its_unit():
-    assert set(key_figures.UNITS) == {*get_args(Scale), "fixed", "control points"} - {"auto"}
+    assert set(UNITS) == {*get_args(Scale), "fixed", "control points"} - {"auto"}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):

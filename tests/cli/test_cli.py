@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from typer.testing import CliRunner
 import sfm_shapefit
 from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.cli import app
-from sfm_shapefit.facts.key_figures import figure_rows
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -57,17 +57,18 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
 def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     result, out = ring_run
     drawing, facts = read_output(out)
-    facts["figures"] |= {"pair_error_deg": 0.25, "pair_error_px": 7.0, "sigma": 0.5, "sigma_of_extent": 0.125}
+    known = {"pair_error_deg": 0.25, "pair_error_px": 7.0, "sigma": 0.5, "sigma_of_extent": 0.125}
+    figures = facts.figures
+    facts = replace(facts, figures=replace(figures, **known))
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
     assert shown["typical error of a pair"] == "7 px, 0.25°"
     assert shown["typical uncertainty, 12% of the scene"] == "± 0.5 units"
-    rows = dict(figure_rows(facts))
+    rows = {label: text for label, (text,) in facts.key_rows()}
     assert rows["typical error of a pair"] == "0.25 deg (7 px)"
     assert rows["typical uncertainty"] == "0.5 of the input's units, 12% of the scene (standard deviation)"
     assert rows["placed"] == "8 of 8 images"
-    figures = read_output(out)[1]["figures"]
-    assert figures["sigma"] == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
-    assert f"{figures['pair_error_deg']:.2g} deg ({figures['pair_error_px']:.2g} px)" in result.stdout
+    assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
+    assert f"{figures.pair_error_deg:.2g} deg ({figures.pair_error_px:.2g} px)" in result.stdout
 
 
 def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):

@@ -19,8 +19,8 @@ from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
 from sfm_shapefit.cli.flags import OutputFlags
 from sfm_shapefit.cli.frame import Run
-from sfm_shapefit.facts.grade import Grade, ModelVerdict
 from sfm_shapefit.files.colmap import model
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from tests.program import run
 from tests.scenes import FACADE, RING, ROOT
 
@@ -132,7 +132,7 @@ def written(monkeypatch, encoding, show):
 
 
 def test_names_that_stdout_cannot_show_have_escapes(monkeypatch):
-    table = partial(console.print_table, "d\u00e9", [("left out", "\u0663\nb\x1b[2J")])
+    table = partial(console.print_table, "d\u00e9", [("left out", ["\u0663", "b\x1b[2J"])])
     shown = written(monkeypatch, "ascii", table)
     assert r"d\xe9" in shown
     assert r"\u0663" in shown
@@ -164,7 +164,7 @@ def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is
                 patch.setenv(name, value)
             raw = io.BytesIO()
             patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
-            console.print_table("title", [("placed", "8 of 8"), ("warning", "look out")])
+            console.print_table("title", [("placed", ["8 of 8"]), ("warning", ["look out"])])
             console.print_ending(verdict, ["open out/report.html"])
             sys.stdout.flush()
             return raw.getvalue().decode()

@@ -1,29 +1,36 @@
 """What is said of intrinsics in doubt: each camera of few, of many what they have in common."""
 
+from dataclasses import replace
+
 import pytest
 
 from sfm_shapefit.adjustment import Lens
 from sfm_shapefit.adjustment.estimate import RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.facts.intrinsics import Intrinsics, describe_intrinsics, intrinsics_warnings
+from sfm_shapefit.facts.intrinsics import (
+    CameraIntrinsics,
+    Intrinsics,
+    describe_intrinsics,
+    intrinsics_warnings,
+)
 from sfm_shapefit.files.colmap.intrinsics import Origin
 from sfm_shapefit.scene.lens import LensDoubt
 
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):
     """A row of locate.json."""
-    return {
-        "camera": camera,
-        "num_images": num_images,
-        "model": "SIMPLE_RADIAL",
-        "origin": Origin.GUESS.value,
-        "decided_by": decided_by,
-        "given_focal_px": given,
-        "focal_px": found,
-        "focal_sigma_px": sigma,
-        "given_parameters": [given, 600.0, 450.0, 0.0],
-        "parameters": [found, 600.0, 450.0, -0.05 if decided_by == "adjusted" else 0.0],
-    }
+    return CameraIntrinsics(
+        camera=camera,
+        num_images=num_images,
+        model="SIMPLE_RADIAL",
+        origin=Origin.GUESS.value,
+        decided_by=decided_by,
+        given_focal_px=given,
+        focal_px=found,
+        focal_sigma_px=sigma,
+        given_parameters=[given, 600.0, 450.0, 0.0],
+        parameters=[found, 600.0, 450.0, -0.05 if decided_by == "adjusted" else 0.0],
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,8 +50,10 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
             "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it",
         ),
         (
-            row(decided_by="undetermined", found=1000.0, sigma=None)
-            | {"parameters": [1000.0, 600.0, 450.0, -0.05]},
+            replace(
+                row(decided_by="undetermined", found=1000.0, sigma=None),
+                parameters=[1000.0, 600.0, 450.0, -0.05],
+            ),
             "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it, "
             "distortion -0.0500",
         ),

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sfm_shapefit.facts.tables import CameraRow, PairRow, dumps, write_json, write_rows
+from sfm_shapefit.base.record import dumps, write_json
+from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from tests.program import run, run_python
 from tests.scenes import RING
 

@@ -128,8 +128,10 @@ def test_rays_of_pictures_lead_back_to_their_pixels(name):
     images = images_of(model)
     pictures, camera = ModelPictures(model, images), model.camera(1)
     chosen = np.arange(0, pictures.count(2), 3)
-    pixels, rays = pictures.look_up(2, chosen)
+    pixels = pictures.pixels(2, chosen)
+    rays = pictures.rays(2, pixels)
     known = [model.image(int(images.ids[2])).point2D(k).xy for k in chosen.tolist()]
     np.testing.assert_array_equal(pixels, known)
     np.testing.assert_allclose(camera.img_from_cam(rays), pixels, atol=1e-6)
+    np.testing.assert_allclose(pictures.project(2, 3.0 * rays), pixels, atol=1e-6)
     assert (rays[:, 2] == 1.0).all() == images.lenses[0].is_adjustable

@@ -1,18 +1,21 @@
 """What of the observations agrees with the cameras, what contradicts them, and what merely sees no point."""
 
 import numpy as np
-import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.facts.grade import Grade
+from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.support import (
     ObservationCounts,
     count_observations,
+    images_of_few_points,
     images_without_support,
 )
 from sfm_shapefit.pipeline import seed
@@ -25,33 +28,39 @@ def found():
     return sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
 
 
-def judge(structure):
+def judge(images, points):
     model, options = read_model(RING / "sparse" / "0"), LocateOptions()
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs, options) as source:
-        batches = source.view.batches()
-        return count_observations(structure, model, batches, options.max_reprojection_error_px).shares()
+        view = source.view
+        limit_px = options.max_reprojection_error_px
+        counts = count_observations(
+            points, images, view.num_keypoints, view.batches(), model.rotations, limit_px
+        )
+    return counts.shares(images.is_posed)
+
+
+def arrays_of(found):
+    images = images_of(found.reconstruction)
+    return images, points_of(found.reconstruction, images)
 
 
 def test_observations_of_right_cameras_agree(found):
-    shares = judge(found.reconstruction)
+    shares = judge(*arrays_of(found))
     assert shares.agreeing == found.agreeing_observations > 0.9
     assert shares.contradicting == found.contradicting_observations < 0.01
 
 
 def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(found):
-    structure = pycolmap.Reconstruction(found.reconstruction)
-    for point in list(structure.points3D):
-        structure.delete_point3D(point)
-    bare = judge(structure)
+    images, points = arrays_of(found)
+    none = points.taken(np.zeros(len(points.images), dtype=bool))
+    bare = judge(images, none)
     assert bare.agreeing == 0.0
     assert bare.contradicting < 0.05
 
-    for frame in structure.reg_frame_ids():
-        pose = structure.frame(frame).rig_from_world
-        turn = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.1 * (frame % 3)])) * pose.rotation
-        structure.frame(frame).rig_from_world = pycolmap.Rigid3d(turn, pose.translation)
-    assert judge(structure).contradicting > 0.5
+    frames = images.frames
+    turns = Rotation.from_rotvec([[0.0, 0.0, 0.1 * (k % 3)] for k in frames.ids.tolist()]).as_matrix()
+    assert judge(images.posed(turns @ frames.rotations, frames.centers), none).contradicting > 0.5
 
 
 def test_a_weight_follows_its_frames_when_some_are_left_out():
@@ -63,33 +72,43 @@ def test_a_weight_follows_its_frames_when_some_are_left_out():
     assert GivenPoses(weight=held.among(np.array([4, 5]), 10)).of(np.array([5, 9])).weight == held
 
 
-def counts_of(structure, checked, agreeing):
-    ids = np.array(sorted(structure.reg_image_ids()))
-    return ObservationCounts(
-        image_ids=ids, checked=np.array(checked), agreeing=np.array(agreeing), contradicting=np.zeros(8, int)
-    )
+def counts_of(checked, agreeing):
+    none = np.zeros(8, dtype=int)
+    return ObservationCounts(checked=np.array(checked), agreeing=np.array(agreeing), contradicting=none)
 
 
 def test_a_camera_whose_matches_make_no_points_goes_and_others_stay(found):
-    structure = pycolmap.Reconstruction(found.reconstruction)
-    names = [structure.image(i).name for i in sorted(structure.reg_image_ids())]
+    images, _ = arrays_of(found)
     # Of 100 that could, 4 is chance and 5 is not; of 29, none says nothing.
-    counts = counts_of(structure, [100, 100, 29, *[100] * 5], [4, 5, 0, *[90] * 5])
-    without = images_without_support(structure, counts)
-    assert [structure.image(i).name for i in without] == names[:1]
+    counts = counts_of([100, 100, 29, *[100] * 5], [4, 5, 0, *[90] * 5])
+    assert images_without_support(counts, images, np.zeros(8, dtype=bool)).tolist() == [True] + [False] * 7
 
 
 def test_frames_that_are_fixed_stay_and_so_do_all_where_hardly_any_is_left(found):
-    structure = pycolmap.Reconstruction(found.reconstruction)
-    first = structure.image(min(structure.reg_image_ids())).frame_id
-    assert images_without_support(structure, counts_of(structure, [100] * 8, [0, *[90] * 7]), [first]) == {}
-    assert images_without_support(structure, counts_of(structure, [100] * 8, [0] * 6 + [90] * 2)) == {}
-    assert structure.num_reg_images() == 8
+    images, none = arrays_of(found)[0], np.zeros(8, dtype=bool)
+    fixed = np.arange(8) == images.frame_of[0]
+    assert not images_without_support(counts_of([100] * 8, [0, *[90] * 7]), images, fixed).any()
+    assert not images_without_support(counts_of([100] * 8, [0] * 6 + [90] * 2), images, none).any()
+
+
+def test_images_of_few_points_take_theirs_along_and_three_frames_stay(found):
+    images, points = arrays_of(found)
+    seen, none = points.count_seen(8), np.zeros(8, dtype=bool)
+    assert (images_of_few_points(points, images, int(seen.min()), none) == -1).all()
+    poorest = int(np.argmin(seen))
+    fixed = np.arange(8) == images.frame_of[poorest]
+    gone = images_of_few_points(points, images, int(seen.min()) + 1, none)
+    assert gone[poorest] == seen.min()
+    assert images_of_few_points(points, images, int(seen.min()) + 1, fixed)[poorest] == -1
+    assert np.sum(images_of_few_points(points, images, 10**6, none) == -1) == 8
+    without = points.taken(points.paired((gone < 0)[points.images]))
+    assert (without.lengths() >= 2).all()
+    assert not without.count_seen(8)[gone >= 0].any()
 
 
 def test_it_is_named_and_can_be_kept(monkeypatch):
-    def count(structure, *given):
-        counts = count_observations(structure, *given)
+    def count(*given):
+        counts = count_observations(*given)
         counts.agreeing[2] = 0
         return counts
 

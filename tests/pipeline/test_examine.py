@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import ModelPictures, points_of
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.pipeline.examine import examine
 from sfm_shapefit.report.drawing import PairClass
@@ -15,8 +16,9 @@ from tests.scenes import COURTYARD, RING, fingerprint
 
 def test_quality_is_that_of_the_models_own_observations():
     model = read_model(RING / "sparse" / "0")
-    quality = image_quality(model)
-    reconstruction = model.reconstruction
+    reconstruction, images = model.reconstruction, model.images
+    pictures = ModelPictures(reconstruction, images)
+    quality = image_quality(points_of(reconstruction, images), images, pictures)
     mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
     assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
     image = reconstruction.image(int(model.image_ids[3]))
@@ -31,7 +33,7 @@ def test_quality_is_that_of_the_models_own_observations():
 
 def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path):
     drawing, facts = examine(RING / "sparse" / "0")
-    assert facts["verdict"]["grade"] == "good"
+    assert facts.verdict.statement == "good"
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
     assert "image_undistorter" in banner(drawing, facts)["command"]
 
@@ -41,7 +43,7 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path):
     image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
     moved.write(tmp_path)
     drawing, facts = examine(tmp_path, RING / "database.db")
-    assert facts["verdict"]["cameras"] == [image.name]
+    assert facts.verdict.cameras == (image.name,)
     row = drawing.cameras.names.index(image.name)
     assert "pairs contradict where it stands" in drawing.cameras.reasons[row]
     assert "its reprojection error is" in drawing.cameras.reasons[row]
@@ -64,7 +66,7 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
 
 def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_path):
     _, facts = examine(COURTYARD / "truth", COURTYARD / "database.db")  # a quarter of its pairs is wrong
-    assert len(facts["verdict"]["cameras"]) <= 1
+    assert len(facts.verdict.cameras) <= 1
     moved = pycolmap.Reconstruction(COURTYARD / "truth")
     image = moved.image(sorted(moved.reg_image_ids())[7])
     pose = image.frame.rig_from_world
@@ -72,5 +74,5 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
     image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, away)
     moved.write(tmp_path)
     drawing, facts = examine(tmp_path, COURTYARD / "database.db")
-    assert image.name in facts["verdict"]["cameras"]
+    assert image.name in facts.verdict.cameras
     assert "its reprojection error is" in drawing.cameras.reasons[drawing.cameras.names.index(image.name)]

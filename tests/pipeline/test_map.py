@@ -14,7 +14,7 @@ from sfm_shapefit.adjustment import structure as triangulation
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
-from sfm_shapefit.facts.scene_words import describe_line, describe_loops
+from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
@@ -349,7 +349,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
     sfm_shapefit.write_map_result(found, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
     assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
-    assert describe_loops(found.models[0].located.summary()["loops"]).endswith(f"{names[0]} to {names[15]}")
+    assert describe_loops(found.models[0].located.facts.loops).endswith(f"{names[0]} to {names[15]}")
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
     assert (blind.num_video_frames, blind.models[0].located.loops) == (0, ())
     assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
@@ -452,7 +452,7 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
     assert row["parameters"] == located.reconstruction.camera(1).params.tolist()
     errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
     assert errors.position.max < 1e-3 * errors.extent
-    (line,) = describe_intrinsics([row])
+    (line,) = describe_intrinsics(located.facts.intrinsics)
     assert line.startswith("camera 1: focal length 850.0 px (a guess) became 1,000.")
     assert "(+17.6%) by adjustment" in line
 
@@ -617,10 +617,10 @@ APART = "they are in models 0 and 1, which are not joined"
 def check_joined_folder(folder, found):
     """A joined model says of itself what others do, and its commands work."""
     drawing, facts = read_output(folder)
-    assert problems(facts, "joined") == []
-    assert facts["known_distances"][0]["found"] == pytest.approx(3.0)
-    assert "0001.jpg and 0008.jpg are 3 apart" in facts["scale"]
-    assert facts["joins"][0]["statement"] == found.joins[0].statement
+    assert problems(facts.summary(), "joined") == []
+    assert facts.known_distances[0].found == pytest.approx(3.0)
+    assert "0001.jpg and 0008.jpg are 3 apart" in facts.scale
+    assert facts.joins[0].statement == found.joins[0].statement
     rows = [row for model in found.models for row in model.located.cameras]
     assert dict(zip(drawing.cameras.names, drawing.cameras.trust.tolist(), strict=True)) == {
         row.name: row.trust for row in rows

@@ -412,15 +412,15 @@ def test_disturbed_rigs_are_refined_to_the_truth_and_the_mean_baseline_stays(dis
     assert mean == pytest.approx(np.linalg.norm(said, axis=1).mean(), rel=1e-9)
     true = scene.rigs.sensor_centers[0]
     size = np.linalg.norm(true[1:], axis=1).mean() / mean
-    assert [row["camera"] for row in found.rigs] == [2, 3, 4]
+    assert [row.camera for row in found.rigs] == [2, 3, 4]
     for row in found.rigs:
-        camera, pose = row["camera"], poses[row["camera"]]
+        camera, pose = row.camera, poses[row.camera]
         turn = scene.rigs.sensor_rotations[0, camera - 1].T @ pose.rotation.matrix()
         center = -size * pose.rotation.matrix().T @ pose.translation
         # Largest of three axes, of the noise and of what is left of the wrong matches: 2.5 times at most.
-        assert rotation_angles_deg(turn) < 5.0 * row["turn_sigma_deg"] < 0.1
-        assert np.linalg.norm(center - true[camera - 1]) < 5.0 * row["place_sigma"] < 0.02
-        assert row["turned_deg"] == pytest.approx(1.0, abs=0.05)
+        assert rotation_angles_deg(turn) < 5.0 * row.turn_sigma_deg < 0.1
+        assert np.linalg.norm(center - true[camera - 1]) < 5.0 * row.place_sigma < 0.02
+        assert row.turned_deg == pytest.approx(1.0, abs=0.05)
     ids, own = centers_of(found.reconstruction)
     assert len(ids) == 32
     fit = fit_similarity(own, scene.centers)

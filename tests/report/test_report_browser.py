@@ -211,9 +211,12 @@ def test_it_fits_a_narrow_window_and_a_row_brings_the_scene_into_view(driver, re
 
 def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     drawing, facts = make_drawing(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
-    facts["inputs"]["model"] = HOSTILE[0]
-    facts["warnings"] = [f"look at {name}" for name in HOSTILE]
-    facts["options"]["note"] = HOSTILE[1]
+    facts = replace(
+        facts,
+        inputs=replace(facts.inputs, model=HOSTILE[0]),
+        warnings=[f"look at {name}" for name in HOSTILE],
+    )
+    facts.options["note"] = HOSTILE[1]
     write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     for row in range(len(HOSTILE)):

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.model import BundleAdjustment
+from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import (
     reprojection_error_bars,
@@ -22,7 +25,7 @@ from sfm_shapefit.report.charts import (
 from sfm_shapefit.report.drawing import PairClass, build_drawing, frustum_corners, view_axes
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
-from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
+from sfm_shapefit.report.sentences import first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
 from tests.drawings import make_drawing
 
@@ -36,6 +39,7 @@ HOSTILE = [
     "\u202eright to left\udcff.jpg",
     "x" * 10_000 + ".jpg",
 ]
+ADJUSTED = BundleAdjustment(converged=True, iterations=9, initial_error_px=2.0, final_error_px=1.0)
 
 
 def data_of(page):
@@ -99,8 +103,11 @@ def test_of_many_pairs_the_worst_are_listed_and_the_page_says_so():
 
 def test_hostile_names_stay_text_in_the_file():
     drawing, facts = make_drawing(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
-    facts["inputs"]["model"] = HOSTILE[0]
-    facts["warnings"] = [f"look at {name}" for name in HOSTILE]
+    facts = replace(
+        facts,
+        inputs=replace(facts.inputs, model=HOSTILE[0]),
+        warnings=[f"look at {name}" for name in HOSTILE],
+    )
     page = report_html(drawing, facts)
     assert page.count("<script") == report_html(*make_drawing()).count("<script")
     assert "<img" not in page.split("<script>", 1)[0]
@@ -127,9 +134,9 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
     assert text.startswith("24 of 25 cameras are placed; 1 is not in this model.")
     assert "18 contradict them" in text
     assert text.endswith("Units and axes: scale and origin of the input's centers.")
-    assert "ShapeFit's optimum is certified to 3.0e-09" in " ".join(expert_sentences(facts))
+    assert "ShapeFit's optimum is certified to 3.0e-09" in " ".join(facts.expert_sentences())
     looks = first_looks(drawing, facts)
-    assert looks[0].text == facts["warnings"][0]
+    assert looks[0].text == facts.warnings[0]
     assert any(look.camera == 24 and "not placed" in look.text for look in looks)
     least = int(np.nanargmin(drawing.cameras.trust))
     assert next(look for look in looks if "has trust" in look.text).camera == least
@@ -140,7 +147,7 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
 
 def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_anyway():
     drawing, facts = make_drawing()
-    facts["warnings"] = [f"{name} looks odd" for name in drawing.cameras.names]
+    facts = replace(facts, warnings=[f"{name} looks odd" for name in drawing.cameras.names])
     looks = first_looks(drawing, facts)
     odd = [look.camera for look in looks if "looks odd" in look.text]
     listed = [look.camera for look in looks if "is not placed" in look.text or "has trust" in look.text]
@@ -151,7 +158,7 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
     ("grade", "adjusted", "headline", "command"),
     [
         ("good", None, "Good: this model can be used", "bundle_adjuster"),
-        ("good", {"converged": True}, "Good: this model can be used", "image_undistorter"),
+        ("good", ADJUSTED, "Good: this model can be used", "image_undistorter"),
         ("look", None, "Look at 2 cameras first", "bundle_adjuster"),
         ("do not use", None, "Do not use this model", "inspect 'a folder/sparse/0'"),
     ],
@@ -159,9 +166,13 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
 def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, headline, command):
     drawing, facts = make_drawing()
     reasons = ["only 30% of the pairs agree"] if grade == "do not use" else []
-    facts["verdict"] = {"grade": grade, "cameras": list(drawing.cameras.names[:2]), "reasons": reasons}
-    facts |= {"bundle_adjustment": adjusted}
-    facts["inputs"]["model"] = "a folder/sparse/0"
+    names = drawing.cameras.names[:2]
+    facts = replace(
+        facts,
+        verdict=ModelVerdict(grade=Grade(grade), cameras=names, reasons=tuple(reasons)),
+        bundle_adjustment=adjusted,
+        inputs=replace(facts.inputs, model="a folder/sparse/0"),
+    )
     found = banner(drawing, facts)
     assert (found["grade"], found["headline"]) == (grade, headline)
     assert command in found["command"]
@@ -180,7 +191,7 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     assert shown["typical error of a pair"] == "1.4 px, 0.08°"
     assert shown["camera to check"] == "1"
     assert shown["typical uncertainty, 0.07% of the scene"] == "± 0.015 units"
-    del facts["figures"]  # as in an output of an earlier version
+    facts = replace(facts, figures=KeyFigures.of_cameras((), None, 1000.0, "units"))  # nothing is known
     labels = [tile["label"] for tile in tiles(drawing, facts)]
     assert not any(label.startswith(("typical error", "typical uncertainty")) for label in labels)
 
@@ -278,22 +289,24 @@ def test_pairs_that_are_off_by_little_alarm_nobody_one_by_one():
         ({"model": "in memory", "database": "a.db"}, "a.db"),
         ({"model": "in memory", "database": None}, "in memory"),
         ({"model": "0", "database": None}, "0"),
-        ({"graph": "data/graph40.txt"}, "graph40.txt"),
     ],
 )
 def test_the_title_is_the_name_of_the_scene(inputs, title):
-    assert scene_name({"inputs": inputs}) == title
+    facts = make_drawing()[1]
+    assert scene_name(replace(facts, inputs=replace(facts.inputs, **inputs))) == title
 
 
 def test_nothing_known_nothing_claimed():
     drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
-    facts |= {"warnings": [], "loose_groups": []}
-    for key in ("verdict", "delivered", "figures", "sigma_of", "scale", "mean_reprojection_error_px"):
-        del facts[key]
-    data = page_data(drawing, facts)
-    assert data["banner"]["grade"] == ""
-    assert data["banner"]["headline"] == "2 of 3 cameras placed"
-    assert "certif" not in " ".join(data["expertFacts"])
+    figures = KeyFigures.of_cameras((), None, 1000.0, "units")
+    none = {
+        "residual_level_deg": None,
+        "mean_reprojection_error_px": None,
+        "sigma_of": "",
+        "figures": figures,
+    }
+    data = page_data(drawing, replace(facts, warnings=[], loose_groups=[], **none))
+    assert "standard deviation" not in " ".join(data["expertFacts"])
     json.dumps(data, allow_nan=False)
 
 

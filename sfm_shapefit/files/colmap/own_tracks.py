@@ -9,13 +9,13 @@ import math
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.executors import answers
-from sfm_shapefit.files.colmap.filter import PointRules
 from sfm_shapefit.files.colmap.model import points2d_xy
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.images import Images
@@ -27,42 +27,47 @@ _TRACKS_A_TASK = 1000
 _RANDOM_SEED = 0
 
 
+class TrackRules(NamedTuple):
+    """What a point must satisfy."""
+
+    max_error_px: float
+    """Largest reprojection error of an observation."""
+    min_angle_deg: float
+    """Least angle between two of its rays."""
+    min_length: int
+    """Fewest observations of its track."""
+
+
 def triangulate_own_tracks(
-    placed: pycolmap.Reconstruction,
-    images: Images,
     source: pycolmap.Reconstruction,
-    rules: PointRules,
+    images: Images,
+    rules: TrackRules,
     advance: Callable[[int, int], None],
     executor: Executor | None = None,
 ) -> Points:
-    """Return the points of another model, each triangulated from its own track.
+    """Return the points of a model, each triangulated from its own track at other poses.
 
     Args:
-        placed: the model with the poses, and with the points2D of `source`.
-        images: those of it that have a pose.
         source: the model whose tracks serve; points keep its ids.
+        images: those of it that are placed.
         rules: what points must satisfy.
         advance: called with the tracks that are done and their number.
         executor: shares out the tracks among its workers, with the same answer to the bit.
 
     Raises:
-        ValueError: if the points2D are others.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    own = [placed.image(i) for i in images.ids.tolist()]
-    for image in own:
-        if image.num_points2D() != source.image(image.image_id).num_points2D():
-            raise ValueError(
-                f"image {image.image_id} has other points2D than the model whose tracks are used"
-            )
-    seen = points_of(source, images)
+    seen, own = points_of(source, images), [source.image(i) for i in images.ids.tolist()]
     pixels = np.empty((len(seen.images), 2))
     for k, image in enumerate(own):
         rows = np.flatnonzero(seen.images == k)
         pixels[rows] = points2d_xy(image)[seen.keypoints[rows]]
     chosen = np.flatnonzero(seen.lengths() >= rules.min_length)
     slices = [slice(*seen.offsets[[k, k + 1]].tolist()) for k in chosen.tolist()]
-    poses, cameras = [image.cam_from_world() for image in own], [placed.camera(i.camera_id) for i in own]
+    cameras = [source.camera(image.camera_id) for image in own]
+    shifts = -np.einsum("iab,ib->ia", images.rotations, images.centers)
+    turns = map(pycolmap.Rotation3d, images.rotations)
+    poses = [pycolmap.Rigid3d(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
     tasks = (
         TrackTask(
             poses=poses,
@@ -98,7 +103,7 @@ class TrackTask:
     cameras: list[pycolmap.Camera]
     tracks: list[tuple[IntArray, FloatArray]]
     """Images (k,), as positions in the two lists, and pixels (k, 2) of each."""
-    rules: PointRules
+    rules: TrackRules
 
 
 def triangulate_task(task: TrackTask) -> list[tuple[FloatArray, BoolArray] | None]:

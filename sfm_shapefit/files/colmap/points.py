@@ -7,7 +7,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
 from sfm_shapefit.files.colmap.images import put_images
-from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.files.colmap.lenses import camera_of, lens_of
 from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -17,26 +17,36 @@ Keypoints = Callable[[int], FloatArray | None]
 
 
 class ModelPictures:
-    """The points2D of images of a reconstruction, or keypoints instead of them, see `Pictures`."""
+    """The points2D of a reconstruction, or keypoints instead, seen through the lenses of `images`."""
 
     def __init__(
         self, reconstruction: pycolmap.Reconstruction, images: Images, keypoints: Keypoints | None = None
     ) -> None:
         self._images = [reconstruction.image(i) for i in images.ids.tolist()]
-        self._cameras = [reconstruction.camera(image.camera_id) for image in self._images]
+        self._cameras, self._lens_of = [camera_of(lens) for lens in images.lenses], images.lens_of.tolist()
         self._keypoints = keypoints
 
     def count(self, image: int) -> int:
         """Return how many points2D an image has."""
         return len(self._pixels(image))
 
-    def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
-        """Return pixels (k, 2) and rays (k, 3) of points2D; through a case of OPENCV, of depth 1."""
-        camera, xy = self._cameras[image], self._pixels(image)[keypoints]
+    def pixels(self, image: int, keypoints: IntArray | Int32Array) -> FloatArray:
+        """Return where points2D are, (k, 2)."""
+        return self._pixels(image)[keypoints]
+
+    def rays(self, image: int, pixels: FloatArray) -> FloatArray:
+        """Return rays (k, 3) of pixels; through a case of OPENCV, of depth 1."""
+        camera = self._cameras[self._lens_of[image]]
         if not lens_of(camera).is_adjustable:
-            return xy, camera_rays(camera, xy)
-        on_plane = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
-        return xy, np.concatenate([on_plane, np.ones((len(xy), 1))], axis=1)
+            return camera_rays(camera, pixels)
+        on_plane = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
+        return np.concatenate([on_plane, np.ones((len(pixels), 1))], axis=1)
+
+    def project(self, image: int, positions: FloatArray, *, ahead: bool = True) -> FloatArray:
+        """Return the pixels (k, 2) of points (k, 3) in axes of the camera; of all, or of those it sees."""
+        camera = self._cameras[self._lens_of[image]]
+        found = camera.img_from_cam(positions, check_cheirality=ahead)
+        return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
     def _pixels(self, image: int) -> FloatArray:
         """Return the pixels of an image, (k, 2)."""
@@ -76,11 +86,14 @@ def add_points(
     """
     image_ids, keypoints = images.ids[points.images].tolist(), points.keypoints.tolist()
     begin = 0
-    for point_id, end, xyz in zip(points.ids.tolist(), points.offsets[1:].tolist(), points.xyz, strict=True):
+    errors = np.full(points.num_points, -1.0) if points.errors_px is None else points.errors_px
+    given = zip(points.ids.tolist(), points.offsets[1:].tolist(), points.xyz, errors.tolist(), strict=True)
+    for point_id, end, xyz, error in given:
         track = pycolmap.Track()
         for image_id, keypoint in zip(image_ids[begin:end], keypoints[begin:end], strict=True):
             track.add_element(image_id, keypoint)  # a TrackElement for each takes four times as long
         point = pycolmap.Point3D(xyz=xyz, track=track)
+        point.error = error
         if colors is not None:
             point.color = colors.point3D(point_id).color
         reconstruction.add_point3D_with_id(point_id, point)

@@ -24,24 +24,28 @@ pairs alone, even half of all, do not make a model bad.
 """
 
 import enum
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of
-from sfm_shapefit.facts.warnings import match_warnings, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.placement.place import SMALLEST_PIECE
 
-if TYPE_CHECKING:
-    from sfm_shapefit.facts.result import GraphResult, LocateResult
-
+UNCERTAIN_SHARE = 0.05
+"""Share of the extent of all above which the standard deviation of a camera counts as large."""
 _MOST_LEVEL_DEG = 5.0
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_PAIRS = 0.25
 _LEAST_KEPT = 0.5
 _LOW_TRUST = 0.75
+# Cameras within so many median distances of the median say how large the scene is.
+_INSIDE = 30.0
 
 
 class Grade(enum.Enum):
@@ -52,24 +56,23 @@ class Grade(enum.Enum):
     DO_NOT_USE = "do not use"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ModelVerdict:
-    """Whether a model can be used, and why."""
+class ModelVerdict(Record):
+    """Whether the model can be used; the rules are in `judgement.grade`."""
 
-    grade: Grade
-    cameras: tuple[str, ...]
-    """To be looked at, the least trusted first."""
-    reasons: tuple[str, ...]
-    """Why the grade is not better; empty if it is good."""
+    grade: Annotated[Grade, "What to do with it."]
+    statement: Annotated[str, "The same in a sentence."] = ""
+    cameras: Annotated[tuple[str, ...], "To be looked at, the least trusted first."]
+    reasons: Annotated[tuple[str, ...], "Why the grade is not better; none if it is good."]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "statement", self._sentence())
 
     @property
     def is_bad(self) -> bool:
         """Whether the model should not be used."""
         return self.grade is Grade.DO_NOT_USE
 
-    @property
-    def statement(self) -> str:
-        """The verdict in a sentence."""
+    def _sentence(self) -> str:
         if self.grade is Grade.GOOD:
             return "good"
         what = self.grade.value
@@ -79,8 +82,8 @@ class ModelVerdict:
         return "; ".join([what, *self.reasons]) if self.cameras else f"{what}: {'; '.join(self.reasons)}"
 
 
-class _Shares(NamedTuple):
-    """Of what there is, how much agrees or is in the output; NaN where that is not known."""
+class Shares(NamedTuple):
+    """How much of the evidence agrees, and how many cameras are in the output; NaN where it is not known."""
 
     observations: float
     contradicting: float
@@ -88,32 +91,23 @@ class _Shares(NamedTuple):
     kept: float
 
 
-def judge_model(found: "LocateResult") -> ModelVerdict:
-    """Return the verdict on a placed model."""
-    kept = float(np.mean(found.kept))
-    shares = _Shares(
-        found.agreeing_observations, found.contradicting_observations, found.agreeing_pairs, kept
-    )
-    outside = [*found.placement.cameras[~found.kept].tolist(), *found.cameras_without_support]
-    repeats = tuple(match_warnings(found.directions))[:1]
-    lenses = tuple(
-        f"the matches of camera {d.camera} prefer another focal length" for d in found.focal_doubts
-    )
-    names = [found.model.names[camera] for camera in outside]
-    return _judge(found.placement, shares, names, lenses + repeats + found.suspicions)
-
-
-def judge_graph(found: "GraphResult") -> ModelVerdict:
+def judge_graph(placement: Judged) -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
-    placement = found.placement
     share = 1.0 - len(placement.rejected_pairs) / max(len(placement.pairs), 1)
-    return _judge(placement, _Shares(np.nan, np.nan, share, 1.0), [], ())
+    return judge_model(placement, Shares(np.nan, np.nan, share, 1.0))
 
 
-def _judge(
-    placement: Judged, shares: _Shares, outside: list[str], suspicions: tuple[str, ...]
+def judge_model(
+    placement: Judged, shares: Shares, outside: Sequence[str] = (), suspicions: Sequence[str] = ()
 ) -> ModelVerdict:
-    """Apply the rules of the module's header."""
+    """Apply the rules of the module's header.
+
+    Args:
+        placement: the evidence for pairs and cameras.
+        shares: how much agrees.
+        outside: names of cameras that are not in the output, or that no point supports.
+        suspicions: what else speaks against the model, a clause each.
+    """
     bad = tuple(_reasons_against(placement, shares))
     trust, cameras = placement.assessment.trust, placement.cameras
     doubtful = trust < _LOW_TRUST
@@ -133,7 +127,7 @@ def _judge(
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
 
 
-def _reasons_against(placement: Judged, shares: _Shares) -> Iterator[str]:
+def _reasons_against(placement: Judged, shares: Shares) -> Iterator[str]:
     """Yield why a model should not be used; a share that is not known is no reason."""
     level = placement.assessment.level_deg
     if level > _MOST_LEVEL_DEG:
@@ -144,3 +138,22 @@ def _reasons_against(placement: Judged, shares: _Shares) -> Iterator[str]:
         yield f"only {shares.pairs:.0%} of the pairs agree"
     if shares.kept < _LEAST_KEPT:
         yield f"only {shares.kept:.0%} of the placed cameras are trusted"
+
+
+def uncertain_cameras(placement: Judged) -> IntArray:
+    """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
+    if len(placement.cameras) < SMALLEST_PIECE:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(largest_sigmas(placement) > UNCERTAIN_SHARE * _extent(placement.locations))
+
+
+def largest_sigmas(placement: Judged) -> FloatArray:
+    """Return the largest of each camera's standard deviations along the axes."""
+    return np.asarray(standard_deviations(placement.covariances).max(axis=1))
+
+
+def _extent(locations: FloatArray) -> float:
+    """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
+    distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
+    inside = locations[distances <= _INSIDE * median_spread(locations)]
+    return float(np.linalg.norm(np.ptp(inside, axis=0)))

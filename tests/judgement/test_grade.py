@@ -1,14 +1,13 @@
 """One verdict for a model, by rules that are written down."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import sfm_shapefit
 from sfm_shapefit import synthetic
-from sfm_shapefit.facts.grade import Grade, judge_graph
+from sfm_shapefit.judgement.grade import Grade, judge_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from tests.program import run
@@ -103,7 +102,7 @@ def test_a_graph_of_noise_is_not_to_be_used():
     """Directions drawn at random agree with no placement."""
     problem = synthetic.random_graph_problem(30, 0.5, 3, q=1.0, seed=2)
     placed = place(problem.view_graph)
-    assert judge_graph(SimpleNamespace(placement=placed)).is_bad
+    assert judge_graph(placed).is_bad
 
 
 def test_strict_ends_with_code_4_where_the_verdict_is_do_not_use_and_writes_the_output(tmp_path):

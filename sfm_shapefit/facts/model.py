@@ -1,0 +1,426 @@
+"""What is told of models: placed by `locate` or `map`, joined by `map`, or looked at as they stand.
+
+A new figure is a field here, with its sentence, and the line that computes it in `LocateResult.facts`;
+what people are to see of it is one more line in `scene_rows` (terminal, report and notebooks) or of `told`.
+"""
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.display import NextStep, Row, Telling, row
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
+from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
+from sfm_shapefit.facts.joins import JoinFacts
+from sfm_shapefit.facts.placed import (
+    IN_MEMORY,
+    SCHEMA_VERSION,
+    Facts,
+    GraphFacts,
+    InputFacts,
+    Options,
+    PlacedFacts,
+    Timings,
+    Version,
+    Warnings,
+)
+from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
+from sfm_shapefit.facts.scene import (
+    DistanceFacts,
+    Loop,
+    describe_doubtful_pairs,
+    describe_line,
+    describe_loops,
+)
+from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
+from sfm_shapefit.placement.place import Placement
+
+
+class EarthDatum(Record):
+    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: Annotated[float, "Geodetic latitude."]
+    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
+    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
+
+
+class ModelInputs(InputFacts):
+    """What a model was made of."""
+
+    model: Annotated[str, "The model's folder or file."]
+    database: Annotated[str | None, "The database whose matches were used, if any."]
+    directions: Annotated[str, "Where the directions came from."]
+
+    @property
+    def path(self) -> str:
+        """Path of the model; one in memory, as of `map`, is named by its database."""
+        return self.database if self.model == IN_MEMORY and self.database else self.model
+
+
+class EvidenceShares(Record):
+    """What share of the evidence agrees with the cameras and points of the output."""
+
+    pairs: Annotated[
+        float | None,
+        "Of the pairs of its cameras that say anything of a direction; null where none does.",
+    ]
+    observations: Annotated[
+        float | None,
+        "Of the keypoints matched in two or more of its other images, the share that sees a 3D point; null "
+        "without a database.",
+    ]
+    contradicting: Annotated[
+        float | None,
+        "Of the same, the share that sees none and most of whose matches miss the epipolar lines of the "
+        "cameras.",
+    ]
+
+
+class PlacementAdjustment(Record):
+    """How placed cameras were adjusted to the pixels, and their given rotations treated."""
+
+    statement: Annotated[str, "What was chosen and why, in words."]
+    rotations: Annotated[Literal["held", "weighted", "free"], "How the given rotations were treated."]
+    rotation_sigma_deg: Annotated[
+        float | None, "Standard deviation per axis by which they were weighted; null if they were not."
+    ]
+    chance_deg: Annotated[
+        float | None, "By how much chance would turn them per axis; null if the matches were not asked."
+    ]
+
+    @classmethod
+    def of_estimate(cls, estimate: Estimate | None) -> Self | None:
+        """Return how a placement was adjusted; None if it was not."""
+        if estimate is None:
+            return None
+        weight, errors = estimate.weight, estimate.errors
+        return cls(
+            statement=estimate.statement,
+            rotations="held" if weight.hold else "free" if weight.sigma_rad is None else "weighted",
+            rotation_sigma_deg=None if weight.sigma_rad is None else math.degrees(weight.sigma_rad),
+            chance_deg=None if errors is None else math.degrees(errors.chance_rad),
+        )
+
+
+class RotationRefinement(Record):
+    """What the adjustment of the placement changed of the given rotations."""
+
+    num_updated: Annotated[int, "Cameras that turned."]
+    num_kept: Annotated[int, "Cameras that keep the rotation of the input."]
+    median_change_deg: Annotated[float, "By how much those that turned did."]
+    max_change_deg: Annotated[float, "By how much the camera turned that did most."]
+
+    @classmethod
+    def of_turns(cls, turned_deg: FloatArray | None) -> Self | None:
+        """Return what is told of turns (n,), exactly 0 where a rotation is kept; None of None."""
+        if turned_deg is None:
+            return None
+        changed = turned_deg[turned_deg > 0.0]
+        return cls(
+            num_updated=len(changed),
+            num_kept=len(turned_deg) - len(changed),
+            median_change_deg=float(np.median(changed)) if len(changed) else 0.0,
+            max_change_deg=float(changed.max(initial=0.0)),
+        )
+
+
+class BundleAdjustment(Record):
+    """What --adjust full reached; mean reprojection errors."""
+
+    converged: Annotated[bool, "Whether the last round met its tolerance."]
+    iterations: Annotated[int, "Steps of all rounds together."]
+    initial_error_px: Annotated[float, "At the seed's poses."]
+    final_error_px: Annotated[float, "At the adjusted poses."]
+
+    @property
+    def statement(self) -> str:
+        """How it went, in words."""
+        state = "converged" if self.converged else "stopped at its limit"
+        errors = f"{self.initial_error_px:.2f} -> {self.final_error_px:.2f} px"
+        return f"{state} after {self.iterations} steps, mean error {errors}"
+
+
+class GroupFacts(Record):
+    """Cameras that move together: frames of rigs, and fixed cameras."""
+
+    num_groups: Annotated[int, "Groups of the input."]
+    num_placed: Annotated[int, "Groups with a camera in the output."]
+    num_fixed: Annotated[int, "Cameras that stay where the input has them."]
+    num_inner_pairs: Annotated[int, "Pairs inside one group, which say nothing."]
+
+    @classmethod
+    def of_placement(cls, placement: Placement, kept: BoolArray, fixed: BoolArray | None) -> Self | None:
+        """Return what moved together; None where each camera moves by itself.
+
+        Args:
+            placement: of the cameras.
+            kept: which of its cameras are in the output.
+            fixed: (n,) images that stay where they are; None if none was to.
+        """
+        if placement.groups is None:
+            return None
+        cameras = placement.groups.group_of[: placement.num_cameras]
+        pairs = placement.graph.edges[: placement.num_pairs]
+        return cls(
+            num_groups=len(np.unique(cameras)),
+            num_placed=len(np.unique(cameras[placement.cameras[kept]])),
+            num_fixed=0 if fixed is None else int(np.sum(fixed)),
+            num_inner_pairs=int(np.sum(~placement.groups.joins(pairs))),
+        )
+
+    @property
+    def statement(self) -> str:
+        """The same in words."""
+        fixed = f", {counted(self.num_fixed, 'camera')} fixed" if self.num_fixed else ""
+        inner = f"; {self.num_inner_pairs} pairs inside them give no constraint"
+        return f"{self.num_placed} of {self.num_groups} placed{fixed}{inner}"
+
+
+class FactsOfModel(Facts):
+    """What is told of any COLMAP model, placed or only looked at."""
+
+    inputs: Annotated[ModelInputs, "What was read."]
+    num_points: Annotated[int, "3D points."]
+    mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
+    scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+
+
+class ModelFacts(FactsOfModel, PlacedFacts):
+    """locate.json, and what `sfm-shapefit locate --json` prints."""
+
+    not_trusted: Annotated[dict[str, str], "Images that are left out because they are not trusted, and why."]
+    few_points: Annotated[
+        dict[str, int],
+        "Images that are left out because they see too few points, or hardly any of those that their matches "
+        "could make, and how many they see.",
+    ]
+    pairs: Annotated[
+        dict[str, int],
+        "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",
+    ]
+    agreement: Annotated[EvidenceShares, "What share of the evidence agrees."]
+    num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
+    scale_sigma: Annotated[
+        float | None,
+        "Relative standard deviation of a scale that rigs, priors, known distances or control points tell; "
+        "else null.",
+    ]
+    known_distances: Annotated[
+        tuple[DistanceFacts, ...], "What was told of distances, and what the model has."
+    ]
+    control_points: Annotated[tuple[ControlPoint, ...], "Ground control points, with their residuals."]
+    datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
+    rigid_groups: Annotated[GroupFacts | None, "Null where every camera moves by itself."]
+    intrinsics: Annotated[
+        tuple[CameraIntrinsics, ...], "Cameras that were never calibrated, or were asked to be refined."
+    ]
+    refined_rigs: Annotated[tuple[RefinedSensor, ...], "Sensors whose poses in their rigs were refined."]
+    line_sigma: Annotated[
+        float | None,
+        "Median standard deviation of a position along the line on which all cameras stand, as a share of "
+        "its length; null where they stand on none, or where it is not known.",
+    ]
+    num_doubtful_pairs: Annotated[
+        int, "Pairs of doubtful_pairs.csv: used, but with far smaller scores than others."
+    ]
+    loops: Annotated[tuple[Loop, ...], "Of the videos among the images of `map`."]
+    adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
+    rotation_refinement: Annotated[RotationRefinement | None, "Null if nothing was adjusted."]
+    bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
+    join: Annotated[JoinFacts | None, "Of a model of `map` beside the largest; else null."]
+
+    @property
+    def next_step(self) -> NextStep:
+        """What to do next."""
+        return next_of_model(
+            self.verdict.grade, self.inputs.path, is_adjusted=self.bundle_adjustment is not None
+        )
+
+    def scene_rows(self) -> list[Row]:
+        """Return what is told of lenses, rigs, control points and the scene, where there is something."""
+        return [
+            Row("intrinsics", describe_intrinsics(self.intrinsics)),
+            Row("rigs", describe_rigs(self.refined_rigs)),
+            row("control points", describe_control_points(self.control_points)),
+            row("straight", describe_line(self.line_sigma)),
+            row("video", describe_loops(self.loops)),
+            row("doubtful pairs", describe_doubtful_pairs(self.num_doubtful_pairs)),
+        ]
+
+    def expert_sentences(self) -> list[str]:
+        """Return what only those who know the method ask for."""
+        said = self.adjustment.statement if self.adjustment else ""
+        return super().expert_sentences() + ([f"{said[:1].upper()}{said[1:]}."] if said else [])
+
+    @property
+    def points_statement(self) -> str:
+        """How many points there are, and how far they are off their keypoints."""
+        if not self.num_points:
+            return "none"
+        return f"{self.num_points}, mean error {self.mean_reprojection_error_px:.2f} px"
+
+    def told(self, left_out: Sequence[str], centers: str) -> Telling:
+        """Return what the terminal says.
+
+        Args:
+            left_out: images that are not in the output, with the reason.
+            centers: where the centers come from, in words.
+        """
+        figures = [
+            *self.key_rows(),
+            row("points", self.points_statement),
+            Row("not placed", left_out),
+            *self.piece_rows(),
+            *self.scene_rows(),
+            *self.warning_rows(),
+        ]
+        nodes = f"{counted(self.num_points_as_nodes, 'track')} helped to place cameras"
+        details = [
+            row("directions", self.inputs.directions),
+            row("rigid groups", self.rigid_groups.statement if self.rigid_groups else ""),
+            Row("pairs", self._pair_lines()),
+            row("points as nodes", nodes),
+            row("centers", centers),
+            row("adjustment", self.adjustment.statement if self.adjustment else ""),
+            row("scale", self.scale),
+            row("bundle adjustment", self.bundle_adjustment.statement if self.bundle_adjustment else ""),
+            row("certificate", self.delivered.statement),
+        ]
+        return Telling(
+            counted(self.num_images, "image"),
+            figures,
+            details,
+            written="seeded model, locate.json, cameras.csv, pairs.csv",
+            step=self.next_step,
+        )
+
+    def _pair_lines(self) -> list[str]:
+        """Say what became of the pairs, in the words of `inspect`."""
+        counts = dict(self.pairs)
+        contradicting, usable = counts.pop("outlier"), counts.pop("usable")
+        others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
+        return [f"{usable} usable ({contradicting} contradict the solution)", *others]
+
+
+def next_of_model(grade: Grade, source: str, *, is_adjusted: bool) -> NextStep:
+    """Return what to do with a model of ours, made of a source."""
+    if grade is Grade.DO_NOT_USE:
+        step = f"sfm-shapefit inspect {shlex.quote(source)}"
+        return NextStep("Next: find out what is wrong with the input.", step)
+    if is_adjusted:
+        return NextStep(
+            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
+            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
+        )
+    return NextStep(
+        "Next: bundle adjustment" + (", once you have looked." if grade is Grade.LOOK else "."),
+        "mkdir -p {out_adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out_adjusted}",
+    )
+
+
+class ExaminedFacts(FactsOfModel):
+    """A model that was only looked at, not placed."""
+
+    examined: Annotated[Literal[True], "Its positions were looked at as they stand."] = True
+    median_track_length: Annotated[float | None, "Of the 3D points."]
+
+    @property
+    def next_step(self) -> NextStep:
+        """What to do next."""
+        path = shlex.quote(self.inputs.path)
+        if self.verdict.grade is Grade.GOOD:
+            return NextStep(
+                "Next: undistort the images for dense reconstruction.",
+                f"colmap image_undistorter --image_path IMAGES --input_path {path} --output_path dense",
+            )
+        text = "Next: place the cameras anew from their rotations and matches, and compare."
+        return NextStep(text, f"sfm-shapefit locate {path} located")
+
+
+class JoinedFacts(ExaminedFacts):
+    """joined_0/locate.json, of models of `map` that were joined: looked at, not placed anew."""
+
+    models: Annotated[list[str], "The folders of the models in it."]
+    joins: Annotated[list[JoinFacts], "How they were joined."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]
+    known_distances: Annotated[
+        tuple[DistanceFacts, ...], "What was told of distances, and what the model has."
+    ]
+    datum: Annotated[EarthDatum | None, "Where the origin is on Earth; null if that is not known."]
+
+    @property
+    def next_step(self) -> NextStep:
+        """What to do next."""
+        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=False)
+
+
+class DatabaseInputs(Record):
+    """What `map` worked from."""
+
+    database: Annotated[str, "The database's path."]
+
+
+class Averaging(Record):
+    """How rotations were averaged, and how well they agree with the pairs."""
+
+    statement: Annotated[str, "How the rotations were found, in words."]
+    num_registered: Annotated[int, "Images that have a rotation."]
+    num_pairs: Annotated[int, "Pairs whose residuals count."]
+    agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
+    num_unsettled: Annotated[int, "Images that most of their pairs contradict, in every answer tried."]
+    median_sigma_deg: Annotated[float | None, "Median standard deviation of a rotation; null if not known."]
+    num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
+    certified: Annotated[
+        bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
+    ]
+    num_repeated_pairs: Annotated[
+        int,
+        "Pairs set aside since they would fold the images together, and lack matches that they should share.",
+    ]
+    num_rival_pairs: Annotated[int, "Pairs of another arrangement of the images that is as likely."]
+
+
+class Component(Record):
+    """One connected component of the images."""
+
+    folder: Annotated[str, "Where it stands in OUT."]
+    num_images: Annotated[int, "Images that have an averaged rotation."]
+    num_placed: Annotated[int, "Cameras in the output."]
+    averaging: Annotated[Averaging, "Where its rotations come from."]
+    located: Annotated[ModelFacts, "What stands in the model's own locate.json."]
+
+
+class MapFacts(Record):
+    """map.json, and what `sfm-shapefit map --json` prints."""
+
+    schema_version: Version = SCHEMA_VERSION
+    inputs: Annotated[DatabaseInputs, "What was read."]
+    options: Options
+    num_images: Annotated[int, "Images of the database."]
+    num_placed: Annotated[int, "Cameras in all models."]
+    num_video_frames: Annotated[int, "Images that are frames of a video."]
+    num_pairs: Annotated[int, "Pairs with a relative rotation."]
+    models: Annotated[list[Component], "One per connected component, most cameras first."]
+    joins: Annotated[list[JoinFacts], "What came of joining the models; one for each but the largest."]
+    left_out: Annotated[dict[str, str], "Images in no model, and why."]
+    timings_s: Timings
+    warnings: Warnings
+
+
+def read_facts(values: Mapping[str, Any]) -> Facts:
+    """Return what stands in a locate.json.
+
+    Raises:
+        TypeError, ValueError, AttributeError: if it is not as this version writes it.
+    """
+    if values.get("examined"):
+        return JoinedFacts.read(values)
+    return (GraphFacts if "graph" in values["inputs"] else ModelFacts).read(values)

@@ -1,0 +1,487 @@
+"""What is told of any placement: records with their sentences, each with what computes and what says it.
+
+Terminal and notebooks begin with three figures, which the report has as tiles:
+
+    placed                   25 of 25 images
+    typical error of a pair  0.04 deg (0.5 px)
+    typical uncertainty      0.0002 of the input's units, 0.006% of the scene (standard deviation)
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+
+from sfm_shapefit import __version__
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.display import NextStep, Row, Telling, row
+from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.judgement.grade import ModelVerdict
+from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.placement.place import Placement, count_large
+from sfm_shapefit.refinement.starts import RefinedPlacement
+from sfm_shapefit.solver.options import Status
+
+UNITS = {
+    "input": "of the input's units",
+    "unit": "units",
+    "rig": "of the rigs' units",
+    "distance": "of the known distance's units",
+    "prior": "of the priors' units",
+    "fixed": "of the fixed cameras' units",
+    "control points": "of the control points' units",
+}
+"""What a standard deviation is given in, by the choice of the scale."""
+SOLVER_UNITS = "of the solver's units"
+NOISE_ONLY = "matching noise only"
+"""How a statement begins that standard deviations leave out errors of rotations and calibration."""
+IN_MEMORY = "in memory"
+"""What stands in locate.json in the place of a model's path where there is none."""
+SCHEMA_VERSION: Literal[1] = 1
+
+_MOST_DEG = 89.0
+"""Largest angle in degrees that is told in pixels."""
+_CAP_OF_SIZE = 0.5
+"""Distance, as a share of the spread of all, above which a camera has no say in a fitted similarity."""
+_SAME = 1e-9
+"""Distance, as a share of the spread, below which two positions differ by rounding only."""
+_OTHERS = {True: ", and no other is as good", False: ", but others may be as good", None: ""}
+_QUANTILES = (25, 50, 75, 90)
+_ANGLES_DEG = (1, 2, 5, 10, 30, 90)
+_NOT_SOLVED = "free: its directions determine no placement"
+
+Options = Annotated[dict[str, Any], "The settings of the run, a key per option of the command."]
+Timings = Annotated[dict[str, float], "Wall-clock seconds per stage."]
+Versions = Annotated[dict[str, str], "Of the packages that the answer depends on."]
+Warnings = Annotated[list[str], "What the user should know, a sentence each."]
+Version = Annotated[Literal[1], "Keys are added, never renamed, within a version."]
+
+
+class KeyFigures(Record):
+    """The figures that terminal and report begin with, beside the number of placed cameras."""
+
+    pair_error_deg: Annotated[
+        float | None, "Median angle between the direction of a pair and the line between its cameras."
+    ]
+    pair_error_px: Annotated[
+        float | None, "The same in pixels, at the images' median focal length; null for a bare graph."
+    ]
+    sigma: Annotated[
+        float | None,
+        "Median over the placed cameras of the largest standard deviation along the axes; null if not known.",
+    ]
+    sigma_of_extent: Annotated[float | None, "The same as a share of the extent of the placed cameras."]
+    sigma_unit: Annotated[str, "What sigma is given in, to follow the number."]
+
+    @classmethod
+    def of_cameras(
+        cls, cameras: Sequence[CameraRow], pair_error_deg: float | None, focal_length_px: float, unit: str
+    ) -> Self:
+        """Return the figures of placed cameras.
+
+        Args:
+            cameras: their rows; those that are not placed do not count.
+            pair_error_deg: median angle between the direction of a pair and the line between its cameras.
+            focal_length_px: median over the images, as pairs are of images, and one camera may take most of
+                them; NaN for a bare graph.
+            unit: what positions are given in, one of `UNITS` or `SOLVER_UNITS`.
+        """
+        placed = [camera for camera in cameras if camera.placed]
+        centers = np.array([camera.center for camera in placed if camera.center])
+        extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) else 0.0
+        largest = [max(camera.sigma) for camera in placed if camera.sigma]
+        known = [sigma for sigma in largest if math.isfinite(sigma)]
+        sigma = float(np.median(known)) if known else math.nan
+        error_deg = math.nan if pair_error_deg is None else pair_error_deg
+        return cls(
+            pair_error_deg=error_deg,
+            pair_error_px=math.tan(math.radians(min(error_deg, _MOST_DEG))) * focal_length_px,
+            sigma=sigma,
+            sigma_of_extent=sigma / extent if extent > 0.0 else math.nan,
+            sigma_unit=unit,
+        )
+
+    @property
+    def pair_error(self) -> str:
+        """The error of a pair in words."""
+        if self.pair_error_deg is None:
+            return "not known"
+        in_pixels = "" if self.pair_error_px is None else f" ({self.pair_error_px:.2g} px)"
+        return f"{rounded(self.pair_error_deg, digits=2)} deg{in_pixels}"
+
+    def uncertainty(self, sigma_of: str) -> str:
+        """Say how uncertain a position is; `sigma_of` as of `Facts`."""
+        if self.sigma is None:
+            return "not known; see warnings, or --verbose"
+        share = self.sigma_of_extent
+        of_scene = "" if share is None else f", {100.0 * share:.2g}% of the scene"
+        return f"{self.sigma:.2g} {self.sigma_unit}{of_scene} (standard deviation{scope_of(sigma_of)})"
+
+
+def scope_of(sigma_of: str) -> str:
+    """Say after a comma that standard deviations know of noise only, if so."""
+    return f", {NOISE_ONLY}" if sigma_of.startswith(NOISE_ONLY) else ""
+
+
+class LooseGroup(Record):
+    """Cameras that are rigid by the graph but loose by the geometry."""
+
+    cameras: Annotated[list[str], "The group's images."]
+    cause: Annotated[str, "Why it hangs loose."]
+
+
+class Piece(Record):
+    """A parallel-rigid piece of three cameras or more."""
+
+    num_cameras: Annotated[int, "Cameras of it, placed or not."]
+    scale: Annotated[str, "Its gauge, in words, or why it has none."]
+    hinges: Annotated[list[str], "Cameras that it shares with other pieces."]
+    folder: Annotated[str, 'Where it stands in OUT, "." for the largest; empty if it was not solved.']
+    num_placed: Annotated[int, "Cameras of it that are in the output; the others are not trusted."]
+
+    @property
+    def statement(self) -> str:
+        """Where it stands, in words."""
+        return (
+            f"{self.folder}: {self.num_placed} of {counted(self.num_cameras, 'camera')}, hinged at "
+            f"{', '.join(self.hinges) or 'nothing'}, with a scale of its own"
+        )
+
+
+def folder_of(piece: int) -> str:
+    """Return where a piece stands in the output."""
+    return f"pieces/{piece}" if piece else "."
+
+
+def pieces_of(placement: Placement, solved: Iterable[tuple[int, str, int]]) -> list[Piece]:
+    """Return the parallel-rigid pieces of three cameras or more, and the largest.
+
+    Args:
+        placement: the graph and its largest piece.
+        solved: number, scale and number of placed cameras of each piece that is solved.
+    """
+    facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
+    n, graph = placement.num_cameras, placement.graph
+    rows = []
+    for k, piece in enumerate(placement.pieces[: max(count_large(placement.pieces, n), 1)]):
+        scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
+        rows.append(
+            Piece(
+                num_cameras=int(np.sum(piece.nodes < n)),
+                scale=scale,
+                hinges=[graph.name_of(hinge) for hinge in piece.hinges[piece.hinges < n].tolist()],
+                folder=folder_of(k) if k in facts else "",
+                num_placed=num_placed,
+            )
+        )
+    return rows
+
+
+class Delivered(Record):
+    """What is certified, and how far the cameras that are delivered stand from it.
+
+    The certificate proves the optimum of ShapeFit. What is delivered is mostly not that optimum: it is
+    refined in angles, from ShapeFit's optimum or from LUD's, and may be adjusted after.
+    """
+
+    statement: Annotated[str, "Both in words."]
+    from_certified_median: Annotated[
+        float | None,
+        "Of the distances from the certified optimum after the similarity that fits best, as a share of the "
+        "scene's radius; null where there is no distance.",
+    ]
+    from_certified_max: Annotated[float | None, "The largest of these distances."]
+
+    @classmethod
+    def compare(cls, placement: Placement, centers: FloatArray, *, adjusted: bool) -> Self:
+        """Compare the delivered centers with the certified optimum.
+
+        Args:
+            placement: the solve and what was kept of it.
+            centers: (k, d) delivered centers of `placement.cameras`, NaN for those that are left out.
+            adjusted: whether a bundle adjustment came last.
+        """
+        solved, refined = placement.certified, placement.refined
+        delivered = f"{refined.start}, refined in angles" if refined.is_refined else refined.start
+        delivered += ", then adjusted" if adjusted else ""
+        to = f"to {max(solved.gap, 0.0):.1e}"
+        certified = f"ShapeFit's optimum is certified {to}{_OTHERS[solved.unique]}"
+        if solved.status is not Status.CONVERGED:
+            certified = f"ShapeFit's optimum is not certified to the tolerance, only {to}"
+        kept = np.isfinite(centers).all(axis=1)
+        optimum, there = solved.locations[: len(centers)][kept], centers[kept]
+        size = median_spread(there)
+        onto = fit_similarity_l1(optimum, there, cap=_CAP_OF_SIZE * size)
+        distances = np.linalg.norm(onto.apply(optimum) - there, axis=1) / size
+        median, largest = float(np.median(distances)), float(distances.max())
+        apart = f"{delivered}, {median:.2%} of the scene's radius from it (median; at most {largest:.2%})"
+        apart = "that optimum itself" if largest <= _SAME else apart
+        return cls(
+            statement=f"{certified}; delivered: {apart}",
+            from_certified_median=median,
+            from_certified_max=largest,
+        )
+
+
+class Solve(Record):
+    """The certified ShapeFit solve of the largest piece."""
+
+    status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
+    objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]
+    dual_bound: Annotated[float | None, "No placement has a lower objective."]
+    gap: Annotated[float | None, "objective - dual_bound."]
+    equality_residual: Annotated[
+        float | None, "Violation of the dual's equality, relative to the largest weighted degree."
+    ]
+    unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
+    iterations: Annotated[int, "Of the solver that ran."]
+    seconds: Annotated[float, "Wall-clock time of the solve."]
+    method: Annotated[str, "The solver that ran."]
+    method_reason: Annotated[str, "Why it was chosen."]
+
+
+class Lud(Record):
+    """The LUD start and its own dual bound, in its own units."""
+
+    objective: Annotated[float, "Value of the LUD program at its start."]
+    dual_bound: Annotated[float | None, "No placement has a lower objective."]
+    equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
+    iterations: Annotated[int, "Of the solver."]
+
+
+class Finish(Record):
+    """From the certified optimum to the centers."""
+
+    start: Annotated[str, "The convex start that was kept."]
+    refined: Annotated[bool, "Whether the angular refinement moved the start."]
+    reason: Annotated[str, "Why this start was kept."]
+    disagreement: Annotated[float | None, "How far the two starts disagree about lengths, as a share."]
+    costs: Annotated[dict[str, float], "Robust angular cost of each start after refinement."]
+    levels_deg: Annotated[tuple[float, ...], "Level of the residuals, of pairs and of directions to points."]
+    moved_median: Annotated[
+        float,
+        "Median move of cameras and points from the start that is kept, as a share of their median distance "
+        "from the center.",
+    ]
+    moved_max: Annotated[float, "The largest such move."]
+    num_turned_pairs: Annotated[
+        int,
+        "Directions, those to points too, that fit the start and not the refined locations, or the other way "
+        "round.",
+    ]
+    num_put_back: Annotated[int, "Cameras that had left the scene and were put back."]
+    lud: Annotated[Lud | None, "The second start; null if it was not solved."]
+
+    @classmethod
+    def of_placement(cls, refined: RefinedPlacement) -> Self:
+        """Return how the locations were found from the optimum."""
+        return cls.taken_from(
+            refined,
+            refined=refined.is_refined,
+            moved_median=refined.moved[0],
+            moved_max=refined.moved[1],
+            num_put_back=len(refined.reset_nodes),
+            lud=Lud.of(refined.lud),
+        )
+
+
+class InputFacts(Record):
+    """What a command worked from."""
+
+    @property
+    def path(self) -> str:
+        """Where it is, to name the result by."""
+        raise NotImplementedError
+
+
+class Facts(Record):
+    """What is told of anything that stands in cameras.csv and pairs.csv, and drawn by the report."""
+
+    schema_version: Version = SCHEMA_VERSION
+    inputs: Annotated[InputFacts, "What was read."]
+    verdict: Annotated[ModelVerdict, "One verdict for the whole model."]
+    options: Options
+    num_images: Annotated[int, "Images of the input, posed or not; nodes of a bare graph."]
+    num_placed: Annotated[int, "Of these, how many are in the output."]
+    figures: Annotated[KeyFigures, "The figures that matter."]
+    num_pairs: Annotated[int, "Pairs that were looked at."]
+    sigma_of: Annotated[
+        str,
+        "What the standard deviations of cameras.csv know of: matching noise only, or, after an adjustment, "
+        "noise, rotations and calibration; and what they are relative to.",
+    ]
+    residual_level_deg: Annotated[
+        float | None, "Level of the agreeing pairs' residuals; null where no pair says any."
+    ]
+    pieces: Annotated[list[Piece], "Parallel-rigid pieces, most cameras first; none of joined models."]
+    loose_groups: Annotated[list[LooseGroup], "Groups of cameras that hang loose; none of joined models."]
+    timings_s: Timings
+    warnings: Warnings
+    versions: Versions
+
+    @property
+    def next_step(self) -> NextStep:
+        """What to do next."""
+        raise NotImplementedError
+
+    def key_rows(self, noun: str = "image") -> list[Row]:
+        """Return the figures that matter."""
+        return [
+            row("placed", f"{self.num_placed:,} of {counted(self.num_images, noun)}"),
+            row("typical error of a pair", self.figures.pair_error),
+            row("typical uncertainty", self.figures.uncertainty(self.sigma_of)),
+        ]
+
+    def piece_rows(self) -> list[Row]:
+        """Say where the further pieces stand."""
+        return [Row("further pieces", [piece.statement for piece in self.pieces[1:] if piece.folder])]
+
+    def scene_rows(self) -> list[Row]:
+        """Return what is told of lenses, rigs, control points and the scene, where there is something."""
+        return []
+
+    def warning_rows(self) -> list[Row]:
+        """Return a row for each warning."""
+        return [row("warning", warning) for warning in self.warnings]
+
+    def expert_sentences(self) -> list[str]:
+        """Return what only those who know the method ask for."""
+        level = self.residual_level_deg
+        if level is None:
+            return []
+        return [f"Pairs that agree are off by a standard deviation of {level:.2g} degrees per axis."]
+
+
+class PlacedFacts(Facts):
+    """What stands in the locate.json of a model and of a bare graph."""
+
+    num_pairs_rejected: Annotated[
+        int, "Pairs without a usable direction, and those that contradict the solution."
+    ]
+    residuals_deg: Annotated[
+        dict[str, float],
+        "Angles between directions and solved baselines of the placed pairs, in degrees: quantile_Q, and "
+        "share_beyond_A, the share of the pairs beyond A degrees.",
+    ]
+    delivered: Annotated[Delivered, "What became of the certified optimum."]
+    solve: Annotated[Solve, "The certified solve."]
+    finish: Annotated[Finish, "What became of its optimum."]
+
+    def expert_sentences(self) -> list[str]:
+        """Return what only those who know the method ask for."""
+        return [*super().expert_sentences(), f"The certificate: {self.delivered.statement}."]
+
+
+def facts_of_placement(
+    placement: Judged,
+    cameras: Sequence[CameraRow],
+    solved: Iterable[tuple[int, str, int]],
+    measures: tuple[float, str],
+) -> dict[str, Any]:
+    """Return what can be said of any placement, by the fields of `PlacedFacts`; nodes count as images.
+
+    Args:
+        placement: the evidence.
+        cameras: a row of each.
+        solved: as of `pieces_of`.
+        measures: the focal length in pixels and the unit of positions.
+    """
+    residuals, graph = residuals_deg(placement), placement.graph
+    others = ("pycolmap", "numpy", "scipy", "clarabel")
+    return {
+        "num_images": graph.num_nodes,
+        "num_placed": len(placement.cameras),
+        "figures": KeyFigures.of_cameras(cameras, residuals["quantile_50"], *measures),
+        "num_pairs": placement.num_pairs,
+        "num_pairs_rejected": len(placement.rejected_pairs),
+        "sigma_of": sigma_of(placement),
+        "residual_level_deg": placement.assessment.level_deg,
+        "residuals_deg": residuals,
+        "loose_groups": [
+            LooseGroup(
+                cameras=[graph.name_of(camera) for camera in placement.cameras[group.cameras].tolist()],
+                cause=group.cause.value,
+            )
+            for group in placement.assessment.loose_groups
+        ],
+        "pieces": pieces_of(placement, solved),
+        "solve": Solve(**placement.certified.summary()),
+        "finish": Finish.of_placement(placement.refined),
+        "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
+    }
+
+
+def sigma_of(placement: Judged) -> str:
+    """Say what the standard deviations of the cameras know of, and what they are relative to."""
+    if placement.adjusted_covariances is None:
+        return f"{NOISE_ONLY}; relative to the centroid and scale of the cameras that are held"
+    held = ~placement.adjusted_covariances.any(axis=(1, 2))
+    relative = f"{int(held.sum())} fixed cameras" if held.any() else "the model's mean position and scale"
+    return f"adjusted: noise, rotations, calibration; relative to {relative}"
+
+
+def residuals_deg(placement: Judged) -> dict[str, float]:
+    """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
+    residuals = placement.assessment.residuals_deg[placement.pairs]
+    facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}
+    return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
+
+
+class GraphInputs(InputFacts):
+    """What `place` worked from."""
+
+    graph: Annotated[str, "The file or folder of the graph."]
+    directions: Annotated[str, "As given, or from which rotations."]
+
+    @property
+    def path(self) -> str:
+        """Path of the graph."""
+        return self.graph
+
+
+class GraphFacts(PlacedFacts):
+    """locate.json of a bare graph, and what `sfm-shapefit place --json` prints."""
+
+    inputs: Annotated[GraphInputs, "What was read."]
+    dimension: Annotated[int, "Of the locations."]
+
+    @property
+    def next_step(self) -> NextStep:
+        """What to do next."""
+        return NextStep(
+            "Next: the positions are in cameras.csv; look at them from all sides.",
+            "sfm-shapefit report {out}",
+        )
+
+    def told(self, left_out: Sequence[str], locations: str) -> Telling:
+        """Return what the terminal says; `left_out` are nodes with the reason, `locations` their origin."""
+        rejected = counted(self.num_pairs_rejected, "pair")
+        quantiles = " / ".join(f"{self.residuals_deg[f'quantile_{q}']:.3g}" for q in _QUANTILES)
+        beyond = ", ".join(f"{self.residuals_deg[f'share_beyond_{a}']:.1%} beyond {a}" for a in _ANGLES_DEG)
+        within = f"{'/'.join(map(str, _QUANTILES))} % of the pairs within {quantiles} deg"
+        figures = [
+            *self.key_rows("node"),
+            Row("not placed", left_out),
+            *self.piece_rows(),
+            *self.warning_rows(),
+        ]
+        details = [
+            row("directions", self.inputs.directions),
+            row("dimension", str(self.dimension)),
+            row("pairs", f"{self.num_pairs:,}: {rejected} contradict the solution"),
+            Row("residuals", [within, f"{beyond} deg"]),
+            row("locations", locations),
+            row("certificate", self.delivered.statement),
+        ]
+        return Telling(
+            counted(self.num_images, "node"),
+            figures,
+            details,
+            written="locate.json, cameras.csv, pairs.csv",
+            step=self.next_step,
+        )

@@ -1,0 +1,128 @@
+"""What is told of a scene: loops of videos, straight drives, doubtful pairs, and distances that were told."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from sfm_shapefit.facts.options import KnownDistance
+
+
+class Loop(Record):
+    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
+
+    first: Annotated[tuple[str, ...], "First and last frame of the earlier stretch."]
+    second: Annotated[tuple[str, ...], "First and last frame of the later stretch."]
+    num_pairs: Annotated[int, "Pairs between the two."]
+    num_matches: Annotated[int, "Their inlier matches."]
+    num_refused: Annotated[int, "Pairs left out, as they do not agree with the chain of pairs near in time."]
+    angle_deg: Annotated[float, "Median angle between their relative rotations and the chain's."]
+    tolerance_deg: Annotated[float, "Up to where they agree with it."]
+
+    @property
+    def cells(self) -> list[str]:
+        """Its two stretches, pairs, matches, angle and fate, as the report has them in a row."""
+        refused, total = self.num_refused, self.num_pairs
+        fate = "taken" if refused == 0 else "refused" if refused == total else f"taken but for {refused}"
+        angle = f"{self.angle_deg:.2g} deg (up to {self.tolerance_deg:.2g} agree)"
+        stretches = [_stretch(self.first), _stretch(self.second)]
+        return [*stretches, str(total), str(self.num_matches), angle, fate]
+
+
+class DistanceFacts(Record):
+    """A distance that was told."""
+
+    first: Annotated[str, "Name of an image."]
+    second: Annotated[str, "Name of another."]
+    known: Annotated[float, "How far apart they are, as told."]
+    found: Annotated[float | None, "In the output; null if one of them is not in it."]
+
+
+def told_distances(
+    known: "Sequence[KnownDistance]", model: "pycolmap.Reconstruction"
+) -> tuple[DistanceFacts, ...]:
+    """Return the distances that were told, each with what a model has."""
+    named = {name for one in known for name in one[:2]}
+    images = model.images.values() if named else ()
+    centers = {i.name: i.projection_center() for i in images if i.name in named and i.has_pose}
+    return tuple(
+        DistanceFacts(
+            first=first, second=second, known=float(distance), found=_distance(centers, first, second)
+        )
+        for first, second, distance in known
+    )
+
+
+def _distance(centers: Mapping[str, FloatArray], first: str, second: str) -> float | None:
+    both = first in centers and second in centers
+    return float(np.linalg.norm(centers[first] - centers[second])) if both else None
+
+
+def describe_loops(loops: Sequence[Loop]) -> str:
+    """Say how many pairs far apart in time were taken and refused; empty where there are none."""
+    if not loops:
+        return ""
+    pairs = sum(loop.num_pairs for loop in loops)
+    lost = sum(loop.num_refused for loop in loops)
+    said = f"{counted(pairs, 'pair')} of frames far apart in time"
+    if not lost:
+        return f"{said}, taken as the frames between say the same"
+    worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
+    return (
+        f"{said}, {lost} refused as the frames between contradict {'it' if lost == 1 else 'them'}: above all "
+        f"from {_stretch(worst.first)} to {_stretch(worst.second)}"
+    )
+
+
+def describe_line(sigma: float | None) -> str:
+    """Say how well lengths along a straight drive are known; empty where cameras do not stand on a line."""
+    if sigma is None:
+        return ""
+    return (
+        "the cameras stand on one line, along which points alone tell lengths: positions along it are known "
+        f"to {100.0 * sigma:.2g}% of its length (standard deviation)"
+    )
+
+
+def describe_doubtful_pairs(count: int) -> str:
+    """Say what to do with pairs that look like repeated structure; empty where there are none."""
+    if not count:
+        return ""
+    if count == 1:
+        return (
+            "1 pair in use looks like repeated structure, though no position contradicts it; --without "
+            "doubtful_pairs.csv leaves it out"
+        )
+    return (
+        f"{count} pairs in use look like repeated structure, though no position contradicts them; --without "
+        "doubtful_pairs.csv leaves them out"
+    )
+
+
+def describe_repeated_pairs(count: int) -> str:
+    """Say that pairs of a folded arrangement were not followed."""
+    return (
+        "the scene repeats itself: pairs that would fold the images together were not followed "
+        f"({counted(count, 'pair')}), as they lack matches that such pairs should share"
+    )
+
+
+def describe_rival_pairs(count: int) -> str:
+    """Say that another arrangement of the images is as likely."""
+    return (
+        f"the images can be arranged in another way that {counted(count, 'other pair')} speak for, with as "
+        "much evidence: the scene repeats itself; look whether parts of it are folded together"
+    )
+
+
+def _stretch(frames: Sequence[str]) -> str:
+    """Name a stretch of a video by its first and last frame."""
+    first, last = frames
+    return first if first == last else f"{first} \N{EN DASH} {last}"

@@ -1,0 +1,69 @@
+"""Observations and points that do not fit are filtered, by COLMAP's rules.
+
+In this order: observations that their camera does not see or that miss by too much; points left with fewer
+than two; points without triangulation angle (a point that is not finite has none); short tracks.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.options import StructureOptions
+
+
+def filter_points(points: Points, images: Images, pictures: Pictures, options: StructureOptions) -> Points:
+    """Return the points that satisfy the options, with what of their observations does, and their errors.
+
+    Args:
+        points: of the images.
+        images: where they stand.
+        pictures: of these.
+        options: what points must satisfy.
+    """
+    errors_px = reprojection_errors_px(points, images, pictures)
+    fitting = points.paired(errors_px <= options.max_reprojection_error_px)  # false for NaN
+    kept = points.taken(fitting)
+    sums = np.bincount(kept.points_seen(), errors_px[fitting], kept.num_points)
+    kept = replace(kept, errors_px=sums / kept.lengths())
+    is_kept = _are_wide(kept, images.centers, options.min_triangulation_angle_deg)
+    is_kept &= kept.lengths() >= options.min_track_length
+    return kept.taken(is_kept[kept.points_seen()])
+
+
+def reprojection_errors_px(
+    points: Points, images: Images, pictures: Pictures, *, ahead: bool = True
+) -> FloatArray:
+    """Return the distance of each observation from its point's projection, (o,); NaN where that is not seen.
+
+    Not `ahead`: points behind a camera are projected too, as the formula of its lens has it.
+    """
+    errors, seen = np.empty(len(points.images)), points.points_seen()
+    rotations, centers = images.rotations, images.centers
+    for k, rows in enumerate(points.rows_of_images(images.num_images)):
+        with np.errstate(invalid="ignore"):  # a point that is not finite
+            in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
+        off = pictures.project(k, in_camera, ahead=ahead) - pictures.pixels(k, points.keypoints[rows])
+        errors[rows] = np.linalg.norm(off, axis=1)
+    return errors
+
+
+def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
+    """Return which points two of their observations see under an angle, or its supplement, of so much."""
+    rays = centers[points.images] - points.xyz[points.points_seen()]
+    with np.errstate(invalid="ignore"):
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    cosine, wide = np.cos(np.radians(least_deg)), np.zeros(points.num_points, dtype=np.bool_)
+    lengths = points.lengths()
+    for first in range(int(lengths.max(initial=1)) - 1):
+        left = np.flatnonzero(~wide & (lengths > first + 1))  # a few, after the first round
+        ends = points.offsets[left]
+        counts = lengths[left] - first - 1
+        others = np.repeat(ends + first + 1 - np.append(0, np.cumsum(counts))[:-1], counts) + np.arange(
+            counts.sum()
+        )
+        cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[ends + first], counts, axis=0), rays[others]))
+        wide[np.repeat(left, counts)[cosines <= cosine]] = True
+    return wide

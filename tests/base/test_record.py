@@ -1,0 +1,70 @@
+"""Records: plain values and back, and the schema of both."""
+
+import enum
+import math
+from typing import Annotated, Literal
+
+import pytest
+
+from sfm_shapefit.base.record import Record, dumps, schema_of
+
+
+class Color(enum.Enum):
+    RED = "red"
+
+
+class Inner(Record):
+    """What is inside."""
+
+    length: Annotated[float | None, "How long it is."]
+
+
+class Outer(Record):
+    """What is outside.
+
+    More of it.
+    """
+
+    color: Annotated[Color, "Its color."]
+    parts: Annotated[tuple[Inner, ...], "Its parts."]
+    names: Annotated[dict[str, Inner], "Parts by name."]
+    kind: Annotated[Literal["a", "b"], "What it is."] = "a"
+
+
+RECORD = Outer(
+    color=Color.RED, parts=(Inner(length=1.0), Inner(length=math.nan)), names={"x": Inner(length=2.0)}
+)
+
+
+def test_plain_values_are_those_of_json_and_lead_back():
+    values = RECORD.summary()
+    assert values == {
+        "color": "red",
+        "parts": [{"length": 1.0}, {"length": None}],
+        "names": {"x": {"length": 2.0}},
+        "kind": "a",
+    }
+    assert Outer.read(values | {"of a later version": 1}) == RECORD
+    assert dumps({"values": (math.inf, 1.0)}) == '{\n  "values": [\n    null,\n    1.0\n  ]\n}'
+    with pytest.raises(TypeError, match="color"):
+        Outer.read({"parts": [], "names": {}})
+    with pytest.raises(ValueError, match="blue"):
+        Outer.read(values | {"color": "blue"})
+
+
+def test_a_record_of_attributes_takes_those_of_its_fields_and_none_is_none():
+    assert Inner.of(Inner(length=3.0)) == Inner(length=3.0)
+    assert Inner.of(None) is None
+
+
+def test_the_schema_has_each_record_once_with_the_sentences_of_its_fields():
+    definitions = {}
+    assert schema_of(Outer, definitions, {Outer: "outer"}) == {"$ref": "#/$defs/outer"}
+    assert list(definitions) == ["outer", "Inner"]
+    outer = definitions["outer"]
+    assert outer["description"] == "What is outside."
+    assert outer["required"] == ["color", "parts", "names", "kind"]
+    assert outer["properties"]["color"] == {"enum": ["red"], "description": "Its color."}
+    assert outer["properties"]["kind"] == {"enum": ["a", "b"], "description": "What it is."}
+    assert outer["properties"]["parts"]["items"] == {"$ref": "#/$defs/Inner"}
+    assert definitions["Inner"]["properties"]["length"]["anyOf"] == [{"type": "number"}, {"type": "null"}]
