@@ -102,7 +102,7 @@ def test_groups_are_placed_without_the_refinement_where_only_its_factor_would_be
     def refuse(*_given, **_more):
         raise UnsolvableError("too large")
 
-    monkeypatch.setattr(starts, "ReducedFactor", refuse)
+    monkeypatch.setattr(starts, "RigidReduction", refuse)
     found = place(measure(kind))
     assert not found.refined.is_refined
     assert "the factor for that would be too large" in found.refined.reason
