@@ -1,13 +1,8 @@
 """Structure: 3D points that do not fit are filtered."""
 
-from collections.abc import Callable
-
 import pycolmap
 
 from sfm_shapefit.tracks.options import StructureOptions
-
-Advance = Callable[[int, int], None]
-"""Called with the work done so far and the work in all."""
 
 
 def filter_points(

@@ -34,11 +34,11 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment.filter import Advance, filter_in_place
+from sfm_shapefit.adjustment.filter import filter_in_place
 from sfm_shapefit.adjustment.sources import TrackSource
 from sfm_shapefit.adjustment.views import add_points, read_frames
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.executors import answers
+from sfm_shapefit.base.executors import Advance, answers, nobody
 from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.files.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.files.colmap.seed import copy_without_points
@@ -63,7 +63,7 @@ def triangulate(
     seed: pycolmap.Reconstruction,
     tracks: TrackSource,
     options: StructureOptions | None = None,
-    advance: Advance | None = None,
+    advance: Advance = nobody,
     executor: Executor | None = None,
 ) -> pycolmap.Reconstruction:
     """Return a copy of `seed` whose 3D points are triangulated at its poses; old points are dropped.
@@ -84,7 +84,7 @@ def triangulate(
         WorkerError: if a worker died and the executor does not replace it.
     """
     structure, options = copy_without_points(seed), options or StructureOptions()
-    triangulate_in_place(structure, tracks, options, advance or (lambda _done, _total: None), executor)
+    triangulate_in_place(structure, tracks, options, advance, executor)
     filter_in_place(structure, options)
     return structure
 

@@ -10,11 +10,18 @@ from sfm_shapefit.base.errors import ShapeFitError
 ExecutorKind = Literal["serial", "processes", "dask"]
 """No executor, processes of this machine, or a cluster."""
 
+Advance = Callable[[int, int], None]
+"""Called with the work done so far and the work in all."""
+
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
 # So many tasks are on their way at once, which bounds the memory that they take.
 _TASKS_AT_ONCE = 32
+
+
+def nobody(_done: int, _total: int) -> None:
+    """Hear of progress, and tell no one."""
 
 
 class WorkerError(ShapeFitError):

@@ -84,7 +84,7 @@ def see_matches(
     """
     source = MatchSource(matches=matches, view=matches.at(model, inputs.left_out), inputs=inputs)
     if options is None or not options.max_memory_mb or source.kind == "tracks":
-        return source
+        return source  # of tracks, what there is to do is known once they are measured
     bare = replace(
         source.workload(),
         adjusts=options.adjusts_cameras(model.num_images),

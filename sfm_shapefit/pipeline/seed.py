@@ -15,6 +15,7 @@ from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import TrackSource, collect_matches
 from sfm_shapefit.adjustment.structure import triangulate_in_place
 from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import LocateOptions
@@ -237,9 +238,9 @@ def read_tracks(
     source: MatchSource,
     located: Located,
     seed: "pycolmap.Reconstruction",
-    advance: Callable[[int, int], None],
+    advance: Advance,
 ) -> TrackSource:
-    """Return the tracks to triangulate at the poses of a seed; the matches are consumed.
+    """Return the tracks to triangulate at the poses of a seed; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
@@ -247,6 +248,6 @@ def read_tracks(
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
-    if source.kind == "tracks":
+    if source.kind == "tracks":  # which are not made of matches
         return model.reconstruction
     return collect_matches(seed, model.image_ids, links, view.num_matches)
