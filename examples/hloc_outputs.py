@@ -10,7 +10,7 @@ sparse/0.
 
 If hloc has made a database.db already, as its reconstruction does, none of this is needed:
 
-    sfm-shapefit map database.db OUT --bundle-adjust
+    sfm-shapefit map database.db OUT --adjust full
 
 Needs h5py.
 """

@@ -14,7 +14,6 @@ import pdoc
 
 NAMES = (
     *(
-        "baselines",
         "files.colmap.model",
         "synthetic.rendered_workspace",
         "files.colmap.quiet",
@@ -39,7 +38,7 @@ NAMES = (
         "judgement",
         "solver",
     ),
-    *("synthetic", "synthetic.fixtures", "theory", "graph.viewgraph"),
+    *("synthetic", "synthetic.fixtures", "graph.viewgraph"),
 )
 MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
 

@@ -24,7 +24,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for name in NAMES:
         subparser = subparsers.add_parser(name)
         if words[:1] == [name]:
-            module = import_module(f"figures.{name}")
+            module = import_module(f"paper.{name}")
             subparser.description = module.__doc__
             add = subparser.add_argument
             add("--out", type=Path, required=True, help="PNG to write")

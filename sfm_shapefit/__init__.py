@@ -35,9 +35,10 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.inspect import inspect
     from sfm_shapefit.pipeline.locate import locate
     from sfm_shapefit.pipeline.map import map_database
+    from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
     from sfm_shapefit.pipeline.write import WriteOptions, write_map_result, write_result
-    from sfm_shapefit.placement.place import Placement, place
+    from sfm_shapefit.placement.place import Placement
     from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.rotations.average import average_rotations
     from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -58,7 +59,8 @@ _HOMES = {
     "pipeline.write": ("WriteOptions", "write_map_result", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "facts.options": ("LocateOptions", "MapOptions"),
-    "placement.place": ("Placement", "place"),
+    "pipeline.place": ("place",),
+    "placement.place": ("Placement",),
     "refinement.options": ("PlacementOptions",),
     "facts.map_result": ("MapResult",),
     "facts.result": ("LocateResult",),

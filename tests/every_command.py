@@ -13,20 +13,20 @@ from sfm_shapefit.cli import app
 
 COMMANDS = """
     locate data_synthetic/courtyard/sparse/0 {out}/located -q
-    locate data_synthetic/ring8/sparse/0 {out}/adjusted --bundle-adjust -q
+    locate data_synthetic/ring8/sparse/0 {out}/adjusted --adjust full -q
     evaluate {out}/located data_synthetic/courtyard/truth
     inspect data_synthetic/courtyard/sparse/0
     solve data_synthetic/graph40.txt {out}/solved -q
     solve data_synthetic/graph40.txt {out}/split --method admm -q
     map data_synthetic/ring8/database.db {out}/mapped -q
-    map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --bundle-adjust -q
-    map data_synthetic/ring8/database.db {out}/averaged --averaging pycolmap -q
+    map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
-    report {out}/located --scene
+    report {out}/located
+    convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q
     synth {out}/drive --shape drive --num-images 6 --num-points 300
-    inspect data_synthetic/ring8/sparse/0 --theory
-    place data_synthetic/graph40.txt {out}/linf --objective least-squares --filter 1dsfm -q
+    inspect data_synthetic/ring8/sparse/0
+    place data_synthetic/graph40.txt {out}/lud --objective lud -q
 """
 
 

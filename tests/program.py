@@ -1,12 +1,8 @@
 """The program as users type it, and Python, in this process or in one of their own."""
 
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 from click.testing import Result
 from typer.testing import CliRunner
@@ -43,18 +39,3 @@ def run_python(*arguments: object, **environment: str) -> subprocess.CompletedPr
         timeout=600,
         check=False,
     )
-
-
-@contextmanager
-def viewing(*arguments: object, cwd: Path = ROOT) -> Iterator[str]:
-    """Start the viewer, yield its address once it serves, and end it as a user does."""
-    command = [sys.executable, "-m", "sfm_shapefit.cli", "view", *map(str, arguments)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=cwd, env=environment, text=True) as process:
-        try:
-            assert process.stdout is not None
-            yield process.stdout.readline().split()[0]
-            process.send_signal(signal.SIGINT)
-            assert process.wait(timeout=60) == 0
-        finally:
-            process.kill()

@@ -13,8 +13,9 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import camera_rows
 from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.diagnosis import diagnose
-from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.program import differences
 from tests.problems import all_pairs
 from tests.scenes import RING, copied, edit_database

@@ -17,7 +17,6 @@ INDEX = {
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
     "real": "Real scenes against their ground truth, before and after bundle adjustment.",
-    "reliability": "Damaged input, faults of the machine, and determinism: a right answer or one sentence.",
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",

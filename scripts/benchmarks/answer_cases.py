@@ -1,7 +1,7 @@
-"""The cases of `answers`: a name that stays, and a command line in the folder that `answer_inputs` makes.
+"""The cases of `answers`: a name by meaning, which stays, and a command line in the folder of the inputs.
 
-A case whose output has a truth is followed by others that read that output. Of large sets the default alone
-is run.
+Command lines are spelled as in 82dd265; `answer_spellings` says how they are spelled in other checkouts. A
+case whose output has a truth is followed by others that read that output. Of large sets only defaults run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +16,8 @@ _SETS = (
     *("kerry-park", "kitti-turn", "lego100", "liberty", "liberty-calibrated", "robots-1"),
 )
 _LARGE = ("kitti-turn", "liberty", "liberty-calibrated", "robots-1")
+_WITHOUT_MODEL = "collection-guessed"
+"""A set whose database is mapped; it has no model to start from."""
 _SILENT = "--quiet --no-report"
 
 
@@ -26,119 +28,175 @@ class Case(NamedTuple):
     argv: tuple[str, ...]
     """Paths are relative to the folder of the inputs."""
     out: str = ""
-    """What it writes, if it writes."""
+    """Path of what it writes, if it writes."""
     scene: str = ""
-    """The scene or set it reads; the case is skipped where that is missing."""
+    """Scene or set it reads; the case is skipped where that is missing."""
     followers: tuple["Case", ...] = ()
     """Cases that read its output, run after it."""
     quick: bool = False
 
-
-def _name_flags(*lines: str) -> dict[str, str]:
-    """Return flags by names made of them: "--points never" is "points-never"."""
-    return {line.removeprefix("--").replace(" --", "-").replace(" ", "-"): line for line in lines}
+    @property
+    def is_verbatim(self) -> bool:
+        """Whether its words may be unknown: the refusal is the answer."""
+        return self.name.startswith("wrong/")
 
 
 _PLACEMENT = {
-    **_name_flags(*(f"--objective {name}" for name in ("shapefit", "lud", "least-squares", "linf"))),
-    **_name_flags(*(f"--solver {name}" for name in ("newton", "admm", "conic"))),
-    **_name_flags("--filter 1dsfm", "--filter triangles", "--no-refine", "--factor-memory 1"),
-    "filter-triangles-least-squares": "--filter triangles --objective least-squares",
-    "tol": "--tol 1e-5",
+    "shapefit": "--objective shapefit",
+    "lud": "--objective lud",
+    "newton": "--solver newton",
+    "admm": "--solver admm",
+    "unrefined": "--no-refine",
+    "small-factor": "--factor-memory-mb 1",
+    "loose-gap": "--tol 1e-5",
 }
-"""Flags of variants that `locate` and `solve` have in common; `solve` calls --solver --method."""
+"""Variants that `locate` and `place` have in common."""
+
+_FROM_PRIORS = {
+    "priors": "--priors scenes/{scene}/priors.txt",
+    "priors-pull": "--priors scenes/{scene}/priors.txt --refine-with-priors",
+    "gps": "--priors scenes/{scene}/gps.csv",
+    "gps-pull": "--priors scenes/{scene}/gps.csv --refine-with-priors",
+    "control": "--control-points scenes/{scene}/control.txt",
+    "control-adjusted": "--control-points scenes/{scene}/control.txt --bundle-adjust",
+    "distance": "--known-distance 0001.jpg 0003.jpg 2.5",
+    "distances": "--known-distance 0001.jpg 0003.jpg 2.5 --known-distance 0002.jpg 0005.jpg 3.5",
+    "database-priors": "--scale prior",
+}
+"""Variants whose scale is told."""
+
+_BOTH = {
+    **_FROM_PRIORS,
+    "all-trusted": "--min-trust 0",
+    "points-never": "--points never",
+    "points-always": "--points always",
+    "unadjusted": "--no-adjust",
+    "adjusted": "--bundle-adjust",
+    "lenses-held": "--refine-intrinsics none",
+    "lenses-focal": "--refine-intrinsics focal",
+    "lenses-all": "--refine-intrinsics all --bundle-adjust",
+    "sensors-free": "--refine-rigs --bundle-adjust",
+    "without-pairs": "--without scenes/{scene}/pairs.txt",
+    "unit": "--scale unit",
+    "one-thread": "--threads 1",
+    "processes": "--executor processes --threads 2",
+    "little-memory": "--max-memory-mb 1",
+    "strict": "--strict",
+}
+"""Variants that `locate` and `map` have in common."""
 
 _LOCATE = {
     **_PLACEMENT,
-    **_name_flags("--min-trust 0", "--points never", "--points always", "--threads 1", "--scene"),
-    **_name_flags(
-        "--scale unit", "--scale input", "--scale prior", "--rotations free", "--no-adjust", "--bundle-adjust"
-    ),
-    **_name_flags("--directions tracks", "--directions relative-poses", "--fix solved"),
-    "known-distance": "--known-distance 0001.jpg 0003.jpg 2.5",
-    "config": "--config known.toml",
-    "fix-names": "--fix scenes/{scene}/fixed.txt",
-    "fix-solved": "--fix solved",
-    "fix-solved-bundle-adjust": "--fix solved --bundle-adjust",
-    "fix-solved-shapefit": "--fix solved --objective shapefit",
-    "fix-names-bundle-adjust": "--fix scenes/{scene}/fixed.txt --bundle-adjust",
-    "priors": "--priors scenes/{scene}/priors.txt",
-    "priors-refine": "--priors scenes/{scene}/priors.txt --refine-with-priors",
-    "gps": "--priors scenes/{scene}/gps.csv",
-    "gps-refine": "--priors scenes/{scene}/gps.csv --refine-with-priors",
+    **_BOTH,
+    "input-scale": "--scale input",
+    "rotations-free": "--rotations free",
+    "rotations-held": "--rotations measured",
+    "rotations-sigma": "--rotation-sigma-deg 0.5",
+    "tracks": "--directions tracks",
+    "tracks-adjusted": "--directions tracks --bundle-adjust",
+    "config": "--config told.toml",
+    "fixed-names": "--fix scenes/{scene}/fixed.txt",
+    "fixed-names-adjusted": "--fix scenes/{scene}/fixed.txt --bundle-adjust",
+    "fixed-solved": "--fix solved",
+    "fixed-solved-adjusted": "--fix solved --bundle-adjust",
+    "fixed-solved-shapefit": "--fix solved --objective shapefit",
     "thresholds": "--min-inliers 40 --inlier-threshold-px 1 --max-reprojection-error-px 2",
-    "processes": "--executor processes --threads 2",
-    "max-memory": "--max-memory 1",
 }
-_FIXED = ("fix-solved-bundle-adjust", "fix-solved-shapefit")
-_OF_ALL = " ".join(sorted({*_LOCATE} - {"min-trust-0", "scale-prior", "gps", "gps-refine"} - {*_FIXED}))
+_NOT_OF_ALL = {"sensors-free", "database-priors", "gps", "gps-pull", "tracks-adjusted"}
+_NOT_OF_ALL |= {"fixed-solved-adjusted", "fixed-solved-shapefit", "all-trusted"}
+_OF_ALL = " ".join(name for name in _LOCATE if name not in _NOT_OF_ALL)
 _LOCATED = {
     "courtyard": _OF_ALL,
-    "castle-P19": _OF_ALL,
-    "ring8": "directions-tracks directions-relative-poses points-never known-distance priors fix-names "
-    "fix-solved objective-shapefit objective-linf bundle-adjust",
-    "facade9": "directions-tracks points-never objective-least-squares priors fix-solved",
-    "photographed": "bundle-adjust rotations-free no-adjust points-never fix-names priors-refine "
-    "objective-shapefit filter-triangles no-refine thresholds",
-    "kerry-park": "points-never fix-names fix-solved bundle-adjust objective-shapefit "
-    "objective-least-squares priors-refine directions-tracks factor-memory-1",
-    "rig": "objective-shapefit objective-lud objective-linf solver-admm fix-names priors priors-refine "
-    "bundle-adjust directions-relative-poses points-always no-refine filter-1dsfm scale-unit "
-    "rotations-free scale-prior",
-    "ring8-hinged": "points-never priors",
+    "castle-P19": " ".join(name for name in _OF_ALL.split() if not name.startswith("control")),
+    "ring8": "tracks tracks-adjusted points-never distance priors fixed-names fixed-solved shapefit "
+    "adjusted control-adjusted",
+    "ring8-guessed": "adjusted lenses-held lenses-focal lenses-all",
+    "facade9": "tracks-adjusted points-never priors priors-pull fixed-names fixed-solved control adjusted "
+    "shapefit",
+    "photographed": "adjusted rotations-free rotations-held rotations-sigma unadjusted points-never "
+    "fixed-names priors-pull shapefit unrefined thresholds control-adjusted lenses-all without-pairs",
+    "photographed-guessed": "adjusted lenses-held lenses-focal lenses-all",
+    "kerry-park": "points-never fixed-names fixed-solved adjusted shapefit priors-pull tracks small-factor "
+    "sensors-free",
+    "rig": "shapefit lud admm fixed-names priors priors-pull adjusted points-always unrefined unit "
+    "rotations-free database-priors sensors-free control",
+    "ring8-hinged": "points-never priors adjusted",
     "ring8-pendant": "points-never",
     "ring8-cycle": "points-never",
-    "courtyard-new": "fix-names fix-names-bundle-adjust fix-solved fix-solved-bundle-adjust "
-    "fix-solved-shapefit priors-refine directions-tracks scale-input",
-    "photographed-new": "fix-solved fix-solved-bundle-adjust",
-    "castle-P30": "bundle-adjust objective-shapefit rotations-free no-adjust",
-    "Herz-Jesus-P8": "directions-relative-poses filter-triangles",
-    "lego100": "points-never objective-shapefit",
-    "brighton-beach": "scale-prior gps gps-refine",
+    "courtyard-hinged": "points-never adjusted priors",
+    "courtyard-broken": "fixed-solved rotations-free adjusted input-scale",
+    "courtyard-new": "fixed-names fixed-names-adjusted fixed-solved fixed-solved-adjusted "
+    "fixed-solved-shapefit priors-pull tracks input-scale",
+    "photographed-new": "fixed-solved fixed-solved-adjusted",
+    "castle-P30": "adjusted shapefit rotations-free unadjusted",
+    "lego100": "points-never shapefit",
+    "brighton-beach": "database-priors gps gps-pull",
 }
-"""Variants of each scene, besides the default and min-trust-0."""
+"""Variants of each scene, besides the default and all-trusted."""
 
 _MAP = {
-    "default": "--json",
-    **_name_flags("--bundle-adjust", "--min-trust 0", "--relative stored", "--min-matches 30"),
-    **_name_flags("--min-model-size 20", "--no-adjust", "--points never"),
+    **_BOTH,
     "shapefit": "--objective shapefit",
+    "many-matches": "--min-matches 30",
+    "large-models": "--min-model-size 20",
+    "few-points-kept": "--min-points-per-image 0",
+    "gravity": "--gravity scenes/{scene}/gravity.txt",
+    "never-joined": "--join never --priors scenes/{scene}/priors.txt",
+    "no-video": "--sequence none",
+    "video": "--sequence names",
 }
 _MAPPED = {
-    "photographed": " ".join(_MAP),
-    "fountain-P11": "default bundle-adjust",
-    "castle-P19": "default bundle-adjust relative-stored",
-    **dict.fromkeys(("ring8", "Herz-Jesus-P8", "lego100", "kerry-park", "brighton-beach", "rig"), "default"),
+    "photographed": "adjusted all-trusted many-matches large-models unadjusted points-never shapefit priors "
+    "priors-pull control gravity processes few-points-kept one-thread",
+    "photographed-guessed": "adjusted lenses-held lenses-all unadjusted",
+    "courtyard": "adjusted gravity priors-pull control distances points-never without-pairs unadjusted",
+    "ring8": "gravity distance priors points-never",
+    "ring8-guessed": "lenses-held",
+    "ring8-hinged": "points-never adjusted",
+    "ring8-apart": "priors never-joined",
+    "ring8-few": "distance",
+    "courtyard-hinged": "points-never",
+    "rig": "adjusted sensors-free priors unit",
+    "fountain-P11": "adjusted gravity priors",
+    "castle-P19": "adjusted gravity",
+    "castle-P30": "",
+    "Herz-Jesus-P8": "",
+    "Herz-Jesus-P25": "",
+    "lego100": "",
+    "kerry-park": "adjusted",
+    "brighton-beach": "gps gps-pull",
+    **dict.fromkeys(("kitti-turn", "liberty", "liberty-calibrated", "robots-1", _WITHOUT_MODEL), ""),
 }
+"""Variants of each scene, besides the default."""
 
-_SOLVE = {
-    **{name: flags.replace("--solver", "--method") for name, flags in _PLACEMENT.items()},
-    "default": "--json",
+_PLACE = {
+    **_PLACEMENT,
     "formats": "--g2o --1dsfm",
-    **_name_flags("--g2o", "--reverse", "--scene"),
-    "rotations-txt": "--rotations graphs/1dsfm/rots.txt",
+    "g2o": "--g2o",
+    "reversed": "--reverse",
+    "rotations-1dsfm": "--rotations graphs/1dsfm/rots.txt",
     "rotations-g2o": "--rotations graphs/poses.g2o",
-    "max-rotation-error": "--max-rotation-error 0.3",
+    "small-rotation-error": "--max-rotation-error 0.3",
 }
-_SOLVED = {
-    "graph40.txt": f"{' '.join(_PLACEMENT)} formats reverse scene",
+_PLACED = {
+    "graph40.txt": f"{' '.join(_PLACEMENT)} formats reversed",
     "random300.txt": " ".join(_PLACEMENT),
-    "chain.txt": "objective-shapefit objective-lud objective-least-squares solver-admm no-refine",
-    "pieces.txt": "objective-shapefit objective-least-squares formats solver-conic",
-    "plane.txt": "objective-lud objective-linf g2o solver-admm",
-    "space5.txt": "objective-shapefit filter-1dsfm",
-    "box.txt": "factor-memory-1",
+    "chain.txt": "shapefit lud admm unrefined",
+    "pieces.txt": "shapefit formats admm",
+    "plane.txt": "lud shapefit g2o admm",
+    "space5.txt": "shapefit",
+    "box.txt": "small-factor",
     "cycle.txt": "",
-    "1dsfm": "rotations-txt objective-lud formats max-rotation-error",
+    "1dsfm": "rotations-1dsfm lud formats small-rotation-error",
     "poses.g2o": "rotations-g2o",
-    "poses.txt": "objective-shapefit",
+    "poses.txt": "shapefit",
     MADRID: "",
 }
 
-_RING = "scenes/ring8/sparse/0"
+_RING, _BROKEN = "scenes/ring8/sparse/0", "scenes/courtyard-broken"
 _WRONG = {
     "no-command": "",
-    "unknown-command": "place RING OUT",
+    "unknown-command": "frobnicate RING OUT",
     "no-model": "locate",
     "no-out": "locate RING",
     "missing-model": "locate scenes/nowhere/sparse/0 OUT",
@@ -150,26 +208,24 @@ _WRONG = {
     "unknown-option": "locate RING OUT --bundle",
     "unknown-objective": "locate RING OUT --objective best",
     "min-trust-2": "locate RING OUT --min-trust 2",
-    "scale-without-distance": "locate RING OUT --scale distance",
-    "distance-and-unit": "locate RING OUT --scale unit --known-distance 0001.jpg 0003.jpg 2",
     "distance-of-unknown": "locate RING OUT --known-distance a.jpg 0003.jpg 2",
-    "scale-prior-without": "locate RING OUT --scale prior",
     "missing-priors": "locate RING OUT --priors nowhere.txt",
     "priors-of-others": "locate RING OUT --priors scenes/rig/priors.txt",
     "fix-unknown": "locate RING OUT --fix scenes/rig/fixed.txt",
+    "control-of-others": "locate RING OUT --control-points scenes/rig/control.txt",
     "config-unknown-key": "locate RING OUT --config wrong.toml",
-    "scheduler-without-dask": "locate RING OUT --scheduler tcp://127.0.0.1:1",
-    "solve-missing": "solve graphs/nowhere.txt OUT",
-    "solve-malformed": "solve graphs/malformed.txt OUT",
-    "solve-model": "solve RING OUT",
-    "solve-rotations-of-graph": "solve graphs/plane.txt OUT --rotations graphs/1dsfm/rots.txt",
-    "solve-1dsfm-of-5-dimensions": "solve graphs/space5.txt OUT --1dsfm",
+    "place-missing": "place graphs/nowhere.txt OUT",
+    "place-malformed": "place graphs/malformed.txt OUT",
+    "place-model": "place RING OUT",
+    "place-rotations-of-graph": "place graphs/plane.txt OUT --rotations graphs/1dsfm/rots.txt",
+    "place-1dsfm-of-5-dimensions": "place graphs/space5.txt OUT --1dsfm",
     "map-model": "map RING OUT",
-    "map-tracks": "map scenes/ring8/database.db OUT --directions tracks",
+    "map-missing": "map scenes/nowhere/database.db OUT",
     "inspect-missing": "inspect scenes/nowhere",
     "evaluate-others": "evaluate RING scenes/rig/truth",
     "evaluate-without-reference": "evaluate RING",
-    "report-no-output": "report empty",
+    "check-empty": "report empty",
+    "check-missing": "report scenes/nowhere",
     "convert-unknown": "convert RING OUT.xyz",
     "synth-options": "synth OUT --jpeg-quality 50",
 }
@@ -183,38 +239,68 @@ _OTHERS = {
         "--corrupted-pair-fraction 0.2"
         for shape in ("ring", "facade", "drive", "cloud", "courtyard")
     },
-    "table/locate": "locate RING OUT",
-    "table/map": "map scenes/photographed/database.db OUT",
-    "table/solve": "solve graphs/pieces.txt OUT",
-    "table/inspect": "inspect scenes/ring8-hinged/sparse/0 --points never",
+    "told/locate": "locate RING OUT",
+    "told/map": "map scenes/photographed/database.db OUT",
+    "told/place": "place graphs/pieces.txt OUT",
+    "told/inspect": "inspect scenes/ring8-hinged/sparse/0 --points never",
     "help/all": "--help",
     "help/version": "--version",
     **{
         f"help/{command}": f"{command} --help"
-        for command in ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
+        for command in ("locate", "map", "place", "inspect", "evaluate", "report", "convert", "synth")
     },
 }
-_QUICK = (
-    *("locate/ring8/default", "locate/courtyard/default", "locate/ring8-hinged/points-never"),
-    *("locate/rig/default", "map/photographed/default", "solve/graph40/default", "solve/graph40/no-refine"),
-    *("solve/pieces/default", "inspect/ring8/default", "wrong/out-exists", "wrong/unknown-option"),
-)
+_CHECKED = {
+    **dict.fromkeys((*_SETS, "courtyard", "photographed", "ring8", "facade9", "courtyard-broken", "rig"), ""),
+    "kerry-park": "global",
+}
+"""Models whose referee runs: the reference of each, or, of a broken scene, its sparse/0."""
+
+_QUICK = {
+    "courtyard": "default all-trusted adjusted unadjusted points-never priors priors-pull control distances "
+    "shapefit lenses-all rotations-free admm without-pairs thresholds",
+    "photographed": "default adjusted rotations-sigma",
+    "ring8": "default tracks fixed-names control-adjusted",
+    "facade9": "default adjusted priors-pull fixed-names",
+    "rig": "default adjusted fixed-names sensors-free points-always",
+    "ring8-hinged": "points-never",
+    "courtyard-hinged": "points-never",
+    "courtyard-new": "fixed-solved fixed-solved-adjusted",
+    "photographed-guessed": "default",
+}
+_QUICK_CASES = {
+    *(f"locate/{scene}/{variant}" for scene, variants in _QUICK.items() for variant in variants.split()),
+    *(f"map/photographed/{variant}" for variant in ("default", "adjusted", "priors-pull")),
+    *(f"map/{scene}/default" for scene in ("courtyard", "ring8-few", "rig", "photographed-guessed")),
+    *("map/ring8/gravity", "map/ring8-apart/priors", "map/ring8-hinged/points-never"),
+    *(f"place/graph40/{variant}" for variant in ("default", "unrefined", "shapefit", "admm")),
+    *("place/pieces/default", "place/plane/default", "place/poses.txt/default", "place/1dsfm/default"),
+    *(f"inspect/{scene}/default" for scene in ("courtyard", "ring8", "facade9", "rig", "ring8-hinged")),
+    *(f"check/{scene}" for scene in ("courtyard", "photographed", "facade9", "courtyard-broken", "rig")),
+    *("evaluate/errors", "convert/text", "convert/nerf", "synth/courtyard", "told/locate", "told/map"),
+    *("wrong/out-exists", "wrong/unknown-option", "wrong/empty-model", "wrong/priors-of-others"),
+}
 
 
 def all_cases(folders: Mapping[str, Path]) -> list[Case]:
-    """Return all cases; `folders` are those of the scenes and sets that are at hand."""
-    scenes = [*BUNDLED, *_SETS, *sorted(set(folders) - {*BUNDLED, *_SETS, MADRID}), *MADE]
-    truths = {name: truth_of(folders[name]) for name in scenes if name in folders}
-    truths |= dict.fromkeys(("rig", "courtyard-new", "photographed-new"), "truth")
+    """Return all cases; `folders` are those of the scenes and sets at hand."""
+    further = sorted(set(folders) - {*BUNDLED, *_SETS, MADRID, _WITHOUT_MODEL})
+    scenes = [*BUNDLED, *_SETS, *further, *MADE]
+    truths = {name: truth_of(folder) for name, folder in folders.items() if name != MADRID}
+    truths |= MADE
     cases = [
-        *(case for name in scenes for case in _locate_cases(name, truths.get(name, "sparse/0"))),
-        *(case for name in _MAPPED for case in _map_cases(name, truths.get(name, "sparse/0"))),
-        *(case for graph in _SOLVED for case in _solve_cases(graph)),
+        *(case for name in scenes for case in _locate_cases(name, truths.get(name, ""))),
+        *(case for name in _MAPPED for case in _map_cases(name, truths.get(name, ""))),
+        *(case for graph in _PLACED for case in _place_cases(graph)),
         *_inspect_cases(scenes),
+        *(_check_case(name, truths.get(name, "")) for name in _CHECKED),
+        _case("evaluate/errors", f"evaluate {_BROKEN}/sparse/0 {_BROKEN}/truth --csv OUT.csv --json"),
+        _case("evaluate/trajectory", f"evaluate {_BROKEN}/sparse/0 {_BROKEN}/truth --trajectory --json"),
+        _case("evaluate/positions", f"evaluate {_RING} scenes/ring8/priors.txt --json"),
         *(_case(name, line) for name, line in _OTHERS.items()),
         *(_case(f"wrong/{name}", line) for name, line in _WRONG.items()),
     ]
-    return [case._replace(quick=case.name in _QUICK) for case in cases]
+    return [case._replace(quick=case.name in _QUICK_CASES) for case in cases]
 
 
 def _out(name: str) -> str:
@@ -238,42 +324,45 @@ def _locate_cases(scene: str, truth: str) -> Iterator[Case]:
     followers = [_evaluation(name, "", reference, scene)]
     if scene == "ring8":
         followers += [
-            _case("report/ring8", f"report {_out(name)}")._replace(out=_out(name)),
-            _case("table/evaluate", f"evaluate {_out(name)} {reference}"),
+            _case("told/evaluate", f"evaluate {_out(name)} {reference}"),
             _case("convert/output", f"convert {_out(name)} OUT.csv"),
         ]
     model = f"scenes/{scene}/sparse/0"
     yield _case(name, f"locate {model} OUT --json", scene, tuple(followers))
-    for variant in () if scene in _LARGE else ("min-trust-0", *_LOCATED.get(scene, "").split()):
+    for variant in () if scene in _LARGE else ("all-trusted", *_LOCATED.get(scene, "").split()):
         flags = _LOCATE[variant].format(scene=scene)
         yield _case(f"locate/{scene}/{variant}", f"locate {model} OUT {_SILENT} {flags}", scene)
 
 
 def _map_cases(scene: str, truth: str) -> Iterator[Case]:
-    """Yield the variants of one database, each of which is evaluated."""
-    for variant in _MAPPED[scene].split():
+    """Yield the default and the variants of one database, each of which is evaluated."""
+    for variant in ("default", *_MAPPED[scene].split()):
         name = f"map/{scene}/{variant}"
-        shown = "" if variant == "default" else _SILENT
-        line = f"map scenes/{scene}/database.db OUT {shown} {_MAP[variant]}"
+        flags = "--json" if variant == "default" else f"{_SILENT} {_MAP[variant].format(scene=scene)}"
+        line = f"map scenes/{scene}/database.db OUT {flags}"
         yield _case(name, line, scene, (_evaluation(name, "/0", f"scenes/{scene}/{truth}", scene),))
 
 
-def _solve_cases(graph: str) -> Iterator[Case]:
+def _place_cases(graph: str) -> Iterator[Case]:
     """Yield the default and the variants of one graph."""
     name, scene = graph.removesuffix(".txt") if graph != "poses.txt" else graph, MADRID * (graph == MADRID)
-    for variant in ("default", *_SOLVED[graph].split()):
-        shown = "" if variant == "default" else _SILENT
-        line = f"solve graphs/{graph} OUT {shown} {_SOLVE[variant]}"
-        yield _case(f"solve/{name}/{variant}", line, scene)
+    for variant in ("default", *_PLACED[graph].split()):
+        flags = "--json" if variant == "default" else f"{_SILENT} {_PLACE[variant]}"
+        yield _case(f"place/{name}/{variant}", f"place graphs/{graph} OUT {flags}", scene)
 
 
 def _inspect_cases(scenes: Sequence[str]) -> Iterator[Case]:
-    """Yield the inspection of every scene and graph, with theory and without points for a few."""
+    """Yield the inspection of every scene and graph, and of a few without points."""
     for scene in scenes:
         line = f"inspect scenes/{scene}/sparse/0 --json"
         yield _case(f"inspect/{scene}/default", line, scene)
-        if scene in ("ring8", "ring8-hinged", "ring8-cycle", "rig", "castle-P19"):
-            yield _case(f"inspect/{scene}/theory", f"{line} --theory", scene)
+        if scene in ("ring8", "ring8-hinged", "ring8-cycle", "rig", "castle-P19", "courtyard-hinged"):
             yield _case(f"inspect/{scene}/points-never", f"{line} --points never", scene)
-    for graph in (*(name for name in _SOLVED if name.endswith(".txt")), "malformed.txt"):
-        yield _case(f"inspect/{graph}/theory", f"inspect graphs/{graph} --json --theory")
+    for graph in (*(name for name in _PLACED if name.endswith(".txt")), "malformed.txt"):
+        yield _case(f"inspect/{graph}", f"inspect graphs/{graph} --json")
+
+
+def _check_case(scene: str, truth: str) -> Case:
+    """Return the case of the referee of one model."""
+    model = "sparse/0" if scene == "courtyard-broken" else _CHECKED[scene] or truth
+    return _case(f"check/{scene}", f"report scenes/{scene}/{model} --write-to OUT.html", scene)

@@ -1,8 +1,9 @@
 """How two recordings of `answers` differ: nested values compared leaf by leaf.
 
-Positions count as shares of the scene's extent; other numbers relative to the larger of the two, and below
-`ROUNDOFF` they are equal. Strings of several words are wording, which a change of code may improve: they are
-told, and do not count. Single words, such as verdicts, are values.
+Positions and rotations count as shares of the scene's extent and of a quaternion's length; other numbers
+relative to the larger of the two, and below `ROUNDOFF` they are equal. Strings of several words are wording,
+which a change of code may improve: they are told, and do not count. Single words, such as verdicts, are
+values. Where answers must be equal to the bit, all numbers are, and the bytes of the models' files.
 """
 
 import math
@@ -11,8 +12,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-ROUNDOFF = 1e-12
-_LIMITS = {"positions": 1e-9, "rotations": 1e-9, "figures": 1e-7}
+from harness.record import leave_out
+
+NOT_COMPARED = {
+    *("options", "timings_s", "seconds", "versions", "schema_version", "expected"),
+    *("num_pairs_filtered", "theory"),
+}
+"""Keys of JSON objects, wherever they stand, that tell of the run and not of its answer (names of stages are
+keys of `timings_s` and `expected`), or of features that left."""
+ROUNDOFF = 1e-9
+_LIMITS = {"positions": 1e-6, "rotations": 1e-6, "figures": 1e-5}
+_PARTS = ("exit", "verdict", "said", "printed", "files", "models", "tables", "json", "texts", "pages")
+_EXACT_PARTS = (*_PARTS, "digests")
+_MEMORY_SHARE, _MEMORY_MB = 0.02, 5.0
+"""Change of a peak that is told: beyond both."""
 _SHOWN = 3
 _KEYS = ("name", "name1", "name2")
 
@@ -25,10 +38,10 @@ class Difference(NamedTuple):
     kind: str = "values"
     amount: float = math.inf
 
-    @property
-    def counts(self) -> bool:
-        """Whether it is beyond its limit; NaN is."""
-        return self.kind != "words" and not self.amount <= _LIMITS.get(self.kind, -1.0)
+    def counts(self, exact: bool) -> bool:
+        """Return whether it is beyond its limit; NaN is."""
+        limit = 0.0 if exact else _LIMITS.get(self.kind, -1.0)
+        return self.kind != "words" and not self.amount <= limit
 
 
 class Vectors(dict[str, list[float]]):
@@ -43,9 +56,10 @@ class Rotations(Vectors):
     kind = "rotations"
 
 
-def compare(old: dict[str, Any], new: dict[str, Any]) -> list[Difference]:
+def compare(old: dict[str, Any], new: dict[str, Any], *, exact: bool = False) -> list[Difference]:
     """Return how two answers of one case differ, and the worst position and rotation of each model."""
-    return [d for part in old if part != "seconds" for d in _walk(part, _part(old, part), _part(new, part))]
+    parts = _EXACT_PARTS if exact else _PARTS
+    return [d for part in parts for d in _walk(part, _part(old, part), _part(new, part), exact)]
 
 
 def _part(answer: dict[str, Any], part: str) -> Any:
@@ -54,7 +68,7 @@ def _part(answer: dict[str, Any], part: str) -> Any:
         return {key: _by_image(model) for key, model in answer[part].items()}
     if part == "tables":
         return {key: _by_row(columns) for key, columns in answer[part].items()}
-    return answer[part]
+    return leave_out(NOT_COMPARED, answer[part])
 
 
 def _by_image(model: dict[str, Any]) -> dict[str, Any]:
@@ -80,21 +94,21 @@ def _by_row(columns: dict[str, list[str]]) -> dict[str, Any]:
     return {"columns": list(columns), "order": list(rows), "positions": positions, "rows": rows}
 
 
-def _walk(where: str, old: Any, new: Any) -> Iterator[Difference]:
+def _walk(where: str, old: Any, new: Any, exact: bool) -> Iterator[Difference]:
     """Yield how two nested values differ."""
     if isinstance(old, Vectors) and isinstance(new, Vectors):
         yield from _compare_vectors(where, old, new)
     elif isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             if key in old and key in new:
-                yield from _walk(f"{where} {key}", old[key], new[key])
+                yield from _walk(f"{where} {key}", old[key], new[key], exact)
             else:
                 yield Difference(f"{where} {key}", "missing" if key in old else "new")
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for k, (a, b) in enumerate(zip(old, new, strict=True)):
-            yield from _walk(f"{where}[{k}]", a, b)
+            yield from _walk(f"{where}[{k}]", a, b, exact)
     elif type(old) is not type(new) or old != new:
-        yield from _compare_leaves(where, old, new)
+        yield from _compare_leaves(where, old, new, exact)
 
 
 def _compare_vectors(where: str, old: Vectors, new: Vectors) -> Iterator[Difference]:
@@ -114,16 +128,16 @@ def _compare_vectors(where: str, old: Vectors, new: Vectors) -> Iterator[Differe
     yield Difference(f"{where} {names[worst]}", f"{amounts[worst]:.1e}", old.kind, float(amounts[worst]))
 
 
-def _compare_leaves(where: str, old: Any, new: Any) -> Iterator[Difference]:
+def _compare_leaves(where: str, old: Any, new: Any, exact: bool) -> Iterator[Difference]:
     """Yield how two unequal values differ: as numbers if they are, as strings may be."""
     text = f"{repr(old)[:150]} -> {repr(new)[:150]}"
     a, b = _number(old), _number(new)
-    if a is None or b is None or (isinstance(a, int) and isinstance(b, int)):
+    if a is None or b is None:
         is_wording = all(isinstance(value, str) and len(value.split()) > 1 for value in (old, new))
         yield Difference(where, text, "words" if is_wording else "values")
-    elif not (abs(a - b) <= ROUNDOFF or (math.isnan(a) and math.isnan(b))):
+    elif not (a == b or (math.isnan(a) and math.isnan(b)) or (abs(a - b) <= ROUNDOFF and not exact)):
         amount = abs(a - b) / max(abs(a), abs(b))
-        if not amount <= _LIMITS["figures"]:
+        if exact or not amount <= _LIMITS["figures"]:
             yield Difference(where, f"{text}, {amount:.1e}", "figures", amount)
 
 
@@ -137,11 +151,11 @@ def _number(value: Any) -> float | None:
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def report(differences: dict[str, list[Difference]]) -> tuple[str, bool]:
+def report(differences: dict[str, list[Difference]], *, exact: bool = False) -> tuple[str, bool]:
     """Return what is to be said of the differences of each case, and whether all cases are equal."""
     lines, num_equal = [], 0
     for case, found in differences.items():
-        counting = sorted((d for d in found if d.counts), key=lambda d: -d.amount)
+        counting = sorted((d for d in found if d.counts(exact)), key=lambda d: -d.amount)
         num_equal += not counting
         lines += [f"{case}: {d.where} {d.text}" for d in counting[:_SHOWN]]
         lines += [f"{case}: and {len(counting) - _SHOWN} more"] * (len(counting) > _SHOWN)
@@ -152,10 +166,28 @@ def report(differences: dict[str, list[Difference]]) -> tuple[str, bool]:
         if d.kind == "words"
     ]
     if words:
-        lines += [f"words ({len(words)}):", *words]
+        lines += [f"words ({len(words)}), which do not count:", *words]
     for kind in ("positions", "rotations"):
         amounts = [d.amount for found in differences.values() for d in found if d.kind == kind]
         if amounts:
             lines.append(f"worst of {kind}: {np.max(amounts):.1e}")
-    lines.append(f"{num_equal} of {len(differences)} cases equal")
+    how = "to the bit" if exact else "within the limits"
+    lines.append(f"{num_equal} of {len(differences)} cases equal {how}")
     return "\n".join(lines), num_equal == len(differences)
+
+
+def compare_use(pairs: dict[str, tuple[dict[str, Any], dict[str, Any]]]) -> tuple[str, bool]:
+    """Return what is to be said of memory and CPU time, and whether no peak has grown."""
+    if not pairs:
+        return "", True
+    lines, is_within = [], True
+    for key, name in (("memory_mb", "peak memory"), ("cpu_s", "CPU time")):
+        ratios = [new[key] / old[key] for old, new in pairs.values() if old[key] > 0.0]
+        sums = [sum(answer[key] for answer in answers) for answers in zip(*pairs.values(), strict=True)]
+        lines.append(f"{name}: median ratio {np.median(ratios):.3f}, of the sums {sums[1] / sums[0]:.3f}")
+    for case, (old, new) in pairs.items():
+        before, now = old["memory_mb"], new["memory_mb"]
+        if abs(now - before) > max(_MEMORY_MB, _MEMORY_SHARE * before):
+            lines.append(f"  {case}: peak {before:.0f} -> {now:.0f} MB, {now / before - 1.0:+.1%}")
+            is_within &= now < before
+    return "\n".join(lines), is_within

@@ -3,13 +3,15 @@
 Everything is made by numpy, scipy and pycolmap alone, so that it does not depend on the code whose answers
 are recorded. All stands below one folder:
 
-    scenes/NAME/    sparse/0, database.db, the truth; priors.txt and fixed.txt made from the truth
+    scenes/NAME/    sparse/0, database.db, the truth; tables made from the truth: priors.txt, gravity.txt,
+                    control.txt, and names of images and pairs
     graphs/         bare graphs and relative poses
 """
 
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +21,27 @@ from scipy.spatial.transform import Rotation
 
 MADRID = "1dsfm-Madrid_Metropolis"
 TRUTHS = ("gt", "truth", "sparse/0")
-_PARTS = ("sparse/0", "database.db", "gt", "truth", "gps.csv")
+_PARTS = ("sparse/0", "database.db", "gt", "truth", "global", "gps.csv")
 _PAIR_BASE = 2147483647  # COLMAP's pair_id is id1 * this + id2
 _PRUNED: dict[str, Callable[[int, int], bool]] = {
     "ring8-hinged": lambda i, j: {i, j} <= {1, 2, 3, 4} or {i, j} <= {4, 5, 6, 7, 8},
     "ring8-pendant": lambda i, j: 1 not in (i, j) or (i, j) == (1, 2),
     "ring8-cycle": lambda i, j: j - i in (1, 7),
+    "ring8-apart": lambda i, j: (i <= 4) == (j <= 4),
+    "courtyard-hinged": lambda i, j: max(i, j) <= 13 or min(i, j) >= 13,
 }
-"""Which pairs of images of the ring are kept."""
+"""Which pairs of images are kept, of the scene before the hyphen."""
 _EXTENDED = ("courtyard", "photographed")
-"""Of their truth a third of the images become new ones, posed by their rotations alone."""
-MADE = ("rig", *_PRUNED, *(f"{name}-new" for name in _EXTENDED))
-"""Scenes that are made, not copied."""
+"""Scenes of whose truth a third of the images become new ones, posed by their rotations alone."""
+_GUESSED = {"ring8": 0.85, "photographed": 1.2}
+"""Scenes whose lens becomes a guess: focal length over the true one; distortion 0."""
+MADE = {
+    **{"rig": "truth", "ring8-few": "sparse/0", "courtyard-broken": "truth"},
+    **{name: "truth" if name.startswith("courtyard") else "sparse/0" for name in _PRUNED},
+    **{f"{name}-new": "truth" for name in _EXTENDED},
+    **{f"{name}-guessed": "truth" for name in _GUESSED},
+}
+"""Scenes that are made, not copied, and which of their models is the truth."""
 
 
 def truth_of(folder: Path) -> str:
@@ -47,18 +58,24 @@ def make_inputs(work: Path, scenes: Mapping[str, Path]) -> None:
         else:
             _copy(folder, work / "scenes" / name)
     shutil.copyfile(scenes["ring8"].with_name("graph40.txt"), work / "graphs" / "graph40.txt")
+    for name in MADE:
+        source, _, _ = name.partition("-")
+        if source in scenes:
+            _copy(scenes[source], work / "scenes" / name)
     for name, kept in _PRUNED.items():
-        _copy(scenes["ring8"], work / "scenes" / name)
         _keep_pairs(work / "scenes" / name / "database.db", kept)
     for name in _EXTENDED:
-        _copy(scenes[name], work / "scenes" / f"{name}-new")
         _forget_some(work / "scenes" / f"{name}-new")
+    for name, factor in _GUESSED.items():
+        _guess_lenses(work / "scenes" / f"{name}-guessed", factor)
+    _keep_few_matches(work / "scenes" / "ring8-few" / "database.db")
+    _break_some(work / "scenes" / "courtyard-broken")
     _make_rig(work / "scenes" / "rig")
     for folder in sorted((work / "scenes").iterdir()):
         _write_tables(folder)
     _write_graphs(work / "graphs")
     _write_relative_poses(work / "graphs")
-    (work / "known.toml").write_text('min_trust = 0.0\nknown_distance = ["0001.jpg", "0003.jpg", 2.5]\n')
+    (work / "told.toml").write_text('min_trust = 0.0\nknown_distance = ["0001.jpg", "0003.jpg", 2.5]\n')
     (work / "wrong.toml").write_text("min_rust = 0.0\n")
     (work / "full").mkdir()
     (work / "full" / "mine.txt").write_text("not to be replaced\n")
@@ -97,6 +114,55 @@ def _forget_some(folder: Path) -> None:
     model.write(folder / "sparse" / "0")
 
 
+def _guess_lenses(folder: Path, factor: float) -> None:
+    """Let all focal lengths of sparse/0 and the database be guesses; the truth is what sparse/0 was."""
+    if not (folder / "truth").is_dir():
+        shutil.copytree(folder / "sparse" / "0", folder / "truth")
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    connection = sqlite3.connect(folder / "database.db")
+    for camera in model.cameras.values():
+        params = np.array(camera.params)
+        params[camera.focal_length_idxs()] *= factor
+        params[camera.extra_params_idxs()] = 0.0
+        camera.params, camera.has_prior_focal_length = params, False
+        connection.execute(
+            "UPDATE cameras SET params = ?, prior_focal_length = 0 WHERE camera_id = ?",
+            (params.astype("<f8").tobytes(), camera.camera_id),
+        )
+    connection.commit()
+    connection.close()
+    model.write(folder / "sparse" / "0")
+
+
+def _keep_few_matches(database: Path) -> None:
+    """Of the pairs between the first four images and the others, leave 12 matches of six, none of others."""
+    rng = np.random.default_rng(0)
+    connection = sqlite3.connect(database)
+    rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0").fetchall()
+    between = [row for row in rows if len({image <= 4 for image in divmod(row[0], _PAIR_BASE)}) == 2]
+    for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: (-row[1], row[0]))):
+        matches = np.frombuffer(data, np.uint32).reshape(-1, 2)[rng.permutation(count)[: 12 * (rank < 6)]]
+        connection.execute(
+            "UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?",
+            (len(matches), matches.tobytes(), pair),
+        )
+    connection.commit()
+    connection.close()
+
+
+def _break_some(folder: Path) -> None:
+    """Let sparse/0 be the truth in which every eighth image is moved or turned, its points left alone."""
+    model = pycolmap.Reconstruction(folder / "truth")
+    rng = np.random.default_rng(5)
+    for rank, image_id in enumerate(sorted(model.images)[::8]):
+        frame = model.frame(model.image(image_id).frame_id)
+        turn = Rotation.from_rotvec(np.radians(rank % 2) * rng.standard_normal(3))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn.as_quat()), rng.normal(0.0, 0.2, 3))
+        frame.rig_from_world = pose * frame.rig_from_world
+    model.update_point_3d_errors()
+    model.write(folder / "sparse" / "0")
+
+
 def _make_rig(folder: Path) -> None:
     """Make two rigs of three cameras; sparse/0 states rotations only, offsets of sensors the scale."""
     options = pycolmap.SyntheticDatasetOptions(
@@ -126,17 +192,43 @@ def _make_rig(folder: Path) -> None:
 
 
 def _write_tables(folder: Path) -> None:
-    """Write noisy priors, one of them far off, and the names of a third of the cameras."""
+    """Write what a user may tell of a scene: noisy positions, one of them far off, gravity, names, marks."""
     model = pycolmap.Reconstruction(folder / truth_of(folder))
-    centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
+    posed = {image.name: image for image in model.images.values() if image.has_pose}
+    centers = {name: posed[name].projection_center() for name in sorted(posed)}
     extent = float(np.ptp(list(centers.values()), axis=0).max())
     rng = np.random.default_rng(7)
-    lines = []
-    for k, name in enumerate(sorted(centers)):
+    priors, gravity = [], []
+    for k, (name, center) in enumerate(centers.items()):
         off = rng.normal(0.0, 0.005 * extent, 3) + (extent if k == 2 else 0.0)
-        lines.append(_line(name, *(centers[name] + off), 0.005 * extent))
-    (folder / "priors.txt").write_text("".join(lines))
-    (folder / "fixed.txt").write_text("".join(f"{name}\n" for name in sorted(centers)[::3]))
+        priors.append(_line(name, *(center + off), 0.005 * extent))
+    for name in centers:
+        down = posed[name].cam_from_world().rotation.matrix() @ [0.0, 0.0, -1.0]
+        gravity.append(_line(name, *(down + rng.normal(0.0, 0.01, 3))))
+    (folder / "priors.txt").write_text("".join(priors))
+    (folder / "gravity.txt").write_text("".join(gravity))
+    names = list(centers)
+    (folder / "fixed.txt").write_text("".join(f"{name}\n" for name in names[::3]))
+    (folder / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairwise(names[:4])))
+    (folder / "control.txt").write_text("".join(["local\n", *_control_lines(model, extent, rng)]))
+
+
+def _control_lines(model: pycolmap.Reconstruction, extent: float, rng: np.random.Generator) -> Iterator[str]:
+    """Yield the marks of six points that many images see, in other axes; the last point only checks."""
+    seen = sorted(model.points3D, key=lambda k: (-model.point3D(k).track.length(), k))
+    xyz = np.array([model.point3D(k).xyz for k in seen]).reshape(-1, 3)
+    chosen: list[int] = []
+    for row in range(len(seen)):  # far from each other
+        if len(chosen) < 6 and all(np.linalg.norm(xyz[row] - xyz[k]) > 0.05 * extent for k in chosen):
+            chosen.append(row)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1])
+    for number, row in enumerate(chosen):
+        place = 2.5 * turn.apply(xyz[row]) + [100.0, -200.0, 300.0]
+        marks = model.point3D(seen[row]).track.elements
+        for mark in sorted(marks, key=lambda mark: (mark.image_id, mark.point2D_idx)):
+            image = model.image(mark.image_id)
+            pixel = image.point2D(mark.point2D_idx).xy + rng.normal(0.0, 0.3, 2)
+            yield _line(*place, *pixel, image.name, f"{'CHK-' if number == 5 else 'P'}{number}")
 
 
 def _line(*words: Any) -> str:

@@ -4,82 +4,51 @@ Made graphs: `rotation_problem` on families of view graphs, a fifth of the pairs
 which pairs are right and takes least squares with their information from the true rotations. The second run
 counts: kernels are compiled by the first. Memory is the peak of the whole process.
 
-Real sets: relative rotations from the matches, averaged by ours and by pycolmap (the most consistent of its
-answers, as `map --averaging pycolmap` takes it), on the same pairs. The truth of liberty-calibrated is its
-reference model.
+Real sets: relative rotations from the matches, averaged by ours and by pycolmap, as its global mapper does,
+on the same pairs. The truth of liberty-calibrated is its reference model.
 """
 
 import argparse
-import resource
-from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from harness import ours
-from harness.driver import Benchmark, Case, if_there
-from harness.metrics import Check, Quantity, check_all, number, numbers, verdict
-from harness.record import table_of
-
-if TYPE_CHECKING:
-    from sfm_shapefit import AveragedRotations
-    from sfm_shapefit.base.arrays import FloatArray
-    from sfm_shapefit.synthetic.rotation_graphs import RotationProblem
+import sfm_shapefit
+from harness.driver import Benchmark, Case, on_sets
+from harness.process import peak_memory_mb, time_call
+from harness.record import Row, at_least, at_most
+from harness.scenes import WRONG_DEG, errors_deg
+from paper.rotation_averaging import average_by_pycolmap
+from sfm_shapefit import synthetic
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.rotations.average import average_relative_rotations
+from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
+from sfm_shapefit.rotations.averaging_system import plan_system
+from sfm_shapefit.synthetic.rotation_graphs import RotationProblem, rotation_problem
 
 FAMILIES = ("ring", "box", "expander", "community")
 DEGREE = 40.0
 """Pairs of a camera: 20 pairs for each camera."""
 LIMIT_S = {1_000: 1.5, 10_000: 3.0, 100_000: 60.0}
-"""CPU seconds by the number of cameras."""
+"""CPU seconds by the number of cameras; graphs of no such size have no limit."""
 LEAST_RATIO = 1.2
 """Median error over that of the oracle."""
 COVERAGE = (0.8, 1.25)
 """Root mean square of error over standard deviation."""
-REAL = {
-    "Herz-Jesus-P25": {"mean deg": 0.051, "beyond 5 deg": 0.0},
-    "castle-P19": {"mean deg": 0.075, "beyond 5 deg": 0.0},
-    "castle-P30": {"mean deg": 0.061, "beyond 5 deg": 0.0},
-    "lego100": {"mean deg": 0.15, "beyond 5 deg": 0.0},
-    "liberty-calibrated": {"beyond 5 deg": 12.0},
+REAL: dict[str, tuple[float | None, int]] = {
+    "Herz-Jesus-P25": (0.051, 0),
+    "castle-P19": (0.075, 0),
+    "castle-P30": (0.061, 0),
+    "lego100": (0.15, 0),
+    "liberty-calibrated": (None, 12),
 }
-"""To reach by our own averaging."""
-
-
-class Made(NamedTuple):
-    """One made graph."""
-
-    family: str
-    num_cameras: int
-    num_pairs: int
-    cpu_s: float
-    memory_gb: float
-    median_deg: float
-    oracle_deg: float
-    num_wrong: int
-    """Cameras beyond 5 deg."""
-    coverage: float
-    """Root mean square of error over sigma, per axis."""
-    certified: str
-
-
-class Real(NamedTuple):
-    """One real set, by one averaging."""
-
-    name: str
-    averaging: str
-    num_pairs: int
-    num_cameras: int
-    """With truth and with a rotation."""
-    cpu_s: float
-    mean_deg: float
-    median_deg: float
-    num_wrong: int
-    share: float
-    num_unsettled: int
-    coverage: float
-    certified: str
+"""Mean error in degrees, and rotations beyond 5 degrees, to reach by our own averaging."""
+MADE_GRAPHS, REAL_SETS = (
+    "Made graphs, a fifth of the pairs wrong",
+    "Real sets, on the same relative rotations",
+)
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -91,57 +60,57 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     found: dict[str, Case] = {
         f"{family} {n}": partial(measure_made, family, n) for n in sizes for family in FAMILIES
     }
-    for name in () if args.quick else REAL:
-        for averaging in ("own", "pycolmap"):
-            case = partial(measure_real, args.data / name, averaging)
-            found[f"{name}, {averaging}"] = if_there(args.data / name, case)
+    for averaging in () if args.quick else ("own", "pycolmap"):
+        real = on_sets(args.data, REAL, measure_real, averaging)
+        found |= {f"{name}, {averaging}": case for name, case in real.items()}
     return found
 
 
-def measure_made(family: str, num_cameras: int) -> Made:
+def measure_made(family: str, n: int) -> Row:
     """Average the rotations of a made graph; to be called in a process of its own."""
-    from sfm_shapefit import synthetic
-    from sfm_shapefit.rotations.average import average_relative_rotations
-    from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
-
-    degree = min(DEGREE, num_cameras / 8)
-    graph = getattr(synthetic, f"{family}_graph_problem")(num_cameras, degree, seed=1).view_graph
-    problem = rotation_problem(num_cameras, graph.edges, seed=2)
-
-    def average() -> "AveragedRotations":
-        return average_relative_rotations(num_cameras, problem.relative)
-
-    average_relative_rotations(num_cameras, problem.relative) if num_cameras < 100_000 else _warm_up(family)
-    run = ours.time_call(average)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    graph = getattr(synthetic, f"{family}_graph_problem")(n, min(DEGREE, n / 8), seed=1).view_graph
+    problem = rotation_problem(n, graph.edges, seed=2)
+    if n < 100_000:
+        average_relative_rotations(n, problem.relative)
+    else:
+        measure_made(family, 5_000)  # compiles the same
+    run = time_call(lambda: average_relative_rotations(n, problem.relative))
+    gb = peak_memory_mb() / 1e3
     errors = errors_deg(run.found.rotations, problem.rotations)
-    near = (errors < 5.0) & np.isfinite(run.found.sigmas_deg)
-    return Made(
-        family=family,
-        num_cameras=num_cameras,
-        num_pairs=graph.num_edges,
-        cpu_s=run.cpu_s,
-        memory_gb=memory,
-        median_deg=float(np.median(errors)),
-        oracle_deg=float(np.median(errors_deg(solve_oracle(problem), problem.rotations))),
-        num_wrong=int((errors > 5.0).sum()),
-        coverage=float(np.sqrt(np.mean((errors[near] / run.found.sigmas_deg[near]) ** 2) / 3.0)),
-        certified=say(run.found.certified),
-    )
+    oracle_deg = float(np.median(errors_deg(solve_oracle(problem), problem.rotations)))
+    middle_deg, wrong = float(np.median(errors)), int((errors > WRONG_DEG).sum())
+    covered = _coverage(errors, run.found.sigmas_deg)
+    checks = at_most(
+        CPU_s=(run.cpu_s, LIMIT_S.get(n)),
+        over_the_oracle=(middle_deg / oracle_deg, LEAST_RATIO),
+        beyond_5_deg=(wrong, 0),
+        rms_over_sigma=(covered, COVERAGE[1]),
+    ) + at_least(rms_over_sigma=(covered, COVERAGE[0]))
+    cells = {
+        "family": family,
+        "cameras": n,
+        "pairs": graph.num_edges,
+        "CPU, s": run.cpu_s,
+        "memory, GB": gb,
+        "median / oracle, deg": [middle_deg, oracle_deg],
+        "ratio": middle_deg / oracle_deg,
+        "beyond 5 deg": wrong,
+        "rms over sigma": covered,
+        "certified": run.found.certified,
+    }
+    return Row(cells, checks if n in LIMIT_S else (), MADE_GRAPHS)
 
 
-def _warm_up(family: str) -> None:
-    """Compile what a large graph needs on a smaller one of the same family."""
-    measure_made(family, 5_000)
+def _coverage(errors: FloatArray, sigmas_deg: FloatArray) -> float:
+    """Return the root mean square of errors over standard deviations, per axis, of what is not wrong."""
+    near = (errors < WRONG_DEG) & np.isfinite(sigmas_deg)
+    if not near.any():
+        return np.nan
+    return float(np.sqrt(np.mean((errors[near] / sigmas_deg[near]) ** 2) / 3.0))
 
 
-def solve_oracle(problem: "RotationProblem") -> "FloatArray":
+def solve_oracle(problem: RotationProblem) -> FloatArray:
     """Return least squares on the right pairs, from the truth, (n, 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    from sfm_shapefit.rotations.averaging_kernels import turn_cameras, weigh_blocks
-    from sfm_shapefit.rotations.averaging_system import plan_system
-
     right = problem.relative.subset(~problem.wrong)
     n, k = len(problem.rotations), len(right.pairs)
     pairs, information = np.ascontiguousarray(right.pairs), np.ascontiguousarray(right.information)
@@ -155,129 +124,53 @@ def solve_oracle(problem: "RotationProblem") -> "FloatArray":
     return np.asarray(Rotation.from_quat(turns).as_matrix())
 
 
-def errors_deg(rotations: "FloatArray", truth: "FloatArray") -> "FloatArray":
-    """Return the angles to the truth after the best common rotation of the world, (n,)."""
-    from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
-
-    difference = rotations.transpose(0, 2, 1) @ truth
-    return rotation_angles_deg(difference @ mean_rotation_l1(difference[:20_000]).T)
-
-
-def measure_real(folder: Path, averaging: Any) -> Real:
+def measure_real(folder: Path, averaging: str) -> Row:
     """Average the rotations of a real set; to be called in a process of its own."""
-    from sfm_shapefit import relative_rotations
-    from sfm_shapefit.rotations.trusted import average_consistently
-
-    relative = relative_rotations(folder / "database.db")
+    relative = sfm_shapefit.relative_rotations(folder / "database.db")
     stored = np.load(folder / "viewgraph.npz", allow_pickle=True)
     known = stored["gt_R"] if "gt_R" in stored.files else stored["ref_R"]
     row_of = {str(name): row for name, row in zip(stored["names"], known, strict=True)}
     truth = np.array([row_of[name] for name in relative.names])
-    average_consistently(len(truth), relative, averaging=averaging)
-    run = ours.time_call(lambda: average_consistently(len(truth), relative, averaging=averaging))
+    ways = {"own": average_relative_rotations, "pycolmap": average_by_pycolmap}
+    average = partial(ways[averaging], len(truth), relative)
+    average()
+    run = time_call(average)
     found = run.found
     judged = found.registered & np.isfinite(truth).all(axis=(1, 2))
     errors = errors_deg(found.rotations[judged], truth[judged])
-    ratio = (errors / found.sigmas_deg[judged])[errors < 5.0]
-    return Real(
-        name=folder.name,
-        averaging=averaging,
-        num_pairs=len(relative.pairs),
-        num_cameras=int(judged.sum()),
-        cpu_s=run.cpu_s,
-        mean_deg=float(errors.mean()),
-        median_deg=float(np.median(errors)),
-        num_wrong=int((errors > 5.0).sum()),
-        share=found.share,
-        num_unsettled=int(found.unsettled.sum()),
-        coverage=float(np.sqrt(np.mean(ratio**2) / 3.0)),
-        certified=say(found.certified),
-    )
+    mean_deg, wrong = float(errors.mean()), int((errors > WRONG_DEG).sum())
+    limit_deg, most = REAL[folder.name]
+    cells = {
+        "set": folder.name,
+        "averaging": averaging,
+        "cameras": int(judged.sum()),
+        "pairs": len(relative.pairs),
+        "CPU, s": run.cpu_s,
+        "mean / median, deg": [mean_deg, float(np.median(errors))],
+        "beyond 5 deg": wrong,
+        "agreeing share": f"{found.share:.2f}",
+        "unsettled": int(found.unsettled.sum()),
+        "rms over sigma": _coverage(errors, found.sigmas_deg[judged]),
+        "certified": found.certified,
+    }
+    checks = at_most(mean_deg=(mean_deg, limit_deg), beyond_5_deg=(wrong, most))
+    return Row(cells, checks if averaging == "own" else (), REAL_SETS)
 
-
-def say(certified: bool | None) -> str:
-    """Return whether an answer is certified, in a word."""
-    return {None: "not checked", True: "yes", False: "no"}[certified]
-
-
-def checks(one: Made | Real) -> list[Check]:
-    """Return the limits of one case; pycolmap's averaging has none."""
-    if isinstance(one, Real):
-        values = {"mean deg": one.mean_deg, "beyond 5 deg": float(one.num_wrong)}
-        return check_all(values, REAL[one.name] if one.averaging == "own" else {})
-    if one.num_cameras not in LIMIT_S:
-        return []
-    return [
-        Check(name="CPU s", value=one.cpu_s, limit=LIMIT_S[one.num_cameras]),
-        Check(name="over the oracle", value=one.median_deg / one.oracle_deg, limit=LEAST_RATIO),
-        Check(name="beyond 5 deg", value=float(one.num_wrong), limit=0.0),
-        Check(name="rms over sigma", value=one.coverage, limit=COVERAGE[1]),
-        Check(name="rms over sigma", value=one.coverage, limit=COVERAGE[0], better="higher"),
-    ]
-
-
-def tables(measured: Mapping[str, Made | Real], _args: argparse.Namespace) -> Iterator[str]:
-    made = [one for one in measured.values() if isinstance(one, Made)]
-    real = [one for one in measured.values() if isinstance(one, Real)]
-    if made:
-        yield "## Made graphs, a fifth of the pairs wrong"
-        yield table_of(
-            made,
-            {
-                "family": lambda one: one.family,
-                "cameras": lambda one: str(one.num_cameras),
-                "pairs": lambda one: str(one.num_pairs),
-                "CPU, s": lambda one: number(one.cpu_s),
-                "to reach, s": lambda one: number(LIMIT_S.get(one.num_cameras, np.nan)),
-                "memory, GB": lambda one: number(one.memory_gb),
-                "median / oracle, deg": lambda one: numbers([one.median_deg, one.oracle_deg]),
-                "ratio": lambda one: number(one.median_deg / one.oracle_deg),
-                "beyond 5 deg": lambda one: str(one.num_wrong),
-                "rms over sigma": lambda one: number(one.coverage),
-                "certified": lambda one: one.certified,
-                "verdict": lambda one: verdict(checks(one)),
-            },
-        )
-    if real:
-        yield "## Real sets, on the same relative rotations"
-        yield table_of(
-            real,
-            {
-                "set": lambda one: one.name,
-                "averaging": lambda one: one.averaging,
-                "cameras": lambda one: str(one.num_cameras),
-                "pairs": lambda one: str(one.num_pairs),
-                "CPU, s": lambda one: number(one.cpu_s),
-                "mean / median, deg": lambda one: numbers([one.mean_deg, one.median_deg]),
-                "beyond 5 deg": lambda one: str(one.num_wrong),
-                "agreeing share": lambda one: f"{one.share:.2f}",
-                "unsettled": lambda one: str(one.num_unsettled),
-                "rms over sigma": lambda one: number(one.coverage),
-                "certified": lambda one: one.certified,
-                "verdict": lambda one: verdict(checks(one)),
-            },
-        )
-        yield _NOTE
-
-
-_NOTE = (
-    "Standard deviations count the errors of pairs as independent. On real sets pairs of a camera share"
-    " errors of its features and its calibration, which do not average out; the ratio says how much these"
-    " are. Unsettled are cameras that most of their pairs contradict in every answer."
-)
 
 BENCHMARK = Benchmark(
     name="averaging",
     title="Rotation averaging",
     cases=cases,
-    checks=checks,
-    tables=tables,
     flags=add_flags,
-    packages=("numpy", "scipy", "numba", "pycolmap"),
-    quantities=(
-        Quantity("CPU", "s", "lower", 0.3, "processor time of a warm call, all of it"),
-        Quantity("memory", "GB", "lower", 0.2, "peak of the process, making the graph included"),
-        Quantity("median", "deg", "lower", 0.05, "error after the best common rotation"),
-        Quantity("rms over sigma", "1", "lower", 0.1, "errors over sigmas, per axis; 1 is right"),
-    ),
+    closing=lambda _rows: [
+        "Standard deviations count the errors of pairs as independent. On real sets pairs of a camera share"
+        " errors of its features and its calibration, which do not average out; the ratio says how much these"
+        " are. Unsettled are cameras that most of their pairs contradict in every answer."
+    ],
+    columns={
+        "CPU": "s; processor time of a warm call, all of it",
+        "memory": "GB; peak of the process, making the graph included",
+        "median, mean": "deg; error after the best common rotation",
+        "rms over sigma": "1; errors over sigmas, per axis; 1 is right",
+    },
 )

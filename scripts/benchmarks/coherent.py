@@ -8,25 +8,27 @@ answer stands beside it.
 """
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from harness import ours
+import sfm_shapefit
 from harness.driver import Benchmark, Case
-from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, Trials, number, verdict
-from harness.record import table_of
+from harness.graphs import GraphSpec, draw, relative_error
+from harness.record import Row, at_least, at_most, median, table
+from sfm_shapefit.facts.warnings import quality_warnings
+from sfm_shapefit.solver.splitting.lud import solve_lud
 
 PROBLEMS = {
-    "er2-50": GraphSpec(family="er2", n=50, sigma=0.01),
-    "er2-100": GraphSpec(family="er2", n=100, sigma=0.01),
-    "geo-300": GraphSpec(family="geo", n=300, degree=20.0, sigma=0.01),
+    "er2-50": GraphSpec("er2", n=50, sigma=0.01),
+    "er2-100": GraphSpec("er2", n=100, sigma=0.01),
+    "geo-300": GraphSpec("geo", n=300, degree=20.0, sigma=0.01),
 }
 SHARES = (0.0, 0.1, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
-QUICK = GraphSpec(family="er2", n=30, sigma=0.01)
+QUICK = GraphSpec("er2", n=30, sigma=0.01)
 BROKEN = 0.2
 """Relative error from which a method counts as broken; two independent configurations are 1.4 apart."""
+METHODS = ("ShapeFit", "LUD", "placed")
 
 
 class Trial(NamedTuple):
@@ -51,46 +53,45 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     }
 
 
-def measure_seeds(name: str, spec: GraphSpec, q: float, seeds: int) -> Trials:
+def measure_seeds(name: str, spec: GraphSpec, q: float, seeds: int) -> Row:
     """Measure a problem at one share of wrong pairs."""
-    return Trials(name, q, [measure(spec, q, seed) for seed in range(seeds)])
+    return judge(name, q, [measure(spec, q, seed) for seed in range(seeds)])
 
 
 def measure(spec: GraphSpec, q: float, seed: int) -> Trial:
     """Draw a graph with a share q of self-consistent wrong pairs and solve it by all methods."""
     problem = draw(spec, q=q, seed=seed, corruption="self-consistent")
-    truth, false = problem.locations, problem.false_locations
-    assert false is not None
-    graph = view_graph(problem)
-    placement = ours.place(graph)
+    truth, false, graph = problem.locations, problem.false_locations, problem.view_graph
+    placement = sfm_shapefit.place(graph)
     rows, found = placement.cameras, placement.locations
     # All methods are given the largest rigid piece, which the directions determine.
     determined = graph.restricted_to(placement.edges)[0]
     return Trial(
-        shapefit=relative_error(ours.solve(determined, uniqueness=True).locations, truth[rows]),
-        lud=relative_error(ours.solve_lud(determined), truth[rows]),
+        shapefit=relative_error(sfm_shapefit.solve(determined).locations, truth[rows]),
+        lud=relative_error(solve_lud(determined).locations, truth[rows]),
         placed=relative_error(found, truth[rows]),
         placed_false=relative_error(found, false[rows]),
         contradicting=len(placement.rejected_pairs) / len(placement.edges),
-        warned=ours.warns(placement),
+        warned=any(quality_warnings(placement)),
     )
 
 
-def find_broken(found: Trials) -> list[Trial]:
-    """Return those whose placed answer is wrong; the problem is the share of wrong pairs."""
-    return [trial for trial in found.trials if trial.placed > BROKEN]
-
-
-def checks(found: Trials) -> list[Check]:
-    """Return the limits: a broken answer carries a warning, and one without wrong pairs does not."""
-    limits = []
-    if broken := find_broken(found):
-        warned = sum(trial.warned for trial in broken)
-        limits.append(Check(name="warned", value=warned, limit=len(broken), better="higher"))
-    if found.problem == 0.0:
-        alarms = sum(trial.warned for trial in found.trials)
-        limits.append(Check(name="false alarms", value=alarms, limit=0))
-    return limits
+def judge(name: str, q: float, trials: Sequence[Trial]) -> Row:
+    """Return the row of a problem: a broken answer has to carry a warning, one without wrong pairs none."""
+    middle = Trial(*map(median, zip(*trials, strict=True)))
+    warned = sum(trial.warned for trial in trials)
+    broken = [trial for trial in trials if trial.placed > BROKEN]
+    heard = sum(trial.warned for trial in broken)
+    checks = at_least(warned=(heard, len(broken) or None)) + at_most(false_alarms=(warned, None if q else 0))
+    cells = {
+        "problem": name,
+        "q": q,
+        **dict(zip(METHODS, middle, strict=False)),
+        "placed, false": middle.placed_false,
+        "contradicting": f"{middle.contradicting:.0%}",
+        "warned": f"{warned} of {len(trials)}, {heard} of {len(broken)} broken",
+    }
+    return Row(cells, checks)
 
 
 def breaking_share(errors: Mapping[float, float]) -> float | None:
@@ -103,60 +104,34 @@ def breaking_share(errors: Mapping[float, float]) -> float | None:
     return broken
 
 
-def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "All wrong pairs agree on one second configuration of the cameras. At q = 0.5 it is as good an answer"
-        " as the truth, which is the limit of every method."
-    )
-    yield table_of(
-        measured.values(),
-        {
-            "problem": lambda one: one.name,
-            "q": lambda one: f"{one.problem:g}",
-            "ShapeFit": lambda one: number(one.median("shapefit")),
-            "LUD": lambda one: number(one.median("lud")),
-            "placed": lambda one: number(one.median("placed")),
-            "placed, false": lambda one: number(one.median("placed_false")),
-            "contradicting": lambda one: f"{one.median('contradicting'):.0%}",
-            "warned": lambda one: (
-                f"{sum(trial.warned for trial in one.trials)} of {len(one.trials)},"
-                f" {sum(trial.warned for trial in find_broken(one))} of {len(find_broken(one))} broken"
-            ),
-            "verdict": lambda one: verdict(checks(one)),
-        },
-    )
+def show_breaking(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield where the methods break."""
     yield f"## Where the methods break\n\nThe least q from which on the median error stays above {BROKEN:g}."
-
-    def show_share(name: str, column: str) -> str:
-        errors = {one.problem: one.median(column) for one in measured.values() if one.name == name}
-        share = breaking_share(errors)
-        return "never" if share is None else f"{share:g}"
-
-    yield table_of(
-        dict.fromkeys(one.name for one in measured.values()),
-        {
-            "problem": str,
-            "ShapeFit": lambda name: show_share(name, "shapefit"),
-            "LUD": lambda name: show_share(name, "lud"),
-            "placed": lambda name: show_share(name, "placed"),
-        },
-    )
+    lines = []
+    for name in dict.fromkeys(row["problem"] for row in rows):
+        own = [row for row in rows if row["problem"] == name]
+        shares = [breaking_share({row["q"]: row[method] for row in own}) for method in METHODS]
+        lines.append([name, *("never" if share is None else f"{share:g}" for share in shares)])
+    yield table(["problem", *METHODS], lines)
 
 
 BENCHMARK = Benchmark(
     name="coherent",
     title="Self-consistent corruption",
     cases=cases,
-    checks=checks,
-    tables=tables,
+    closing=show_breaking,
     packages=("numpy", "scipy", "numba"),
     quick={"repeats": 1},
     repeats=5,
-    quantities=(
-        Quantity("q", "1", "neither", 0.0, "odds that a direction is a wrong one"),
-        Quantity("ShapeFit, LUD, placed", "1", "lower", 0.05, "against the truth, median of the seeds"),
-        Quantity("placed, false", "1", "neither", 0.05, "the same against the second configuration"),
-        Quantity("contradicting", "1", "neither", 0.05, "share of pairs that contradict the answer, median"),
-        Quantity("warned", "seeds", "neither", 0.0, f"and of those with an error above {BROKEN:g}"),
-    ),
+    notes={
+        "": "All wrong pairs agree on one second configuration of the cameras. At q = 0.5 it is as good an"
+        " answer as the truth, which is the limit of every method."
+    },
+    columns={
+        "q": "1; odds that a direction is a wrong one",
+        "ShapeFit, LUD, placed": "1; error against the truth, median of the seeds",
+        "placed, false": "1; the same against the second configuration",
+        "contradicting": "1; share of pairs that contradict the answer, median",
+        "warned": f"seeds; and of those with an error above {BROKEN:g}",
+    },
 )

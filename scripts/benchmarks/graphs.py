@@ -6,32 +6,36 @@ a little damping would hide most of the drift of a long chain, which is in the d
 """
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from harness import ours
+import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+import sfm_shapefit
 from harness.driver import DATA, ROOT, Benchmark, Case, if_there
-from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, Trials, number, verdict
-from harness.record import table_of
-
-if TYPE_CHECKING:
-    from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-    from sfm_shapefit.graph.viewgraph import ViewGraph
-    from sfm_shapefit.synthetic import GraphProblem
+from harness.graphs import GraphSpec, draw, relative_error
+from harness.process import time_call
+from harness.record import Check, Row, median
+from sfm_shapefit import ViewGraph
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.synthetic import GraphProblem, measured_problem, street_problem
 
 MADRID = "1dsfm-Madrid_Metropolis"
 EXACT = 1e-9
 """Error that counts as exact, where right directions have no noise."""
 MEAN_OVER_MEDIAN = 3.0
-# `locate` keeps cameras of this trust by default.
+# Trust from which `locate` keeps cameras by default.
 _MIN_TRUST = 0.6
 _ORACLE_STEPS = 8
-# The oracle's factorization of larger graphs takes too long.
+# Nodes up to which the oracle's factorization does not take too long.
 _ORACLE_NODES = 20_000
 
 
@@ -59,8 +63,8 @@ PROBLEMS: dict[str, Problem] = {
         f"{family}-{n} {sigma:g}": Problem(GraphSpec(family, n, degree, sigma), over_oracle=1.08)
         for (family, n, degree), sigma in product(USUAL, (0.01, 0.05))
     },
-    "er2-100 0.05, q 0.4": Problem(spec=GraphSpec(family="er2", n=100, sigma=0.05, q=0.4), over_oracle=1.15),
-    "seq-300 exact, q 0.1": Problem(spec=GraphSpec(family="seq", n=300, degree=36.0, q=0.1), error=EXACT),
+    "er2-100 0.05, q 0.4": Problem(GraphSpec("er2", 100, sigma=0.05, q=0.4), over_oracle=1.15),
+    "seq-300 exact, q 0.1": Problem(GraphSpec("seq", 300, degree=36.0, q=0.1), error=EXACT),
     **{
         f"{family}-{n}": Problem(GraphSpec(family, n, degree, 0.01), over_oracle=1.3, below_lud=True)
         for family, n, degree in CHAINS
@@ -70,12 +74,11 @@ PROBLEMS: dict[str, Problem] = {
         for words, jitter in (("straight", 0.0), ("jitter 1%", 0.01), ("jitter 5%", 0.05))
     },
     "street-5000 straight": Problem(GraphSpec("street", 5000, sigma=0.01, q=0.15), error=9e-3, seconds=30.0),
-    "Madrid, q 0.3 on few": Problem(spec=GraphSpec(family="madrid", n=394, sigma=0.01, q=0.3)),
+    "Madrid, q 0.3 on few": Problem(GraphSpec("madrid", 394, sigma=0.01, q=0.3)),
 }
-
 QUICK = {
-    "seqv-60": Problem(spec=GraphSpec(family="seqv", n=60, degree=16.0, sigma=0.01), over_oracle=1.3),
-    "street-30": Problem(spec=GraphSpec(family="street", n=30), error=0.1),
+    "seqv-60": Problem(GraphSpec("seqv", 60, degree=16.0, sigma=0.01), over_oracle=1.3),
+    "street-30": Problem(GraphSpec("street", 30), error=0.1),
 }
 
 
@@ -83,13 +86,13 @@ QUICK = {
 class Drawn:
     """A graph with its truth."""
 
-    graph: "ViewGraph"
-    truth: "FloatArray"
+    graph: ViewGraph
+    truth: FloatArray
     """(n, 3) of all nodes."""
-    right: "FloatArray"
+    right: FloatArray
     """(m,) 1 / variance of right directions, 0 for wrong ones."""
     num_cameras: int
-    covariance: "FloatArray | None" = None
+    covariance: FloatArray | None = None
 
 
 class Trial(NamedTuple):
@@ -118,11 +121,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
 
 def draw_graph(problem: Problem, seed: int, data: Path = DATA) -> Drawn:
     """Return the problem's graph for a seed."""
-    import numpy as np
-
-    from sfm_shapefit import ViewGraph
-    from sfm_shapefit.synthetic import street_problem
-
     spec = problem.spec
     if spec.family == "street":
         street = street_problem(spec.n, jitter=problem.jitter, seed=seed)
@@ -134,20 +132,12 @@ def draw_graph(problem: Problem, seed: int, data: Path = DATA) -> Drawn:
             covariance=street.covariance,
         )
     bare = _madrid(spec, seed, data) if spec.family == "madrid" else draw(spec, seed=seed)
-    return Drawn(
-        graph=view_graph(bare),
-        truth=bare.locations,
-        right=np.where(bare.corrupted, 0.0, 1.0),
-        num_cameras=len(bare.locations),
-    )
+    right, n = np.where(bare.corrupted, 0.0, 1.0), len(bare.locations)
+    return Drawn(graph=bare.view_graph, truth=bare.locations, right=right, num_cameras=n)
 
 
-def _madrid(spec: GraphSpec, seed: int, data: Path) -> "GraphProblem":
+def _madrid(spec: GraphSpec, seed: int, data: Path) -> GraphProblem:
     """Return drawn positions, in a flat square, on the pairs of a real collection."""
-    import numpy as np
-
-    from sfm_shapefit.synthetic import measured_problem
-
     with np.load(data / MADRID / "viewgraph.npz") as file:
         edges, n = file["edges"].astype(np.int64), len(file["names"])
     rng = np.random.default_rng(seed)
@@ -156,22 +146,18 @@ def _madrid(spec: GraphSpec, seed: int, data: Path) -> "GraphProblem":
     return measured_problem(locations, pairs, sigma=spec.sigma, q=spec.q, seed=rng, corruption="concentrated")
 
 
-def measure_seeds(name: str, problem: Problem, seeds: int, data: Path) -> Trials:
+def measure_seeds(name: str, problem: Problem, seeds: int, data: Path) -> Row:
     """Measure a problem, after a small one that loads the compiled code."""
     measure(replace(problem, spec=replace(problem.spec, n=min(problem.spec.n, 100))), 0, data)
-    return Trials(name, problem, [measure(problem, seed, data) for seed in range(seeds)])
+    return judge(name, problem, [measure(problem, seed, data) for seed in range(seeds)])
 
 
 def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     """Place one graph of a problem and compare with its truth."""
-    import numpy as np
-
-    from sfm_shapefit.base.geometry import fit_similarity
-
     one = draw_graph(problem, seed, data)
-    run = ours.time_call(
-        lambda: ours.place(one.graph, covariance=one.covariance, num_cameras=one.num_cameras)
-    )
+    num_points = one.graph.num_nodes - one.num_cameras
+    measured = MeasuredGraph(one.graph, covariance=one.covariance, num_points=num_points)
+    run = time_call(lambda: sfm_shapefit.place(measured))
     placement = run.found
     rows, count = placement.cameras, len(placement.cameras)
     truth, lud = one.truth[rows], placement.refined.lud
@@ -194,15 +180,11 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     )
 
 
-def oracle(one: Drawn) -> "FloatArray":
+def oracle(one: Drawn) -> FloatArray:
     """Return weighted least squares of |u_e - v_e| on the right directions alone, (n, 3), from the truth.
 
     What fewer than two right directions hold stays where it is.
     """
-    import numpy as np
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
-
     right = _holding(one.right > 0.0, one.graph.edges)
     edges, v, root = one.graph.edges[right], one.graph.directions[right], np.sqrt(one.right[right])
     (m, d), t = v.shape, one.truth.copy()
@@ -229,10 +211,8 @@ def oracle(one: Drawn) -> "FloatArray":
     return t
 
 
-def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
+def _holding(right: BoolArray, edges: IntArray) -> BoolArray:
     """Return the right directions without those to nodes that have no second one, again and again."""
-    import numpy as np
-
     while True:
         degree = np.bincount(edges[right].ravel(), minlength=int(edges.max()) + 1)
         left = right & (degree[edges] >= 2).all(axis=1)
@@ -241,60 +221,49 @@ def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
         right = left
 
 
-def worst_ratio(found: Trials) -> float:
-    """Return the largest mean over median of the trials."""
-    return max(trial.mean_over_median for trial in found.trials)
-
-
-def checks(found: Trials) -> list[Check]:
-    """Return the limits of one problem: of medians, and of the worst mean over median."""
-    problem, worst = found.problem, worst_ratio(found)
+def judge(name: str, problem: Problem, trials: Sequence[Trial]) -> Row:
+    """Return the row of a problem: limits of medians, and of the worst mean over median."""
+    middle, worst = (
+        Trial(*map(median, zip(*trials, strict=True))),
+        max(one.mean_over_median for one in trials),
+    )
     limits = (
-        ("/ oracle", found.median("over_oracle"), problem.over_oracle),
-        ("error", found.median("placed"), problem.error),
-        ("placed against LUD", found.median("placed"), found.median("lud") if problem.below_lud else None),
-        ("seconds", found.median("seconds"), problem.seconds),
+        ("/ oracle", middle.over_oracle, problem.over_oracle),
+        ("error", middle.placed, problem.error),
+        ("placed against LUD", middle.placed, middle.lud if problem.below_lud else None),
+        ("seconds", middle.seconds, problem.seconds),
         ("mean / median", worst, MEAN_OVER_MEDIAN),
     )
-    return [Check(name=name, value=v, limit=limit) for name, v, limit in limits if limit is not None]
-
-
-def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterator[str]:
-    yield (
-        "Problems have a fifth of wrong directions and noise of 0.01 unless they say otherwise; those of"
-        " 5,000 nodes or more, one seed."
-    )
-    yield table_of(
-        measured.values(),
-        {
-            "problem": lambda one: one.name,
-            "ShapeFit": lambda one: number(one.median("shapefit")),
-            "LUD": lambda one: number(one.median("lud")),
-            "placed": lambda one: number(one.median("placed")),
-            "oracle": lambda one: number(one.median("oracle")),
-            "/ oracle": lambda one: number(one.median("over_oracle")),
-            "mean / median": lambda one: number(worst_ratio(one)),
-            "kept": lambda one: str(min(trial.kept for trial in one.trials)),
-            "seconds": lambda one: number(one.median("seconds")),
-            "verdict": lambda one: verdict(checks(one)),
-        },
-    )
+    cells = {
+        "problem": name,
+        "ShapeFit": middle.shapefit,
+        "LUD": middle.lud,
+        "placed": middle.placed,
+        "oracle": middle.oracle,
+        "/ oracle": middle.over_oracle,
+        "mean / median": worst,
+        "kept": min(trial.kept for trial in trials),
+        "seconds": middle.seconds,
+    }
+    return Row(cells, [Check(name, value, limit) for name, value, limit in limits if limit is not None])
 
 
 BENCHMARK = Benchmark(
     name="graphs",
     title="Families of graphs",
     cases=cases,
-    checks=checks,
-    tables=tables,
     packages=("numpy", "scipy", "numba"),
     quick={"repeats": 1},
     repeats=5,
-    quantities=(
-        Quantity("ShapeFit, LUD, placed, oracle", "1", "lower", 0.05, "of the cameras, of unit norm, median"),
-        Quantity("/ oracle", "1", "lower", 0.05, "placed over the oracle, median of the seeds' ratios"),
-        Quantity("mean / median", "1", "lower", 0.1, "distances of the cameras kept; worst seed"),
-        Quantity("kept", "cameras", "higher", 0.0, f"cameras of trust {_MIN_TRUST:g} or more, fewest"),
-        Quantity("seconds", "s", "lower", 0.5, "`place`, wall-clock, median"),
-    ),
+    notes={
+        "": "Problems have a fifth of wrong directions and noise of 0.01 unless they say otherwise; those of"
+        " 5,000 nodes or more, one seed."
+    },
+    columns={
+        "ShapeFit, LUD, placed, oracle": "1; errors of the cameras, of unit norm, median",
+        "/ oracle": "1; placed over the oracle, median of the seeds' ratios",
+        "mean / median": "1; distances of the cameras kept; worst seed",
+        "kept": f"cameras of trust {_MIN_TRUST:g} or more, fewest",
+        "seconds": "`place`, wall-clock, median",
+    },
 )

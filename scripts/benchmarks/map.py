@@ -6,8 +6,8 @@ counts; `map` chooses by itself. They refine focal lengths; `map` keeps those of
 those of the largest model against the truth after robust alignment.
 
 CPU seconds are those of a whole process with one thread, imports and writing included, and with kernels
-compiled: a run on the bundled ring comes before. Rotation errors are those of the averaged rotations, before
-anything is placed.
+compiled: a run on the bundled ring comes before. How far the averaged rotations are off, before anything is
+placed, `averaging` measures.
 
 The scenes of `LIMITS` were looked at when the method was chosen. Those of `FURTHER` were not: images drawn
 with a seed, and SIFT, matches and verification by pycolmap.
@@ -17,158 +17,88 @@ import argparse
 import json
 import math
 import os
-import resource
 import sqlite3
 import struct
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 
+import sfm_shapefit
 from harness.driver import ROOT, Benchmark, Case, Kept, if_there
-from harness.metrics import Check, Quantity, check_all, number, numbers, ratio, verdict
-from harness.process import call, thread_environment
-from harness.record import table_of, versions
+from harness.process import call, children_cpu_s, run_command, thread_environment
+from harness.record import Check, Row, at_least, at_most, ratio, versions
+from harness.scenes import write_scene
 
 OURS = ("map", "map --bundle-adjust")
-PEERS = tuple((mapper, k) for mapper in ("global", "incremental") for k in (15, 30))
+MAPPERS, MIN_MATCHES = ("global", "incremental"), (15, 30)
 LARGEST_RATIO = 1.15
 """Of the mean error of `map --bundle-adjust` on a further scene, to that of the better peer."""
-WRONG_DEG = 5.0
 
 
-class Limit(NamedTuple):
-    """What one command has to reach on a scene."""
-
-    median: float
-    mean: float
-    placed: int
-    cpu_s: float
-
-    def checks(self, run: "Outcome") -> list[Check]:
-        """Return the checks of a run."""
-        return [
-            Check(name="median", value=run.median(), limit=self.median),
-            Check(name="mean", value=run.mean(), limit=self.mean),
-            Check(name="placed", value=len(run.errors), limit=self.placed, better="higher"),
-            Check(name="CPU s", value=run.cpu_s, limit=self.cpu_s),
-        ]
-
-
-class Target(NamedTuple):
-    """What is to be reached on a scene."""
-
-    adjusted: Limit
-    bundle_adjusted: Limit
-    rotations: Mapping[str, float] = {}
-    """Of the averaged ones."""
-
-
-LIMITS = {
-    "fountain-P11": Target(Limit(0.0020, 0.0023, 11, 3.0), Limit(0.0020, 0.0023, 11, 3.5)),
-    "Herz-Jesus-P8": Target(Limit(0.0028, 0.0036, 8, 2.5), Limit(0.0025, 0.0034, 8, 3.0)),
-    "Herz-Jesus-P25": Target(
-        Limit(0.0054, 0.0055, 25, 5.0), Limit(0.0049, 0.0052, 25, 6.0), {"mean deg": 0.051}
-    ),
-    "castle-P19": Target(Limit(0.0150, 0.0235, 19, 4.0), Limit(0.0175, 0.0245, 19, 5.0), {"mean deg": 0.075}),
-    "castle-P30": Target(Limit(0.0200, 0.0230, 30, 5.0), Limit(0.0190, 0.0212, 30, 7.0), {"mean deg": 0.061}),
-    "lego100": Target(
-        Limit(0.0041, 0.0050, 100, 5.0),
-        Limit(0.0028, 0.0036, 100, 7.0),
-        {"mean deg": 0.15, "beyond 5 deg": 0.0},
-    ),
-    "liberty-calibrated": Target(
-        Limit(0.0114, 0.045, 106, 8.0), Limit(0.0085, 0.0150, 106, 10.0), {"beyond 5 deg": 12.0}
-    ),
-    "ring 300": Target(Limit(0.0036, 0.0040, 300, 20.0), Limit(0.0036, 0.0040, 300, math.inf)),
-    "facade 300": Target(Limit(0.0035, 0.0038, 300, 20.0), Limit(0.0035, 0.0038, 300, math.inf)),
+LIMITS: dict[str, tuple[tuple[float, float, int, float], ...]] = {
+    "fountain-P11": ((0.0020, 0.0023, 11, 3.0), (0.0020, 0.0023, 11, 3.5)),
+    "Herz-Jesus-P8": ((0.0028, 0.0036, 8, 2.5), (0.0025, 0.0034, 8, 3.0)),
+    "Herz-Jesus-P25": ((0.0054, 0.0055, 25, 5.0), (0.0049, 0.0052, 25, 6.0)),
+    "castle-P19": ((0.0150, 0.0235, 19, 4.0), (0.0175, 0.0245, 19, 5.0)),
+    "castle-P30": ((0.0200, 0.0230, 30, 5.0), (0.0190, 0.0212, 30, 7.0)),
+    "lego100": ((0.0041, 0.0050, 100, 5.0), (0.0028, 0.0036, 100, 7.0)),
+    "liberty-calibrated": ((0.0114, 0.045, 106, 8.0), (0.0085, 0.0150, 106, 10.0)),
+    "ring 300": ((0.0036, 0.0040, 300, 20.0), (0.0036, 0.0040, 300, math.inf)),
+    "facade 300": ((0.0035, 0.0038, 300, 20.0), (0.0035, 0.0038, 300, math.inf)),
 }
-_LARGE = {"num_images": 300, "wrong_match_fraction": 0.05}
+"""Median, mean, cameras placed and CPU seconds to reach, by each of `OURS`."""
+_LARGE = {"num_images": 300, "wrong_match_fraction": 0.05, "seed": 1}
 MADE: dict[str, dict[str, Any]] = {
-    "ring 300": {**_LARGE, "shape": "ring", "num_points": 6000, "seed": 1},
-    "facade 300": {**_LARGE, "shape": "facade", "num_points": 10_000, "seed": 1},
+    "ring 300": {**_LARGE, "shape": "ring", "num_points": 6000},
+    "facade 300": {**_LARGE, "shape": "facade", "num_points": 10_000},
+    "ring": {"shape": "ring", "num_images": 10, "num_points": 500, "wrong_match_fraction": 0.02, "seed": 6},
 }
-QUICK = {"shape": "ring", "num_images": 10, "num_points": 500, "wrong_match_fraction": 0.02, "seed": 6}
 _SIZE = {"image_width": 800, "image_height": 600, "focal_length_px": 667.0}
-
-
-class Drawn(NamedTuple):
-    """A scene to be photographed."""
-
-    scene: Mapping[str, Any]
-    render: Mapping[str, Any]
-    is_simple: bool = False
-    """Whether the camera stands in the database as SIMPLE_RADIAL, which has no second coefficient."""
-
-
-FURTHER = {
-    "further: houses": Drawn(
-        {**_SIZE, "shape": "facade", "num_images": 36, "seed": 101}, {"repeated_fraction": 0.5}
-    ),
-    "further: courtyard": Drawn(
-        {**_SIZE, "shape": "courtyard", "num_images": 40, "seed": 102}, {"repeated_fraction": 0.5}
-    ),
-    "further: tower": Drawn(
-        {**_SIZE, "shape": "ring", "num_images": 48, "seed": 103}, {"repeated_fraction": 0.375}
-    ),
-    "further: street": Drawn({**_SIZE, "shape": "drive", "num_images": 36, "seed": 104}, {}),
-    "further: simple lens": Drawn(
-        {**_SIZE, "shape": "facade", "num_images": 25, "seed": 105},
+SIMPLE_LENS = "further: simple lens"
+"""Its camera stands in the database as SIMPLE_RADIAL, which has no second coefficient."""
+FURTHER: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "further: houses": ({"shape": "facade", "num_images": 36, "seed": 101}, {"repeated_fraction": 0.5}),
+    "further: courtyard": ({"shape": "courtyard", "num_images": 40, "seed": 102}, {"repeated_fraction": 0.5}),
+    "further: tower": ({"shape": "ring", "num_images": 48, "seed": 103}, {"repeated_fraction": 0.375}),
+    "further: street": ({"shape": "drive", "num_images": 36, "seed": 104}, {}),
+    SIMPLE_LENS: (
+        {"shape": "facade", "num_images": 25, "seed": 105},
         {"radial_k1": -0.15, "radial_k2": 0.0},
-        is_simple=True,
     ),
-    "further: wide lens": Drawn(
-        {**_SIZE, "focal_length_px": 450.0, "shape": "courtyard", "num_images": 30, "seed": 106},
+    "further: wide lens": (
+        {"focal_length_px": 450.0, "shape": "courtyard", "num_images": 30, "seed": 106},
         {"radial_k1": -0.12, "radial_k2": 0.015},
     ),
 }
+"""Options of scenes that are photographed, and of their pictures."""
 
 
 class Outcome(NamedTuple):
     """One mapper on one scene."""
 
     mapper: str
-    min_matches: int
-    """Of the setting; 0 where the mapper chose."""
+    setting: str
     cpu_s: float
     wall_s: float
     errors: Mapping[str, float]
     """Position error of each placed camera by name, in the truth's units."""
-    verdict: str = ""
-    """What `map` says of its model."""
-    agreeing: Sequence[float] = ()
-    """The shares of its pairs and observations that agree, as `map` says."""
+    says: str = ""
+    """Shares of its pairs and observations that agree, and the verdict, as `map` says."""
 
-    def mean(self, names: Collection[str] | None = None) -> float:
-        """Return the mean error, of some of the cameras if they are named; NaN if none is placed."""
-        chosen = [e for name, e in self.errors.items() if names is None or name in names]
-        return float(np.mean(chosen)) if chosen else math.nan
+    def mean(self) -> float:
+        """Return the mean error; NaN if no camera is placed."""
+        return float(np.mean(list(self.errors.values()))) if self.errors else math.nan
 
     def median(self) -> float:
         """Return the median error; NaN if no camera is placed."""
         return float(np.median(list(self.errors.values()))) if self.errors else math.nan
-
-
-class Measured(NamedTuple):
-    """All mappers on one scene."""
-
-    scene: str
-    ours: Sequence[Outcome]
-    """As `OURS`."""
-    peers: Sequence[Outcome]
-    rotations: Mapping[str, float]
-    """Errors of the averaged rotations."""
-
-    def best_peer(self) -> Outcome | None:
-        """Return the run of a peer with the lowest mean error, if one placed a camera."""
-        return min((run for run in self.peers if run.errors), key=Outcome.mean, default=None)
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
@@ -176,7 +106,7 @@ def flags(parser: argparse.ArgumentParser) -> None:
         "--folder", type=Path, help="where made scenes and answers of peers are kept (a temporary folder)"
     )
     parser.add_argument(
-        "--no-peers", action="store_true", help="leave out pycolmap's mappers, which take long"
+        "--no-peers", action="store_true", help="leave out pycolmap's mappers: they take long"
     )
 
 
@@ -184,63 +114,47 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return the scenes: those with limits, and the further ones."""
     if args.quick:
         return {"ring": partial(measure_scene, "ring", args)}
-    names = (*LIMITS, *FURTHER)
-    return {
-        name: if_there(
-            ROOT if name in MADE or name in FURTHER else args.data / name, partial(measure_scene, name, args)
-        )
-        for name in names
-    }
+    places = {name: ROOT if name in MADE else args.data / name for name in LIMITS} | dict.fromkeys(
+        FURTHER, ROOT
+    )
+    return {name: if_there(folder, partial(measure_scene, name, args)) for name, folder in places.items()}
 
 
-def measure_scene(name: str, args: argparse.Namespace) -> Measured:
+def measure_scene(name: str, args: argparse.Namespace) -> list[Row]:
     """Run all mappers on one scene, each in a fresh process."""
     with tempfile.TemporaryDirectory() as temporary:
         kept_in = args.folder or Path(temporary)
-        folder = _make(name, kept_in) or args.data / name
+        folder = _make(name, kept_in) if name in MADE or name in FURTHER else args.data / name
         truth = folder / "gt" if (folder / "gt").exists() else folder / "sparse" / "0"
-        database = folder / "database.db"
-        variables = thread_environment(args.threads)
-        peers = []
+        database, variables = folder / "database.db", thread_environment(args.threads)
         settings = {"threads": args.threads, "versions": versions(["pycolmap"]), "scene": name}
         kept = Kept(kept_in / f"{folder.name}.peers" if args.folder else None, settings)
-        for mapper, limit in PEERS:
-            if not args.no_peers or f"{mapper} {limit}" in kept:
+        peers = []
+        for setting in ((mapper, least) for mapper in MAPPERS for least in MIN_MATCHES):
+            if not args.no_peers or str(setting) in kept:
                 ask = partial(
-                    *(call, measure_peer, mapper, limit, database, truth, args.threads),
-                    environment=variables,
+                    call, measure_peer, *setting, database, truth, args.threads, environment=variables
                 )
-                peers.append(kept.get(f"{mapper} {limit}", ask))
+                peers.append(kept.get(str(setting), ask))
         if not args.quick:  # which measures nothing that compiling would spoil
-            run_ours(ROOT / "data_synthetic" / "ring8" / "database.db", Path(temporary) / "warm", OURS[1], 1)
+            ring = ROOT / "data_synthetic" / "ring8"
+            measure_ours(OURS[1], ring / "database.db", ring / "sparse" / "0", Path(temporary) / "warm", 1)
         ours = [
             measure_ours(command, database, truth, Path(temporary) / str(k), args.threads)
             for k, command in enumerate(OURS)
         ]
-        return Measured(name, ours, peers, call(measure_rotations, database, truth, environment=variables))
+        return judge(name, ours, peers)
 
 
-def _make(name: str, folder: Path) -> Path | None:
-    """Make a scene in a folder unless it has it, and return its own folder; None of a real scene."""
-    from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_scene
-    from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
-    from sfm_shapefit.synthetic.rendering import make_rendered_scene
-    from sfm_shapefit.synthetic.workspace import write_workspace
-
+def _make(name: str, folder: Path) -> Path:
+    """Make a scene in a folder unless it has it, and return its own folder."""
     out = folder / name.replace(": ", "-").replace(" ", "-")
-    if name in FURTHER:
-        drawn = FURTHER[name]
-        if not out.exists():
-            scene = make_rendered_scene(SceneOptions(**drawn.scene), RenderOptions(**drawn.render))
-            write_rendered_workspace(scene, out)
-            if drawn.is_simple:
-                _simplify_camera(out / "database.db")
-        return out
-    options = QUICK if name == "ring" else MADE.get(name)
-    if options is None:
-        return None
-    if not out.exists():
-        write_workspace(make_scene(SceneOptions(**options)), out)  # type: ignore[arg-type]
+    if not out.exists() and name in MADE:
+        write_scene(out, MADE[name])
+    elif not out.exists():
+        write_scene(out, _SIZE | FURTHER[name][0], FURTHER[name][1])
+        if name == SIMPLE_LENS:
+            _simplify_camera(out / "database.db")
     return out
 
 
@@ -258,68 +172,35 @@ def _simplify_camera(database: Path) -> None:
 
 def measure_ours(command: str, database: Path, truth: Path, out: Path, threads: int) -> Outcome:
     """Run `map` once, and compare its largest model with the truth."""
-    cpu_s, wall_s = run_ours(database, out, command, threads)
+    before, start = children_cpu_s(), time.perf_counter()
+    with patch.dict(os.environ, thread_environment(threads)):
+        run_command(*command.split(), database, out, "--threads", threads, "-q")
+    cpu_s, wall_s = children_cpu_s() - before, time.perf_counter() - start
     located = json.loads((out / "map.json").read_text(encoding="utf-8"))["models"][0]["located"]
-    return Outcome(
-        mapper=command,
-        min_matches=0,
-        cpu_s=cpu_s,
-        wall_s=wall_s,
-        errors=call(errors_by_name, out / "0", truth),
-        verdict=located["verdict"]["grade"],
-        agreeing=[located["agreement"][of] for of in ("pairs", "observations")],
-    )
-
-
-def run_ours(database: Path, out: Path, command: str, threads: int) -> tuple[float, float]:
-    """Run a command of ours in a process, and return the seconds of CPU and of the clock that it took.
-
-    Raises:
-        RuntimeError: if it fails, with its last lines.
-    """
-    words = [*command.split(), str(database), str(out), "--threads", str(threads), "-q"]
-    before, start = _children_s(), time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-m", "sfm_shapefit", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
-        env={**os.environ, **thread_environment(threads)},
-    )
-    if done.returncode:
-        raise RuntimeError(f"{command} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
-    return _children_s() - before, time.perf_counter() - start
-
-
-def _children_s() -> float:
-    """Return the CPU seconds of all child processes that have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    agreeing = ", ".join(f"{located['agreement'][of]:.2f}" for of in ("pairs", "observations"))
+    errors = call(errors_by_name, out / "0", truth)
+    return Outcome(command, "chosen", cpu_s, wall_s, errors, f"{agreeing}, {located['verdict']['grade']}")
 
 
 def measure_peer(mapper: str, min_matches: int, database: Path, truth: Path, threads: int) -> Outcome:
     """Run one mapper of pycolmap once, and compare its largest model with the truth; in its own process."""
-    from peers.colmap import map_database
+    from paper.colmap_peer import map_database
     from sfm_shapefit.files.colmap.quiet import quiet_stderr
 
-    start = time.perf_counter()
+    start, errors = time.perf_counter(), {}
     with quiet_stderr():
         try:
             found = map_database(
                 database, min_matches, incremental=mapper == "incremental", num_threads=threads
-            )[0]
+            )
+            errors = errors_by_name(found[0], truth)
         except RuntimeError:
-            found = None
-    cpu_s, wall_s = time.process_time(), time.perf_counter() - start
-    errors = {} if found is None else errors_by_name(found, truth)
-    return Outcome(mapper, min_matches, cpu_s, wall_s, errors)
+            pass  # no model came out
+    return Outcome(mapper, str(min_matches), time.process_time(), time.perf_counter() - start, errors)
 
 
 def errors_by_name(found: Any, truth: Path) -> dict[str, float]:
     """Return the position error of each camera that a model and the truth have in common."""
-    import sfm_shapefit
-
     try:
         compared = sfm_shapefit.evaluate(found, truth)
     except sfm_shapefit.ShapeFitError:
@@ -328,104 +209,49 @@ def errors_by_name(found: Any, truth: Path) -> dict[str, float]:
     return dict(zip(compared.names, compared.position_errors.tolist(), strict=True))
 
 
-def measure_rotations(database: Path, truth: Path) -> dict[str, float]:
-    """Return the errors of the averaged rotations, of the images with truth; in its own process."""
-    from benchmarks.averaging import errors_deg
-    from sfm_shapefit import relative_rotations
-    from sfm_shapefit.files.colmap.model import read_model
-    from sfm_shapefit.rotations.trusted import average_consistently
-
-    relative, known = relative_rotations(database), read_model(truth)
-    found = average_consistently(len(relative.names), relative)
-    row_of = {name: k for k, name in enumerate(known.names)}
-    rows = [k for k, name in enumerate(relative.names) if found.registered[k] and name in row_of]
-    true = known.rotations[[row_of[relative.names[k]] for k in rows]]
-    errors = errors_deg(found.rotations[rows], true)
-    return {"mean deg": float(errors.mean()), "beyond 5 deg": float((errors > WRONG_DEG).sum())}
+def best(runs: Sequence[Outcome]) -> Outcome | None:
+    """Return the run with the lowest mean error, if one placed a camera."""
+    return min((run for run in runs if run.errors), key=Outcome.mean, default=None)
 
 
-def checks(one: Measured) -> list[Check]:
-    """Return the limits of a scene."""
-    if one.scene in LIMITS:
-        target = LIMITS[one.scene]
-        limits = zip((target.adjusted, target.bundle_adjusted), one.ours, strict=True)
-        found = [check for limit, run in limits for check in _name(limit.checks(run), run.mapper)]
-        # What is not finite is no limit.
-        found = [check for check in found if math.isfinite(check.limit)]
-        return found + check_all(one.rotations, target.rotations)
-    best = one.best_peer()
-    if best is None:
-        return []
-    off = ratio(one.ours[-1].mean(), best.mean())
-    return [Check(name="mean error / better peer", value=off, limit=LARGEST_RATIO)]
+def judge(name: str, ours: Sequence[Outcome], peers: Sequence[Outcome]) -> list[Row]:
+    """Return the rows of a scene; the better setting of a peer is bold."""
+    kind = "Further scenes" if name in FURTHER else "Scenes with limits"
+    better = [best([run for run in peers if run.mapper == mapper]) for mapper in MAPPERS]
+    limits, rows = LIMITS.get(name, ()), []
+    for k, run in enumerate([*ours, *peers]):
+        checks: list[Check] = []
+        if run in ours and limits:
+            median, mean, placed, cpu_s = limits[k]
+            checks = at_most(median=(run.median(), median), mean=(run.mean(), mean))
+            checks += at_least(placed=(len(run.errors), placed))
+            checks += at_most(CPU_s=(run.cpu_s, cpu_s if math.isfinite(cpu_s) else None))
+        elif run is ours[-1] and name in FURTHER and (peer := best(peers)):
+            checks = [Check("mean error / better peer", ratio(run.mean(), peer.mean()), LARGEST_RATIO)]
+        common = [error for camera, error in run.errors.items() if camera in ours[0].errors]
+        cells = {
+            "scene": name,
+            "mapper": f"**{run.mapper}**" if run in better else run.mapper,
+            "least matches": run.setting,
+            "placed": len(run.errors),
+            "median / mean error": [run.median(), run.mean()],
+            "of those `map` placed": float(np.mean(common)) if run in peers and common else "",
+            "CPU, wall s": f"{run.cpu_s:.1f}, {run.wall_s:.1f}",
+            "agreeing, verdict": run.says,
+        }
+        rows.append(Row(cells, checks, kind))
+    return rows
 
 
-def _name(found: Sequence[Check], mapper: str) -> list[Check]:
-    return [
-        Check(name=f"{mapper}: {one.name}", value=one.value, limit=one.limit, better=one.better)
-        for one in found
-    ]
-
-
-def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
-    for title, chosen in (
-        ("## Scenes with limits", [one for one in measured.values() if one.scene not in FURTHER]),
-        ("## Further scenes", [one for one in measured.values() if one.scene in FURTHER]),
-    ):
-        if chosen:
-            yield title
-            yield _show(chosen)
-            yield _show_evidence(chosen)
-    sizes = ", ".join(f"{name} of {made['num_points']} points" for name, made in MADE.items())
+def _say_what_was_made(_rows: Sequence[Row]) -> Iterator[str]:
+    sizes = ", ".join(
+        f"{name} of {made['num_points']} points" for name, made in MADE.items() if name in LIMITS
+    )
     yield (
         f"Made scenes: {sizes}, a share of {_LARGE['wrong_match_fraction']} of all matches wrong. The limit"
         f" of further scenes is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers, for"
-        " `map --bundle-adjust`. The better setting of a mapper is bold. With `--folder`, what a peer"
+        " `map --adjust full`. The better setting of a mapper is bold. With `--folder`, what a peer"
         " reached in an earlier run with the same threads and versions is not measured again."
-    )
-
-
-def _show(chosen: Sequence[Measured]) -> str:
-    """Return all runs of some scenes; the cell of a better setting of a peer is bold."""
-    rows = [(one, run) for one in chosen for run in (*one.ours, *one.peers)]
-    better = {id(_better(one, mapper)) for one in chosen for mapper in ("global", "incremental")}
-    columns: dict[str, Callable[[tuple[Measured, Outcome]], str]] = {
-        "scene": lambda row: row[0].scene,
-        "mapper": lambda row: f"**{row[1].mapper}**" if id(row[1]) in better else row[1].mapper,
-        "least matches": lambda row: str(row[1].min_matches or "chosen"),
-        "placed": lambda row: str(len(row[1].errors)),
-        "median / mean error": lambda row: numbers([row[1].median(), row[1].mean()]),
-        "of those `map` placed": lambda row: (
-            "" if row[1].mapper in OURS else number(row[1].mean(row[0].ours[0].errors))
-        ),
-        "CPU, wall s": lambda row: f"{row[1].cpu_s:.1f}, {row[1].wall_s:.1f}",
-    }
-    return table_of(rows, columns)
-
-
-def _better(one: Measured, mapper: str) -> Outcome | None:
-    """Return the run of a peer at its better setting."""
-    runs = [run for run in one.peers if run.mapper == mapper and run.errors]
-    return min(runs, key=Outcome.mean, default=None)
-
-
-def _show_evidence(chosen: Sequence[Measured]) -> str:
-    """Return what `map` says of its models, and whether limits are met."""
-    return table_of(
-        chosen,
-        {
-            "scene": lambda one: one.scene,
-            "averaged: mean deg": lambda one: number(one.rotations["mean deg"]),
-            "beyond 5 deg": lambda one: f"{one.rotations['beyond 5 deg']:.0f}",
-            "agreeing pairs, observations": lambda one: ", ".join(
-                f"{share:.2f}" for share in one.ours[0].agreeing
-            ),
-            "verdict": lambda one: one.ours[0].verdict,
-            "bundle adjusted": lambda one: ", ".join(
-                [*(f"{share:.2f}" for share in one.ours[1].agreeing), one.ours[1].verdict]
-            ),
-            "result": lambda one: verdict(checks(one)),
-        },
     )
 
 
@@ -433,21 +259,14 @@ BENCHMARK = Benchmark(
     name="map",
     title="map: from a database to an adjusted model",
     cases=cases,
-    checks=checks,
-    tables=tables,
     flags=flags,
-    quantities=(
-        Quantity("median / mean error", "truth's", "lower", 0.05, "positions of the placed cameras"),
-        Quantity("of those `map` placed", "truth's", "lower", 0.05, "mean error"),
-        Quantity("placed", "1", "higher", 0.0, "cameras of the largest model that have a truth"),
-        Quantity("CPU, wall", "s", "lower", 0.3, "time of the whole process"),
-        Quantity("averaged: mean deg", "deg", "lower", 0.05, "rotation error before anything is placed"),
-        Quantity(
-            "beyond 5 deg", "1", "lower", 0.0, "cameras with a truth whose averaged rotation is so wrong"
-        ),
-        Quantity(
-            *("agreeing pairs, observations", "1", "higher", 0.02),
-            "shares of what says anything that agrees with the model, by `map`",
-        ),
-    ),
+    closing=_say_what_was_made,
+    columns={
+        "median / mean error": "truth's; positions of the placed cameras",
+        "of those `map` placed": "truth's; mean error",
+        "placed": "cameras of the largest model that have a truth",
+        "CPU, wall": "s; time of the whole process",
+        "agreeing": "1; shares of the pairs and observations that agree with the model, of those that say"
+        " anything, by `map`",
+    },
 )

@@ -1,7 +1,7 @@
 """Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognized?
 
-Calibration: scenes of known truth, directions with known or unknown covariances, and photographed scenes
-through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are.
+Calibration: graphs of known truth and covariances, and made scenes through `locate`, as they are placed. A
+standard deviation covers an error that it is not smaller than; of normal errors 68 % are.
 
 Ranking: graphs in which some cameras are worse than others, for one of three reasons. A camera is bad if its
 error is more than three times the median; the area under the curve (AUC) is the probability that a bad camera
@@ -12,25 +12,24 @@ camera is flagged if `locate` leaves it out. The truth of liberty* is the model 
 """
 
 import argparse
-import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from harness import ours
-from harness.driver import ROOT, Benchmark, Case, if_there
-from harness.graphs import view_graph
-from harness.metrics import Check, Quantity, number, numbers, verdict
-from harness.record import table_of
-
-if TYPE_CHECKING:
-    from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-    from sfm_shapefit.files.colmap.model import PosedModel
-    from sfm_shapefit.placement.place import Placement
+import sfm_shapefit
+from harness.driver import ROOT, Benchmark, Case, on_sets
+from harness.record import Row, at_least, at_most
+from harness.scenes import WRONG_DEG, rotation_errors_deg, temporary_scene
+from sfm_shapefit import ViewGraph, synthetic
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import fit_similarity_l1, normalized, tangent_bases
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.judged import Judged
 
 SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30", "lego100")
 FURTHER_SETS = ("liberty", "liberty-calibrated")
@@ -39,49 +38,21 @@ COVERAGE = (0.546, 0.816)
 LEAST_AUC = 0.9
 BAD = 3.0
 """Times the median error."""
-WRONG_DEG = 5.0
 SHAPES = ("ring", "facade", "cloud", "courtyard")
 
 
 class Graph(NamedTuple):
     """Directions between known locations."""
 
-    locations: "FloatArray"
-    edges: "IntArray"
-    directions: "FloatArray"
-    covariances: "FloatArray"
+    locations: FloatArray
+    edges: IntArray
+    directions: FloatArray
+    covariances: FloatArray
 
-
-class Calibration(NamedTuple):
-    """Errors over standard deviations of one problem."""
-
-    name: str
-    covered: float
-    rms: float
-
-
-class Ranking(NamedTuple):
-    """How trust ranks the errors of one problem."""
-
-    name: str
-    area: float
-    """Under the curve, mean of the seeds that have bad cameras."""
-    num_bad: int
-
-
-class Flagged(NamedTuple):
-    """Which cameras of a real set were left out."""
-
-    name: str
-    num_cameras: int
-    num_wrong: int
-    num_caught: int
-    """Wrong rotations left out."""
-    num_blamed: int
-    """Right rotations left out."""
-    lowest_trust: float
-    errors: tuple[float, float]
-    """Median and mean of the others."""
+    def place(self) -> Judged:
+        """Place its cameras."""
+        graph = ViewGraph(len(self.locations), self.edges, self.directions)
+        return sfm_shapefit.place(MeasuredGraph(graph, covariance=self.covariances))
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
@@ -93,22 +64,22 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     ratios |= {f"scene {shape}, 25 images, 0.5 px": partial(scene_ratios, shape) for shape in SHAPES}
     found: dict[str, Case] = {n: partial(calibrate, n, ask, args.repeats) for n, ask in ratios.items()}
     found |= {name: partial(rank, name, args.repeats) for name in SPOILED}
-    for name in (*SETS, *FURTHER_SETS):
-        found[name] = if_there(args.data / name, partial(flag, args.data / name))
     if args.quick:
         chosen = ("graph box, 20% wrong", "scene cloud, 25 images, 0.5 px", *list(SPOILED)[:1])
-        found = {name: found[name] for name in chosen}
-        found["courtyard"] = partial(flag, ROOT / "data_synthetic" / "courtyard")
-    return found
+        bundled = on_sets(ROOT / "data_synthetic", ("courtyard",), flag)
+        return {name: found[name] for name in chosen} | bundled
+    return found | on_sets(args.data, (*SETS, *FURTHER_SETS), flag)
 
 
-def calibrate(name: str, ask: "Callable[[int], FloatArray]", seeds: int) -> Calibration:
+def calibrate(name: str, ask: Callable[[int], FloatArray], seeds: int) -> Row:
     """Return what the errors over standard deviations of all seeds say of a kind of problem."""
     ratios = np.concatenate([ask(seed) for seed in range(seeds)])
-    return Calibration(name, float(np.mean(np.abs(ratios) < 1.0)), float(np.sqrt(np.mean(ratios**2))))
+    covered, rms = float(np.mean(np.abs(ratios) < 1.0)), float(np.sqrt(np.mean(ratios**2)))
+    checks = at_least(covered=(covered, COVERAGE[0])) + at_most(covered=(covered, COVERAGE[1]))
+    return Row({"problem": name, "covered": covered, "rms": rms}, checks, "Standard deviations")
 
 
-def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray") -> "FloatArray":
+def error_ratios(found: FloatArray, truth: FloatArray, sigmas: FloatArray) -> FloatArray:
     """Return errors over standard deviations, centroid and scale of the held cameras brought together."""
     held = np.isfinite(sigmas).all(axis=1)
     centered, wanted = found - found[held].mean(axis=0), truth - truth[held].mean(axis=0)
@@ -117,41 +88,35 @@ def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray")
     return ratios
 
 
-def graph_ratios(name: str, wrong: float, seed: int) -> "FloatArray":
+def graph_ratios(name: str, wrong: float, seed: int) -> FloatArray:
     """Return errors over standard deviations of a graph's placement."""
     graph = draw_graph(name, seed, wrong)
-    return _placement_ratios(ours.place(view_graph(graph), covariance=graph.covariances), graph.locations)
+    return _placement_ratios(graph.place(), graph.locations)
 
 
-def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArray":
+def scene_ratios(shape: str, seed: int) -> FloatArray:
+    """Return errors over standard deviations of a made scene's cameras."""
+    options = {"shape": shape, "num_images": 25, "num_points": 1000, "seed": seed}
+    with temporary_scene(options) as (scene, folder):
+        found = sfm_shapefit.locate(folder / "sparse" / "0", min_trust=0.0)
+        return _placement_ratios(found.placement, scene.centers)
+
+
+def _placement_ratios(placement: Judged, truth: FloatArray) -> FloatArray:
     cameras = placement.cameras
-    sigmas = placement.assessment.sigmas[: len(cameras)]
-    return error_ratios(placement.locations, truth[cameras], sigmas)
+    return error_ratios(placement.locations, truth[cameras], placement.assessment.sigmas[: len(cameras)])
 
 
-def scene_ratios(shape: str, seed: int) -> "FloatArray":
-    """Return errors over standard deviations of a photographed scene's cameras."""
-    from sfm_shapefit.synthetic import SceneOptions, make_scene
-    from sfm_shapefit.synthetic.workspace import write_workspace
-
-    options = SceneOptions(shape=shape, num_images=25, num_points=1000, seed=seed)  # type: ignore[arg-type]
-    scene = make_scene(options)
-    with tempfile.TemporaryDirectory() as folder:
-        workspace = Path(folder) / "scene"
-        write_workspace(scene, workspace)
-        found = ours.locate(workspace / "sparse" / "0", min_trust=0.0)
-    return _placement_ratios(found.placement, scene.centers)
-
-
-def rank(name: str, seeds: int) -> Ranking:
+def rank(name: str, seeds: int) -> Row:
     """Rank the cameras of spoiled graphs by their trust."""
     found = [rank_graph(SPOILED[name](seed)) for seed in range(seeds)]
     areas = [area for area, num_bad in found if num_bad]
     area = float(np.mean(areas)) if areas else float("nan")
-    return Ranking(name, area, sum(num_bad for _, num_bad in found))
+    cells = {"problem": name, "AUC": area, "bad cameras": sum(num_bad for _, num_bad in found)}
+    return Row(cells, at_least(AUC=(area, LEAST_AUC)), "Ranking")
 
 
-def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
+def area_under_curve(trust: FloatArray, bad: BoolArray) -> float:
     """Return the probability that a bad camera is trusted less than a good one; half for equal trust."""
     low, high = trust[bad][:, None], trust[~bad][None, :]
     return float(np.mean((low < high) + 0.5 * (low == high)))
@@ -159,20 +124,15 @@ def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
 
 def rank_graph(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
-    from sfm_shapefit.base.geometry import fit_similarity_l1
-
-    placement = ours.place(view_graph(graph), covariance=graph.covariances)
-    truth = graph.locations[placement.cameras]
-    found = placement.locations
+    placement = graph.place()
+    truth, found = graph.locations[placement.cameras], placement.locations
     errors = np.linalg.norm(fit_similarity_l1(found, truth, rotate=False).apply(found) - truth, axis=1)
     bad = errors > BAD * np.median(errors)
     return area_under_curve(placement.assessment.trust, bad) if bad.any() else 0.0, int(bad.sum())
 
 
-def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
+def _measure(locations: FloatArray, edges: IntArray, wrong: BoolArray, seed: int) -> Graph:
     """Return directions with normal errors of known, varying size, and random ones where `wrong`."""
-    from sfm_shapefit.base.geometry import normalized, tangent_bases
-
     rng = np.random.default_rng(1000 + seed)
     true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
     sigmas = 0.01 * np.exp(0.5 * rng.standard_normal(len(edges)))
@@ -193,20 +153,15 @@ GRAPHS: dict[str, tuple[str, int, float]] = {
 
 def draw_graph(name: str, seed: int, wrong: float = 0.0) -> Graph:
     """Return a graph of a kind, a share of whose directions is wrong."""
-    from sfm_shapefit import synthetic
-
     function, n, density = GRAPHS[name]
     problem = getattr(synthetic, function)(n, density, q=wrong, seed=seed)
     return _measure(problem.locations, problem.edges, problem.corrupted, seed)
 
 
-def _chosen(seed: int, graph: Graph) -> "BoolArray":
+def _chosen(seed: int, graph: Graph) -> BoolArray:
     """Return a tenth of the cameras of a graph."""
-    rng = np.random.default_rng(2000 + seed)
     n = len(graph.locations)
-    chosen: BoolArray = np.zeros(n, dtype=np.bool_)
-    chosen[rng.permutation(n)[: n // 10]] = True
-    return chosen
+    return np.isin(np.arange(n), np.random.default_rng(2000 + seed).permutation(n)[: n // 10])
 
 
 def concentrate(seed: int) -> Graph:
@@ -219,8 +174,6 @@ def concentrate(seed: int) -> Graph:
 
 def turn_cameras(seed: int) -> Graph:
     """A tenth of the cameras are turned by 20 degrees, the directions of their pairs half as far."""
-    from sfm_shapefit.base.geometry import normalized
-
     graph = draw_graph("box", seed)
     axes = normalized(np.random.default_rng(3000 + seed).standard_normal(graph.locations.shape))
     turns = np.where(_chosen(seed, graph)[:, None], np.radians(20.0) * axes, 0.0)
@@ -246,109 +199,41 @@ SPOILED: dict[str, Callable[[int], Graph]] = {
 }
 
 
-def flag(folder: Path) -> Flagged:
-    """Locate the cameras of a set and compare those left out with the wrong rotations."""
-    import sfm_shapefit
-    from sfm_shapefit.files.colmap.model import read_model
+def flag(folder: Path) -> Row:
+    """Locate the cameras of a set and compare those left out with the wrong rotations.
 
-    found = ours.locate(folder / "sparse" / "0", folder / "database.db")
+    Sets whose truth gives their rotations have no limits.
+    """
+    found = sfm_shapefit.locate(folder / "sparse" / "0", folder / "database.db")
     reference = next(folder / name for name in ("gt", "truth", "sparse/0") if (folder / name).is_dir())
     cameras = found.placement.cameras
     wrong = rotation_errors_deg(found.model, read_model(reference))[cameras] > WRONG_DEG
     errors = sfm_shapefit.evaluate(found.reconstruction, reference).position
-    return Flagged(
-        name=folder.name,
-        num_cameras=len(cameras),
-        num_wrong=int(np.sum(wrong)),
-        num_caught=int(np.sum(wrong & ~found.kept)),
-        num_blamed=int(np.sum(~wrong & ~found.kept)),
-        lowest_trust=float(found.placement.assessment.trust[found.kept].min()),
-        errors=(errors.median, errors.mean),
-    )
-
-
-def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray":
-    """Return the angle of each given rotation from the truth after the best common rotation, or NaN."""
-    from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
-
-    place_of = {name: k for k, name in enumerate(truth.names)}
-    common = [k for k, name in enumerate(model.names) if name in place_of]
-    theirs = truth.rotations[[place_of[model.names[k]] for k in common]]
-    relative = model.rotations[common].transpose(0, 2, 1) @ theirs
-    errors = np.full(len(model.names), np.nan)
-    errors[common] = rotation_angles_deg(relative @ mean_rotation_l1(relative).T)
-    return errors
-
-
-def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
-    """Return the limits of one case; sets whose truth gives their rotations have none."""
-    if isinstance(one, Calibration):
-        return [
-            Check(name="covered", value=one.covered, limit=COVERAGE[0], better="higher"),
-            Check(name="covered", value=one.covered, limit=COVERAGE[1]),
-        ]
-    if isinstance(one, Ranking):
-        return [Check(name="AUC", value=one.area, limit=LEAST_AUC, better="higher")]
-    if one.name not in SETS:
-        return []
-    least = one.num_wrong - (1 if one.num_wrong else 0)
-    most = 6 if one.name == "lego100" else 0
-    return [
-        Check(name="wrong", value=one.num_caught, limit=least, better="higher"),
-        Check(name="right", value=one.num_blamed, limit=most),
-    ]
-
-
-COLUMNS: dict[type, tuple[str, dict[str, Callable[[Any], str]]]] = {
-    Calibration: (
-        "Standard deviations",
-        {
-            "problem": lambda one: one.name,
-            "covered": lambda one: number(one.covered),
-            "rms": lambda one: number(one.rms),
-        },
-    ),
-    Ranking: (
-        "Ranking",
-        {
-            "problem": lambda one: one.name,
-            "AUC": lambda one: number(one.area),
-            "bad cameras": lambda one: str(one.num_bad),
-        },
-    ),
-    Flagged: (
-        "Wrong rotations",
-        {
-            "set": lambda one: one.name,
-            "wrong rotations": lambda one: f"{one.num_wrong} of {one.num_cameras}",
-            "flagged wrong / right": lambda one: f"{one.num_caught} / {one.num_blamed}",
-            "lowest trust kept": lambda one: number(one.lowest_trust),
-            "median / mean": lambda one: numbers(one.errors),
-        },
-    ),
-}
-
-
-def tables(measured: Mapping[str, Any], _args: argparse.Namespace) -> Iterator[str]:
-    for kind, (heading, columns) in COLUMNS.items():
-        yield f"## {heading}"
-        found = [one for one in measured.values() if isinstance(one, kind)]
-        yield table_of(found, columns | {"verdict": lambda one: verdict(checks(one))})
+    num_wrong, caught = int(wrong.sum()), int(np.sum(wrong & ~found.kept))
+    blamed = int(np.sum(~wrong & ~found.kept))
+    cells = {
+        "set": folder.name,
+        "wrong rotations": f"{num_wrong} of {len(cameras)}",
+        "flagged wrong / right": [caught, blamed],
+        "lowest trust kept": float(found.placement.assessment.trust[found.kept].min()),
+        "median / mean": [errors.median, errors.mean],
+    }
+    checks = at_least(wrong=(caught, max(num_wrong - 1, 0)))
+    checks += at_most(right=(blamed, 6 if folder.name == "lego100" else 0))
+    return Row(cells, checks if folder.name in SETS else (), "Wrong rotations")
 
 
 BENCHMARK = Benchmark(
     name="trust",
     title="Trust",
     cases=cases,
-    checks=checks,
-    tables=tables,
     quick={"repeats": 1},
     repeats=5,
     threads=2,
-    quantities=(
-        Quantity("covered", "1", "neither", 0.05, "share of errors within one standard deviation"),
-        Quantity("rms", "1", "neither", 0.05, "of errors over standard deviations"),
-        Quantity("AUC", "1", "higher", 0.02, "trust against bad cameras"),
-        Quantity("flagged", "cameras", "neither", 0.0, "wrong ones / right ones left out"),
-    ),
+    columns={
+        "covered": "1; share of errors within one standard deviation",
+        "rms": "1; of errors over standard deviations",
+        "AUC": "1; trust against bad cameras",
+        "flagged": "cameras; wrong ones / right ones left out",
+    },
 )

@@ -22,43 +22,37 @@ compared with the model that gives their rotations.
 """
 
 import argparse
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness import ours
+import sfm_shapefit
 from harness.driver import ROOT, Benchmark, Case, if_there
-from harness.metrics import Check, Quantity, number, verdict
-from harness.record import table_of
+from harness.record import Row, at_least, at_most
+from harness.scenes import set_rotation, temporary_scene
+from sfm_shapefit.base.arrays import FloatArray
 
 LEAST_RMS, MOST_RMS = 0.6, 1.8
 MOST_BEYOND = 0.03
 
 
 class Scene(NamedTuple):
-    """A set, where its rotations and its truth are, and whether its limits count."""
+    """A set, with what it is located from and compared with."""
 
     folder: str
     model: str = "sparse/0"
     truth: str = "gt"
-    options: tuple[tuple[str, Any], ...] = ()
+    options: Mapping[str, Any] = {}
     judged: bool = True
+    """Not where the truth is too coarse, or no truth."""
     truth_sigma: float = 0.0
     """Standard deviation of the truth's positions along an axis, in its unit."""
 
 
-class Made(NamedTuple):
-    """Drawn scenes of one kind; `rotation_deg` is the standard deviation of their rotations' errors."""
-
-    shape: str
-    rotation_deg: float
-
-
-BUNDLE = (("bundle_adjust", True),)
+BUNDLE = {"adjust": "full"}
 # Meters.
 OF_STRECHA, OF_MOTION_CAPTURE = 0.001, 0.01 / np.sqrt(3.0)
 SETS = {
@@ -68,7 +62,7 @@ SETS = {
     },
     "lego100": Scene("lego100"),
     "lego100-exact": Scene("lego100", model="gt"),
-    "lego100-measured": Scene("lego100", model="gt", options=(("rotations", "measured"),)),
+    "lego100-measured": Scene("lego100", model="gt", options={"rotations": "held"}),
     "castle-P30, bundle-adjusted": Scene("castle-P30", options=BUNDLE, truth_sigma=OF_STRECHA),
     "Herz-Jesus-P25, bundle-adjusted": Scene("Herz-Jesus-P25", options=BUNDLE, truth_sigma=OF_STRECHA),
     "robots-1": Scene("robots-1", truth_sigma=OF_MOTION_CAPTURE),
@@ -78,168 +72,109 @@ SETS = {
 }
 BUNDLED = {name: Scene(name, truth="truth") for name in ("courtyard", "photographed")}
 MADE = {
-    f"{shape}, rotations {'exact' if sigma == 0.0 else f'off by {sigma:g} deg'}": Made(shape, sigma)
+    f"{shape}, rotations {'exact' if sigma_deg == 0.0 else f'off by {sigma_deg:g} deg'}": (shape, sigma_deg)
     for shape in ("ring", "facade", "cloud", "courtyard")
-    for sigma in (0.0, 0.05)
+    for sigma_deg in (0.0, 0.05)
 }
+"""Shapes, and the standard deviation of the errors of their rotations."""
 
 
-class Measured(NamedTuple):
-    """Errors over standard deviations of one set."""
+class Compared(NamedTuple):
+    """Errors and standard deviations of the cameras (n,) in the truth's units."""
 
-    name: str
-    judged: bool
-    num_cameras: int
-    error: float
-    """Median, in the truth's units."""
-    sigma: float
-    """Median, the same."""
-    truth_sigma: float
-    """Of the truth's positions along an axis."""
-    rms: float
-    median: float
-    beyond: float
-    """Share of the cameras beyond three standard deviations."""
+    errors: FloatArray
+    sigmas: FloatArray
     sigma_of: str
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return the sets, the bundled scenes and the made ones."""
-    found: dict[str, Case] = {}
-    if not args.quick:
-        for name, scene in SETS.items():
-            folder = args.data / scene.folder
-            found[name] = if_there(folder, partial(measure, name, scene, folder))
-    for name, scene in BUNDLED.items():
-        found[name] = partial(measure, name, scene, ROOT / "data_synthetic" / scene.folder)
-    if not args.quick:
-        found |= {name: partial(measure_made, name, made, args.repeats) for name, made in MADE.items()}
-    return found
+    bundled: dict[str, Case] = {
+        name: partial(measure, name, scene, ROOT / "data_synthetic" / scene.folder)
+        for name, scene in BUNDLED.items()
+    }
+    if args.quick:
+        return bundled
+    real = {
+        name: if_there(args.data / scene.folder, partial(measure, name, scene, args.data / scene.folder))
+        for name, scene in SETS.items()
+    }
+    return real | bundled | {name: partial(measure_made, name, args.repeats) for name in MADE}
 
 
-def measure(name: str, scene: Scene, folder: Path) -> Measured:
+def measure(name: str, scene: Scene, folder: Path) -> Row:
     """Locate a set."""
-    found = ours.locate(folder / scene.model, folder / "database.db", **dict(scene.options))
-    ratios, errors, sigmas = compare(found, folder / scene.truth, scene.truth_sigma)
-    return _summarize(name, scene, ratios, errors, sigmas, found.summary()["sigma_of"])
+    found = sfm_shapefit.locate(folder / scene.model, folder / "database.db", **scene.options)
+    return judge(name, scene, compare(found, folder / scene.truth))
 
 
-def measure_made(name: str, made: Made, seeds: int) -> Measured:
-    """Locate drawn scenes, and take all their cameras together."""
-    from sfm_shapefit.synthetic import SceneOptions, make_scene
-    from sfm_shapefit.synthetic.workspace import write_workspace
-
-    parts, sigma_of = [], ""
+def measure_made(name: str, seeds: int) -> Row:
+    """Locate made scenes, and take all their cameras together."""
+    (shape, sigma_deg), parts = MADE[name], []
     for seed in range(seeds):
-        drawn: Any = {"shape": made.shape, "num_images": 25, "num_points": 1000, "seed": seed}
-        with tempfile.TemporaryDirectory() as folder:
-            workspace = Path(folder) / "scene"
-            write_workspace(make_scene(SceneOptions(**drawn)), workspace)
-            model = workspace / "sparse" / "0"
-            start = turn_rotations(model, made.rotation_deg, seed)
-            found = ours.locate(start, workspace / "database.db")
-            parts.append(compare(found, model))
-            sigma_of = found.summary()["sigma_of"]
-    return _summarize(name, Scene(""), *(np.concatenate(part) for part in zip(*parts, strict=True)), sigma_of)
+        options = {"shape": shape, "num_images": 25, "num_points": 1000, "seed": seed}
+        with temporary_scene(options) as (_, folder):
+            start = turn_rotations(folder / "sparse" / "0", sigma_deg, seed)
+            found = sfm_shapefit.locate(start, folder / "database.db")
+            parts.append(compare(found, folder / "sparse" / "0"))
+    errors, sigmas, (sigma_of, *_) = zip(*parts, strict=True)
+    return judge(name, Scene(""), Compared(np.concatenate(errors), np.concatenate(sigmas), sigma_of))
 
 
 def turn_rotations(model: Path, sigma_deg: float, seed: int) -> Any:
     """Return a model whose rotations are off, its centers where they were."""
     import pycolmap
 
-    from sfm_shapefit.base.arrays import FloatArray
-
     reconstruction = pycolmap.Reconstruction(model)
     rng = np.random.default_rng(4000 + seed)
     for frame_id in reconstruction.reg_frame_ids():
         frame = reconstruction.frame(frame_id)
-        pose = frame.rig_from_world
-        center: FloatArray = -(pose.rotation.inverse() * pose.translation)
-        turn = pycolmap.Rotation3d(np.radians(sigma_deg) * rng.standard_normal(3)) * pose.rotation
-        frame.rig_from_world = pycolmap.Rigid3d(turn, -(turn * center))
+        turn = pycolmap.Rotation3d(np.radians(sigma_deg) * rng.standard_normal(3))
+        set_rotation(frame, turn * frame.rig_from_world.rotation)
     return reconstruction
 
 
-def compare(found: Any, truth: Path, truth_sigma: float = 0.0) -> tuple[Any, Any, Any]:
-    """Return errors over standard deviations, errors and standard deviations in the truth's units.
-
-    The errors are over the standard deviations of a camera and of its truth together.
-    """
-    import sfm_shapefit
-
+def compare(found: Any, truth: Path) -> Compared:
+    """Return errors and standard deviations of the cameras that have one."""
     evaluation = sfm_shapefit.evaluate(found.reconstruction, truth)
     rows = {row.name: row for row in found.cameras}
     sizes = np.array([float(np.linalg.norm(rows[name].sigma or np.nan)) for name in evaluation.names])
     sigmas = evaluation.ref_from_model.scale * sizes
-    errors = evaluation.position_errors
     known = np.isfinite(sigmas) & (sigmas > 0.0)
-    errors, sigmas = errors[known], sigmas[known]
-    return errors / np.sqrt(sigmas**2 + 3.0 * truth_sigma**2), errors, sigmas
+    return Compared(evaluation.position_errors[known], sigmas[known], found.summary()["sigma_of"])
 
 
-def _summarize(name: str, scene: Scene, ratios: Any, errors: Any, sigmas: Any, sigma_of: str) -> Measured:
-    return Measured(
-        name=name,
-        judged=scene.judged,
-        num_cameras=len(ratios),
-        error=float(np.median(errors)),
-        sigma=float(np.median(sigmas)),
-        truth_sigma=float(scene.truth_sigma),
-        rms=float(np.sqrt(np.mean(ratios**2))),
-        median=float(np.median(ratios)),
-        beyond=float(np.mean(ratios > 3.0)),
-        sigma_of=sigma_of,
-    )
-
-
-def checks(one: Measured) -> list[Check]:
-    """Return the limits of one set; those whose truth is too coarse, or no truth, have none."""
-    if not one.judged:
-        return []
-    return [
-        Check(name="rms", value=one.rms, limit=LEAST_RMS, better="higher"),
-        Check(name="rms", value=one.rms, limit=MOST_RMS),
-        Check(name="beyond 3", value=one.beyond, limit=MOST_BEYOND),
-    ]
-
-
-def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
-    yield (
-        f"To reach: rms {LEAST_RMS} to {MOST_RMS}, at most {MOST_BEYOND:.0%} of the cameras beyond three"
-        " standard deviations. On small sets one camera is more than that."
-    )
-    yield table_of(
-        list(measured.values()),
-        {
-            "set": lambda one: one.name,
-            "cameras": lambda one: str(one.num_cameras),
-            "median error": lambda one: number(one.error),
-            "median sigma": lambda one: number(one.sigma),
-            "of the truth": lambda one: number(one.truth_sigma) if one.truth_sigma else "-",
-            "rms": lambda one: f"{one.rms:.2f}",
-            "median ratio": lambda one: f"{one.median:.2f}",
-            "beyond 3": lambda one: f"{one.beyond:.1%}",
-            "knows of": lambda one: one.sigma_of.split(";")[0],
-            "verdict": lambda one: verdict(checks(one)),
-        },
-    )
+def judge(name: str, scene: Scene, found: Compared) -> Row:
+    """Return the row of a set, errors over the standard deviations of a camera and of its truth together."""
+    ratios = found.errors / np.sqrt(found.sigmas**2 + 3.0 * scene.truth_sigma**2)
+    rms, beyond = float(np.sqrt(np.mean(ratios**2))), float(np.mean(ratios > 3.0))
+    cells = {
+        "set": name,
+        "cameras": len(ratios),
+        "median error": float(np.median(found.errors)),
+        "median sigma": float(np.median(found.sigmas)),
+        "of the truth": scene.truth_sigma or None,
+        "rms": f"{rms:.2f}",
+        "median ratio": f"{np.median(ratios):.2f}",
+        "beyond 3": f"{beyond:.1%}",
+        "knows of": found.sigma_of.split(";")[0],
+    }
+    checks = at_least(rms=(rms, LEAST_RMS)) + at_most(rms=(rms, MOST_RMS), beyond_3=(beyond, MOST_BEYOND))
+    return Row(cells, checks if scene.judged else ())
 
 
 BENCHMARK = Benchmark(
     name="uncertainty",
     title="Standard deviations of the cameras",
     cases=cases,
-    checks=checks,
-    tables=tables,
     quick={"repeats": 1},
     repeats=5,
-    quantities=(
-        Quantity("rms", "1", "neither", 0.1, "root of the mean square of errors over standard deviations"),
-        Quantity("median ratio", "1", "neither", 0.1, "of the same; 0.89 for normal errors"),
-        Quantity("beyond 3", "%", "lower", 0.0, "cameras farther off than three standard deviations"),
-        Quantity(
-            "of the truth", "truth's", "lower", 0.0, "standard deviation of its positions along an axis"
-        ),
-        Quantity("median error, median sigma", "truth's", "lower", 0.05, "of the cameras"),
-    ),
+    notes={"": "On small sets one camera is more than the share that may be beyond 3."},
+    columns={
+        "rms": "1; root of the mean square of errors over standard deviations",
+        "median ratio": "1; of the same; 0.89 for normal errors",
+        "beyond 3": "%; cameras farther off than three standard deviations",
+        "of the truth": "truth's; standard deviation of its positions along an axis",
+        "median error, median sigma": "truth's; of the cameras",
+    },
 )

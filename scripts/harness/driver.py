@@ -1,6 +1,6 @@
 """The driver of all benchmarks: it measures cases in fresh processes and writes a section of the results.
 
-A benchmark states its cases, how a case is judged and how its tables look. All of them understand
+A benchmark states its cases, each of which gives rows of tables, and what its columns mean. All understand
 
     --only NAME ...   the cases whose names begin so
     --quick           a small version, which takes seconds and says nothing of speed
@@ -22,9 +22,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from harness.metrics import Check, Quantity, count_met
 from harness.process import call, thread_environment
-from harness.record import environment, legend, versions
+from harness.record import Row, count_met, environment, table, tables_of, versions
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -32,23 +31,24 @@ DATA = ROOT.parent / "shared" / "data"
 RESULTS = ROOT / "scripts" / "results"
 NOT_FOUND = "its data is not found; give their folder with --data"
 
-Case = Callable[[], Any] | str
+Case = Callable[[], Row | Sequence[Row]] | str
 """A function to be called in a fresh process, or the reason why the case is skipped."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Benchmark:
-    """What is measured, how it is judged, and how it is shown."""
+    """What is measured and how it is shown."""
 
     name: str
     title: str
     cases: Callable[[argparse.Namespace], Mapping[str, Case]]
     """By name; a case can be pickled, such as a `partial` of a function of a module."""
-    tables: Callable[[Mapping[str, Any], argparse.Namespace], Iterable[str]]
-    """The parts of the section, of what all cases gave."""
-    quantities: Sequence[Quantity]
-    checks: Callable[[Any], Sequence[Check]] = lambda _found: ()
-    """The limits of what one case gave; none where tables only compare."""
+    columns: Mapping[str, str]
+    """The unit of each column, and what it means."""
+    notes: Mapping[str, str] = field(default_factory=dict)
+    """Text before a table, by its heading."""
+    closing: Callable[[Sequence[Row]], Iterable[str]] = lambda _rows: ()
+    """Further parts of the section, of all rows."""
     packages: Sequence[str] = ("numpy", "scipy", "numba", "pycolmap")
     flags: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
     """Declares further arguments."""
@@ -76,36 +76,30 @@ class Benchmark:
         if args.quick:
             vars(args).update(self.quick)
         about = environment(self.packages, self.command_line(args))
-        cases = choose(self.cases(args), args.only)
-        measured, reasons, loads = self._measure(cases, args)
+        rows, reasons, loads = self._measure(choose(self.cases(args), args.only), args)
         for name, reason in reasons.items():
             print(f"{name}: {reason}", file=sys.stderr)
-        if not measured:
+        if not rows:
             return 0
         about += f"- Load average (1 min) while measuring: {min(loads):.1f} to {max(loads):.1f}\n"
-        body = self.section(measured, args, about, reasons)
+        body = self.section(rows, about, reasons)
         print(body)
         if args.out is not None or not args.quick:
             replace_file(args.out or RESULTS / f"{self.name}.md", body.encode())
         return 0
 
-    def section(
-        self,
-        measured: Mapping[str, Any],
-        args: argparse.Namespace,
-        about: str = "",
-        reasons: Mapping[str, str] | None = None,
-    ) -> str:
+    def section(self, rows: Sequence[Row], about: str = "", reasons: Mapping[str, str] | None = None) -> str:
         """Return the section of what was measured, and of what was not and why."""
         missing = "; ".join(f"{name}: {reason}" for name, reason in (reasons or {}).items())
         parts = [
             f"# {self.title}",
             about,
-            count_met([check for found in measured.values() for check in self.checks(found)]),
-            *self.tables(measured, args),
+            count_met([check for row in rows for check in row.checks]),
+            *tables_of(rows, self.notes),
+            *self.closing(rows),
             f"Not measured: {missing}." if missing else "",
             "## What the columns mean",
-            legend(self.quantities),
+            table(["column", "unit and meaning"], self.columns.items()),
         ]
         return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
@@ -124,9 +118,9 @@ class Benchmark:
 
     def _measure(
         self, cases: Mapping[str, Case], args: argparse.Namespace
-    ) -> tuple[dict[str, Any], dict[str, str], list[float]]:
-        """Return what the cases gave, why others gave nothing, and the loads of the machine."""
-        measured, reasons, loads = {}, {}, [os.getloadavg()[0]]
+    ) -> tuple[list[Row], dict[str, str], list[float]]:
+        """Return the rows of the cases, why others gave none, and the loads of the machine."""
+        rows, reasons, loads = list[Row](), dict[str, str](), [os.getloadavg()[0]]
         variables = thread_environment(args.threads)
         kept = Kept(args.cache, {"command": self.command_line(args), "versions": versions(self.packages)})
         for name, case in cases.items():
@@ -134,13 +128,13 @@ class Benchmark:
                 reasons[name] = case
                 continue
             print(f"measuring {name}", file=sys.stderr, flush=True)
-            ask = partial(call, case, environment=variables, timeout_s=self.timeout_s)
             try:
-                measured[name] = kept.get(name, ask)
+                found = kept.get(name, partial(call, case, environment=variables, timeout_s=self.timeout_s))
+                rows += [found] if isinstance(found, Row) else found
             except (RuntimeError, TimeoutError) as error:
                 reasons[name] = f"failed: {error}"
             loads.append(os.getloadavg()[0])
-        return measured, reasons, loads
+        return rows, reasons, loads
 
 
 class Kept:
@@ -175,6 +169,11 @@ class Kept:
 def if_there(folder: Path, case: Case) -> Case:
     """Return a case if its data is there, or the reason why it is skipped."""
     return case if folder.exists() else NOT_FOUND
+
+
+def on_sets(data: Path, names: Iterable[str], measure: Callable[..., Any], *args: Any) -> dict[str, Case]:
+    """Return a case for each real set, `measure(folder, *args)`."""
+    return {name: if_there(data / name, partial(measure, data / name, *args)) for name in names}
 
 
 def choose(cases: Mapping[str, Case], beginnings: Sequence[str]) -> dict[str, Case]:

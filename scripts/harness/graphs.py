@@ -1,14 +1,21 @@
 """Bare graphs of known truth: families by name, and the paper's error."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from sfm_shapefit.base.arrays import FloatArray
-    from sfm_shapefit.graph.viewgraph import ViewGraph
-    from sfm_shapefit.synthetic import GraphProblem
+import numpy as np
+
+from sfm_shapefit import synthetic
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.synthetic.graphs import GraphProblem
 
 SEED = 1
+_FAMILIES = {"geo": "box", "comm": "community", "er": "expander", "ring": "ring", "lawn": "lawn"} | {
+    "seq": "trajectory",
+    "seqv": "trajectory",
+    "corr": "corridor",
+}
+"""Functions of `sfm_shapefit.synthetic`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,8 +23,7 @@ class GraphSpec:
     """A random graph problem that can be drawn again anywhere."""
 
     family: str
-    """er2 is G(n, 1/2), the paper's; the others are those of `sfm_shapefit.synthetic`; seqv is seq with
-    a speed that varies by a factor of 4."""
+    """er2 is G(n, 1/2), the paper's; seqv is seq with a speed that varies by a factor of 4."""
     n: int
     degree: float = 0.0
     """Mean degree asked for; not used by er2."""
@@ -28,48 +34,28 @@ class GraphSpec:
         return f"{self.family} {self.n}, sigma {self.sigma:g}"
 
 
-def draw(spec: GraphSpec, **changes: Any) -> "GraphProblem":
+def draw(spec: GraphSpec, **changes: Any) -> GraphProblem:
     """Return the problem, always the same one; `changes` are further arguments of the family."""
-    from sfm_shapefit import synthetic
-
     noise: dict[str, Any] = {"sigma": spec.sigma, "q": spec.q, "seed": SEED} | changes
     if spec.family == "er2":
         return synthetic.random_graph_problem(spec.n, 0.5, **noise)
     if spec.family == "seqv":
-        return synthetic.trajectory_graph_problem(spec.n, spec.degree, speed_ratio=4.0, **noise)
-    families = {
-        "geo": synthetic.box_graph_problem,
-        "comm": synthetic.community_graph_problem,
-        "er": synthetic.expander_graph_problem,
-        "seq": synthetic.trajectory_graph_problem,
-        "ring": synthetic.ring_graph_problem,
-        "lawn": synthetic.lawn_graph_problem,
-        "corr": synthetic.corridor_graph_problem,
-    }
-    return families[spec.family](spec.n, spec.degree, **noise)
+        noise |= {"speed_ratio": 4.0}
+    make = getattr(synthetic, f"{_FAMILIES[spec.family]}_graph_problem")
+    problem: GraphProblem = make(spec.n, spec.degree, **noise)
+    return problem
 
 
-def view_graph(problem: "GraphProblem") -> "ViewGraph":
-    """Return the measurements of a problem."""
-    from sfm_shapefit import ViewGraph
-
-    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
-
-
-def relative_error(locations: "FloatArray", truth: "FloatArray") -> float:
+def relative_error(locations: FloatArray, truth: FloatArray) -> float:
     """Return the paper's error: the distance of the two sets, each centered and scaled to unit norm.
 
     Source: Hand, Lee, Voroninski (2015), section 4.
     """
-    import numpy as np
-
     return float(np.linalg.norm(to_unit_norm(locations) - to_unit_norm(truth)))
 
 
-def to_unit_norm(locations: "FloatArray") -> "FloatArray":
+def to_unit_norm(locations: FloatArray) -> FloatArray:
     """Return locations (n, d) about their centroid, scaled to a norm of 1."""
-    import numpy as np
-
     centered = locations - locations.mean(axis=0)
     unit: FloatArray = centered / np.linalg.norm(centered)
     return unit

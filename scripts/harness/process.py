@@ -9,11 +9,13 @@ import multiprocessing
 import os
 import resource
 import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 THREAD_VARIABLES = (
@@ -23,6 +25,41 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "RAYON_NUM_THREADS",
 )
+
+
+class Timed(NamedTuple):
+    """An answer and what it took."""
+
+    found: Any
+    wall_s: float
+    cpu_s: float
+
+
+def time_call(function: Callable[[], Any]) -> Timed:
+    """Call a function once."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = function()
+    return Timed(found, time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def children_cpu_s() -> float:
+    """Return the CPU seconds of all processes that were started here and ended, and of theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def run_command(*words: object) -> str:
+    """Run a command of sfm-shapefit and return what it printed.
+
+    Raises:
+        RuntimeError: if it fails, with its last lines.
+    """
+    command = [sys.executable, "-m", "sfm_shapefit", *map(str, words)]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
+    if done.returncode:
+        raise RuntimeError(f"{words[0]} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
+    return done.stdout
 
 
 def thread_environment(threads: int) -> dict[str, str]:

@@ -1,172 +1,112 @@
-"""Bundle adjustment from a seed: our own (`adjustment_run`), or pycolmap's Ceres (`ceres_adjustment`)."""
+"""Bundle adjustment of images: from a seed by all points, on few tracks, or after a placement."""
 
-import math
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 
-import pycolmap
-
 from sfm_shapefit.adjustment import AdjustmentOptions
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement, RefinedLenses, Uncertainty
-from sfm_shapefit.adjustment.ceres_adjustment import adjust_by_ceres
-from sfm_shapefit.adjustment.filter import filter_points
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES, AdjustmentRun, GivenPoses
-from sfm_shapefit.adjustment.sources import TrackSource, read_bundle
-from sfm_shapefit.adjustment.structure import triangulate
-from sfm_shapefit.adjustment.views import read_frames, rotations_of_frames
-from sfm_shapefit.tracks.options import Adjuster, StructureOptions
-
-# Of the last round of Ceres, by which its answer is judged.
-_CERES_LOSS_PX = 1.0
+from sfm_shapefit.adjustment.sources import Links
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.options import StructureOptions
 
 
 def bundle_adjust(
-    seed: pycolmap.Reconstruction,
-    tracks: TrackSource,
+    images: Images,
+    links: Links,
     structure_options: StructureOptions | None = None,
-    *,
-    adjuster: Adjuster = "own",
-    fixed_frames: Collection[int] = (),
     given: GivenPoses | None = None,
-) -> Adjusted:
-    """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
+) -> tuple[Estimate, Points]:
+    """Adjust poses and points together, starting from the poses of `images`, all of them posed.
 
     Args:
-        seed: the placed images; any points are ignored, for `tracks` are triangulated at its poses.
-        tracks: as in `triangulate`.
+        images: the start.
+        links: of these images; points are triangulated from them.
         structure_options: filters; the defaults if None.
-        adjuster: our own, or pycolmap's.
-        fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: what is known of poses, and how it is treated; nothing if None, and with Ceres. Lenses that may
-            change are free with both.
+        given: what is known of poses and lenses, and how it is treated; nothing if None.
 
     Returns:
-        The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
-        frames, rigs and known centers do not hold stays near the seed's: by our own, the centers' best
-        similarity to the seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs
-        stay what they are, and intrinsics that are not free to the bit.
-
-    Raises:
-        UnsolvableError: if no point can be triangulated, or Ceres diverges.
-    """
-    structure_options, given = structure_options or StructureOptions(), given or GivenPoses()
-    if adjuster == "ceres":
-        start = triangulate(seed, tracks, structure_options)
-        initial_error_px = start.compute_mean_reprojection_error()
-        unfiltered, iterations, converged = adjust_by_ceres(
-            start, tracks, structure_options, fixed_frames, given.lenses, free_rigs=given.free_rigs
-        )
-        uncertainty, sensors = Uncertainty(), _judge_sensors_of_ceres(unfiltered, fixed_frames, given)
-        refined = RefinedLenses(dict.fromkeys(given.lenses.with_free_focal(), math.nan), (), given.lenses)
-    else:
-        run = AdjustmentRun(seed, tracks, structure_options, fixed_frames, given)
-        run.weight = given.weight_of(run.frames.frame_ids)
-        if given.model is not None:
-            run.given_rotations = rotations_of_frames(given.model, run.frames.frame_ids)
-        unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
-        iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
-        refined, sensors = run.refined, run.judge_sensors(last)
-    answer = filter_points(unfiltered, structure_options)
-    return Adjusted(
-        reconstruction=answer,
-        initial_error_px=initial_error_px,
-        final_error_px=answer.compute_mean_reprojection_error(),
-        converged=converged,
-        iterations=iterations,
-        uncertainty=uncertainty,
-        lenses=refined,
-        sensors=sensors,
-    )
-
-
-def _judge_sensors_of_ceres(
-    adjusted: pycolmap.Reconstruction, fixed_frames: Collection[int], given: GivenPoses
-) -> Mapping[int, SensorSigma]:
-    """Return how well the free sensors of a model that Ceres has adjusted are known."""
-    frames = read_frames(adjusted, fixed_frames, free_rigs=given.free_rigs)
-    if not frames.free_sensors:
-        return NO_SENSORS
-    options = AdjustmentOptions(loss_scale_px=_CERES_LOSS_PX)
-    return judge_sensors(frames, read_bundle(adjusted, frames)[1], options)
-
-
-def adjust_thinly(
-    seed: pycolmap.Reconstruction,
-    read_tracks: Callable[[], TrackSource],
-    structure_options: StructureOptions | None = None,
-    *,
-    fixed_frames: Collection[int] = (),
-    given: GivenPoses | None = None,
-    thorough: bool = False,
-) -> AdjustedPlacement:
-    """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
-
-    Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as
-    long rings are. A ring of 300 images ends 0.0020 off after the first solve, 0.0012 after the second.
-
-    Args:
-        seed: the placed images, which is not changed; any points are ignored.
-        read_tracks: returns what `triangulate` takes. Nobody else holds them, so that matches are given back
-            before the last solve, which takes most memory.
-        structure_options: filters; the defaults if None. Observations may miss by four times their limit.
-        fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: lenses and rigs that change with the poses; nothing else of it counts. A lens whose focal
-            length the points leave open gets what was given back, and the poses are adjusted again.
-        thorough: whether all points follow where a lens or a rig has changed: a shape bends with a focal
-            length that few points leave a thousandth off. Up to 2,000 frames.
-
-    Returns:
-        The adjusted poses, all rotations free; their gauge is as from `bundle_adjust`.
+        The images where they stand now, and the points, not filtered yet. The gauge stays that of the start
+        where fixed frames, rigs and known centers leave it open: the best similarity of the centers to the
+        start's is the identity. Sensors and intrinsics that are not free stay what they are to the bit.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
     given = given or GivenPoses()
-    freed = GivenPoses(lenses=given.lenses, free_rigs=given.free_rigs)
-    run = AdjustmentRun(seed, read_tracks(), structure_options or StructureOptions(), fixed_frames, freed)
-    adjusted = run.repeat_with_known_lenses(partial(run.adjust_twice_thinly, is_last=True))
-    if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
-        _, _, adjusted = run.adjust_by_all_points()
-    return AdjustedPlacement(
-        reconstruction=run.posed(seed),
-        weight=run.weight,
-        frame_ids=run.frames.frame_ids,
-        errors=None,
-        uncertainty=run.uncertainty(adjusted),
-        lenses=run.refined,
-        sensors=run.judge_sensors(adjusted) if thorough else NO_SENSORS,
-    )
+    run = AdjustmentRun(images, links, structure_options or StructureOptions(), given)
+    run.weight = given.weight
+    if given.rotations is not None:
+        run.given_rotations = given.rotations
+    points, initial_error_px, last = run.adjust_all()
+    return run.estimate(last, initial_error_px=initial_error_px), points
 
 
-def adjust_placement(
-    seed: pycolmap.Reconstruction,
-    tracks: TrackSource,
-    structure_options: StructureOptions,
-    weight: RotationWeight | None,
-    *,
-    fixed_frames: Collection[int] = (),
+def adjust_thinly(
+    images: Images,
+    read_links: Callable[[], Links],
+    structure_options: StructureOptions | None = None,
     given: GivenPoses | None = None,
-) -> AdjustedPlacement:
-    """Adjust placed cameras whose rotations were given, on all tracks at once.
+    *,
+    thorough: bool = False,
+) -> Estimate:
+    """Adjust the poses of images on few tracks that hold every camera; for poses that may be coarse.
+
+    Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as
+    long rings are. A ring of 300 images ends 0.0020 off after the first solve, 0.0012 after the second.
 
     Args:
-        seed: the placed images, which is not changed; any points are ignored.
-        tracks: as in `triangulate`.
-        structure_options: filters.
-        weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
-        fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: centers measured otherwise, which pull at the frames, and lenses that may change.
+        images: the start, all of them posed.
+        read_links: returns the links of these images. Nobody else holds them, so that matches are given back
+            before the last solve, which takes most memory.
+        structure_options: filters; the defaults if None. Observations may miss by four times their limit.
+        given: fixed frames, lenses and rigs that change with the poses; nothing else of it counts. A lens
+            whose focal length the points leave open gets what was given back, and the poses are adjusted
+            again.
+        thorough: whether all points follow where a lens or a rig has changed: a shape bends with a focal
+            length that few points leave a thousandth off. Up to 2,000 frames.
+
+    Returns:
+        All rotations are free; the gauge is as from `bundle_adjust`.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run, errors = AdjustmentRun(seed, tracks, structure_options, fixed_frames, given or GivenPoses()), None
+    given = given or GivenPoses()
+    freed = GivenPoses(fixed=given.fixed, lenses=given.lenses, free_rigs=given.free_rigs)
+    run = AdjustmentRun(images, read_links(), structure_options or StructureOptions(), freed)
+    adjusted = run.repeat_with_known_lenses(partial(run.adjust_twice_thinly, is_last=True))
+    if thorough and run.frees_more_than_poses() and adjusted.num_frames <= MOST_FRAMES:
+        _, _, adjusted = run.adjust_by_all_points()
+    return run.estimate(adjusted, with_sensors=thorough)
+
+
+def adjust_placement(
+    images: Images,
+    links: Links,
+    structure_options: StructureOptions,
+    weight: RotationWeight | None,
+    given: GivenPoses | None = None,
+) -> Estimate:
+    """Adjust placed images whose rotations were given, on all tracks at once.
+
+    Args:
+        images: the start, all of them posed.
+        links: of these images.
+        structure_options: filters.
+        weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
+        given: fixed frames, centers measured otherwise, which pull at the frames, and lenses and rigs that
+            may change.
+
+    Raises:
+        UnsolvableError: if no point can be triangulated.
+    """
+    run, errors = AdjustmentRun(images, links, structure_options, given or GivenPoses()), None
     if run.frees_more_than_poses():  # points are found, and rotations judged, with what comes out
         run.repeat_with_known_lenses(run.adjust_twice_thinly)
-        run.frames = replace(run.frames, rotations=run.start.rotations)
+        run.images = run.images.posed(images.frames.rotations, run.images.frames.centers)
     _, _, problem = run.problem_of_all(checked=True)
     if weight is None:
         # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
@@ -179,12 +119,4 @@ def adjust_placement(
     # A frame whose rotation was far off has had few of its tracks; where it stands now it has more, then all.
     for fall in (FIRST_FALL, LAST_FALL) if is_repeated else ():
         adjusted = run.adjust_placed(run.problem_of_all(checked=True)[2], fall)
-    return AdjustedPlacement(
-        reconstruction=run.posed(seed),
-        weight=weight,
-        frame_ids=run.frames.frame_ids,
-        errors=errors,
-        uncertainty=run.uncertainty(adjusted),
-        lenses=run.refined,
-        sensors=run.judge_sensors(adjusted),
-    )
+    return run.estimate(adjusted, errors=errors)

@@ -1,7 +1,7 @@
 """Sensors that may move in their rigs: how well the observations tell where they are."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem
 from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.adjustment.views import PosedFrames
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 
@@ -19,7 +18,7 @@ _SHARED_NOISE = 7.0
 _LARGEST_TURN_RAD = math.radians(1.0)
 _OPEN_SENSOR = (
     "the matches do not tell where {camera} is in its rig: its images see too little that others see too, or "
-    "the rig never turns; leave out refine_rigs, or give more frames"
+    "the rig never turns; leave out rigs=free, or give more frames"
 )
 
 
@@ -37,9 +36,14 @@ NO_SENSORS: Mapping[int, SensorSigma] = MappingProxyType({})
 
 
 def judge_sensors(
-    frames: PosedFrames, adjusted: AdjustmentProblem, options: AdjustmentOptions
+    camera_ids: Sequence[int], adjusted: AdjustmentProblem, options: AdjustmentOptions
 ) -> Mapping[int, SensorSigma]:
     """Return how well the free sensors of a problem at its minimum are known, by the ids of their cameras.
+
+    Args:
+        camera_ids: (s,) those of the free sensors.
+        adjusted: the problem.
+        options: by which the minimum is one.
 
     Raises:
         InputError: if the observations leave the pose of a sensor open.
@@ -53,6 +57,6 @@ def judge_sensors(
     limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
     off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
     if off.max() > 1.0:
-        raise InputError(_OPEN_SENSOR.format(camera=f"camera {frames.free_sensors[int(np.argmax(off))]}"))
-    largest = zip(frames.free_sensors, sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1), strict=True)
+        raise InputError(_OPEN_SENSOR.format(camera=f"camera {camera_ids[int(np.argmax(off))]}"))
+    largest = zip(camera_ids, sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1), strict=True)
     return {camera_id: SensorSigma(float(place), float(turn)) for camera_id, place, turn in largest}

@@ -75,6 +75,25 @@ class RotationWeight(NamedTuple):
     open_sigmas_rad: FloatArray | None = None
     """(n,) of frames that pull as if they were held: by what they may be wrong. None: of none."""
 
+    def of(self, frames: IntArray) -> "RotationWeight":
+        """Return the weight of some of the frames."""
+        sigmas, left_open = self.frame_sigmas_rad, self.open_sigmas_rad
+        return self._replace(
+            frame_sigmas_rad=None if sigmas is None else sigmas[frames],
+            open_sigmas_rad=None if left_open is None else left_open[frames],
+        )
+
+    def among(self, frames: IntArray, count: int) -> "RotationWeight":
+        """Return the weight of so many frames, of which it has some; the others have the usual one."""
+        sigmas, left_open = self.frame_sigmas_rad, self.open_sigmas_rad
+        if sigmas is None:
+            return self
+        of_all, of_open = np.full(count, self.sigma_rad or 0.0), np.zeros(count)
+        of_all[frames] = sigmas
+        if left_open is not None:
+            of_open[frames] = left_open
+        return self._replace(frame_sigmas_rad=of_all, open_sigmas_rad=None if left_open is None else of_open)
+
     def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
         """Return the problem with the pull of the given rotations (n, 3, 3)."""
         if self.hold or self.sigma_rad is None:

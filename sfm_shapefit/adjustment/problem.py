@@ -136,6 +136,8 @@ class AdjustmentProblem:
         for name in ("cameras_seeing", "points_seen"):
             self._take(name, np.int64, (len(self.pixels),))
         _check_rotations(self.rotations, "rotation")
+        for lens in self.lenses:
+            lens.refuse_impossible()
         _check_range(self.points_seen, self.num_points, "point")
         _check_range(self.lens_of_camera, len(self.lenses), "lens")
         self._check_rig()

@@ -27,12 +27,11 @@ One thread does all, as the answer must not depend on their number.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 
 from sfm_shapefit.adjustment import (
     AdjustmentOptions,
@@ -42,17 +41,18 @@ from sfm_shapefit.adjustment import (
     frames_not_gained,
     reprojection_errors_px,
 )
-from sfm_shapefit.adjustment.adjusted import RefinedLenses, Uncertainty
-from sfm_shapefit.adjustment.ceres_adjustment import refuse_without_points
+from sfm_shapefit.adjustment.estimate import Estimate, RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
 from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
-from sfm_shapefit.adjustment.given_rotations import RotationWeight
-from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
-from sfm_shapefit.adjustment.sources import TrackSource, collect_tracks, with_rays_of
-from sfm_shapefit.adjustment.views import add_points, read_frames, set_poses
+from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight
+from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
+from sfm_shapefit.adjustment.sources import Links, with_rays_of
+from sfm_shapefit.adjustment.views import Bounds, observations, views_of
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.files.colmap.seed import copy_without_points
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
@@ -87,71 +87,79 @@ _FREE = RotationWeight()
 
 
 class GivenPoses(NamedTuple):
-    """What is known of poses and lenses beside the pixels, and how an adjustment treats it."""
+    """What is known of poses and lenses of images beside the pixels, and how an adjustment treats it."""
 
     weight: RotationWeight = _FREE
-    """Of the model's rotations."""
-    weight_frames: Sequence[int] = ()
-    """Ids of the frames that its standard deviations are of, if each has one."""
-    model: pycolmap.Reconstruction | None = None
-    """Whose rotations were given; None: those of the seed."""
+    """Of the given rotations."""
+    rotations: FloatArray | None = None
+    """(f, 3, 3) those that were given; None: those of the images."""
+    fixed: BoolArray | None = None
+    """(f,) frames whose poses stay what they are to the last bit; none if None."""
     centers: KnownPositions | None = None
-    """Measured otherwise, by the ids of frames, which they pull at."""
+    """Measured otherwise, of frames, which they pull at."""
     lenses: FreeLenses = ALL_HELD
     """Those that may change; all others stay what they are, to the bit."""
     free_rigs: bool = False
     """Whether the sensors of rigs may move in them."""
 
-    def weight_of(self, frame_ids: Sequence[int]) -> RotationWeight:
-        """Return the weight with the standard deviations of the given frames; new ones have the usual one."""
-        sigmas, usual = self.weight.frame_sigmas_rad, self.weight.sigma_rad or 0.0
-        if sigmas is None:
-            return self.weight
-        known = dict(zip(self.weight_frames, sigmas.tolist(), strict=True))
-        of_frames, left_open = np.array([known.get(i, usual) for i in frame_ids]), self.weight.open_sigmas_rad
-        if left_open is not None:
-            known = dict(zip(self.weight_frames, left_open.tolist(), strict=True))
-            left_open = np.array([known.get(i, 0.0) for i in frame_ids])
-        return self.weight._replace(frame_sigmas_rad=of_frames, open_sigmas_rad=left_open)
+    def of(self, frames: IntArray) -> "GivenPoses":
+        """Return what is known of some frames, ascending."""
+        return self._replace(
+            weight=self.weight.of(frames),
+            rotations=None if self.rotations is None else self.rotations[frames],
+            fixed=None if self.fixed is None else self.fixed[frames],
+            centers=None if self.centers is None else self.centers.among(frames),
+        )
+
+    def bounds(self, images: Images) -> Bounds:
+        """Return what holds and what moves in a problem of the images."""
+        none = np.zeros(len(images.frames.ids), np.bool_)
+        return Bounds(
+            fixed=none if self.fixed is None else self.fixed,
+            centers=self.centers,
+            free_sensors=~images.sensors.is_reference if self.free_rigs else None,
+        )
 
 
 class AdjustmentRun:
-    """The frames and tracks of one adjustment; each solve moves the frames on.
+    """The images and tracks of one adjustment; each solve moves the images on.
 
-    A solve moves `frames`, gives the tracks of `source` the rays of lenses that changed with them, and counts
+    A solve moves `images`, gives the tracks of `source` the rays of lenses that changed with them, and counts
     `iterations`. `loss_scale_px` is that of the last one. `lenses` are those still free, and `refined` says
     how well they are known. Whoever adjusts sets `weight`, and the `given_rotations` that it is of, before.
     """
 
-    def __init__(
-        self,
-        seed: pycolmap.Reconstruction,
-        tracks: TrackSource,
-        options: StructureOptions,
-        fixed_frames: Collection[int],
-        given: GivenPoses,
-    ) -> None:
+    def __init__(self, images: Images, links: Links, options: StructureOptions, given: GivenPoses) -> None:
         self.lenses, self.refined = given.lenses, RefinedLenses({}, (), given.lenses)
-        self.start = self.frames = read_frames(seed, fixed_frames, given.centers, free_rigs=given.free_rigs)
-        self.weight, self.given_rotations = _FREE, self.start.rotations
-        self.source: ObservedTracks | MatchedKeypoints
-        if isinstance(tracks, MatchedKeypoints):
-            self.source, fewest = tracks, options.fewest_views(len(self.frames.image_ids))
-        else:
-            self.source, fewest = collect_tracks(self.frames, seed, tracks), 2
+        self.start = self.images = images
+        self.views, self.bounds = views_of(images), given.bounds(images)
+        self.weight, self.given_rotations = _FREE, images.frames.rotations
+        self.source: Links | None = links
+        fewest = options.fewest_views(images.num_images) if isinstance(links, MatchedKeypoints) else 2
         self.options = options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
         self.checked_length = max(options.min_track_length, fewest)
 
+    def has_free_sensors(self) -> bool:
+        """Return whether any sensor may move in its rig."""
+        return self.bounds.free_sensors is not None and bool(self.bounds.free_sensors.any())
+
     def frees_more_than_poses(self) -> bool:
         """Return whether lenses or rigs change."""
-        return bool(self.lenses.doubts or self.frames.free_sensors)
+        return bool(self.lenses.doubts) or self.has_free_sensors()
 
-    def judge_sensors(self, adjusted: AdjustmentProblem) -> Mapping[int, SensorSigma]:
+    def _judge_sensors(self, adjusted: AdjustmentProblem) -> Mapping[int, SensorSigma]:
         """Return how well free sensors are known at the optimum last solved for, see `free_sensors`."""
-        if not self.frames.free_sensors:
+        if not self.has_free_sensors():
             return NO_SENSORS
-        return judge_sensors(self.frames, adjusted, self._options_at_optimum())
+        assert self.bounds.free_sensors is not None
+        camera_ids = [self.images.lenses[k].id for k in np.flatnonzero(self.bounds.free_sensors).tolist()]
+        return judge_sensors(camera_ids, adjusted, self._options_at_optimum())
+
+    def _problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
+        """Return the problem of points that were triangulated from tracks, at the poses of the images."""
+        seen = observations(tracks, found.points_seen)
+        return self.views.problem(self.images, self.bounds, found.points, seen)
 
     def _options_at_optimum(self) -> AdjustmentOptions:
         """Return the options by which the optimum last solved for is one."""
@@ -171,7 +179,8 @@ class AdjustmentRun:
             min_angle_deg=self.options.min_triangulation_angle_deg,
             min_length=self.checked_length if checked else self.options.min_track_length,
         )
-        poses = self.frames.poses()
+        poses = self.views.poses(self.images)
+        assert self.source is not None
         if isinstance(self.source, ObservedTracks):
             return self.source, triangulate_tracks(self.source, poses, limits)
         return triangulate_matches(self.source, poses, limits, self.options.max_reprojection_error_px)
@@ -181,8 +190,8 @@ class AdjustmentRun:
     ) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
         """Return tracks and points at the pixel threshold, as `triangulate` does, and the problem of all."""
         joined, found = self._triangulate(1.0, checked=checked)
-        refuse_without_points(len(found.points))
-        return joined, found, self.frames.problem(joined, found)
+        _refuse_without_points(len(found.points))
+        return joined, found, self._problem(joined, found)
 
     def _of_checked_points(self, problem: AdjustmentProblem) -> AdjustmentProblem:
         """Return a problem without the points that the model may not have; as it is if it has no others.
@@ -198,13 +207,13 @@ class AdjustmentRun:
         self, tracks: ObservedTracks, found: TriangulatedPoints, *, times: int = 1
     ) -> AdjustmentProblem:
         """Return the problem of few of the points found, or of some times as many."""
-        refuse_without_points(len(found.points))
+        _refuse_without_points(len(found.points))
         thin = tracks.of_points(found.points_seen)
-        images = self.frames.images[thin.cameras]
-        chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, len(self.frames.image_ids), times)
+        images = self.views.images[thin.cameras]
+        chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, self.images.num_images, times)
         seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
-        return self.frames.problem(thin.subset(chosen), points)
+        return self._problem(thin.subset(chosen), points)
 
     def _adjust_by_few(self, problem: AdjustmentProblem) -> AdjustmentProblem:
         """Move coarse frames to the optimum of a thin problem, and return it."""
@@ -224,7 +233,7 @@ class AdjustmentRun:
         problem = self._thin_problem(joined, found, times=_FINE_TIMES)
         del joined, found, adjusted
         if is_last and not self.frees_more_than_poses():
-            del self.source  # all matches, at the peak of the memory; nothing is triangulated any more
+            self.source = None  # all matches, at the peak of the memory; nothing is triangulated any more
         return self._solve(problem, self.choose_scale(problem), _THIN_FALL, _NEAR_DAMPING)
 
     def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
@@ -248,14 +257,14 @@ class AdjustmentRun:
         if not self.lenses.doubts:
             return []
         options = replace(self._options_at_optimum(), **self.lenses.overrides())
-        ids = self.frames.colmap_camera_of_lens
+        ids = self._camera_ids()
         try:
             found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
         except UnsolvableError:
             found = dict.fromkeys(ids, math.inf)
         told = self.lenses.with_free_focal()
         self.refined = self.refined._replace(sigmas={i: found[i] for i in ids if i in told})
-        lenses, doubts = dict(zip(ids, self.frames.lenses, strict=True)), self.lenses.doubts
+        lenses, doubts = dict(zip(ids, self.images.lenses, strict=True)), self.lenses.doubts
         return [i for i in ids if i in doubts and not doubts[i].accepts(lenses[i], found[i])]
 
     def _hold_lenses(self, camera_ids: Sequence[int]) -> None:
@@ -264,20 +273,29 @@ class AdjustmentRun:
         A lens that is not to be believed even so is held as a whole.
         """
         given = {camera: self.lenses.doubts[camera].given for camera in camera_ids}
-        ids = self.frames.colmap_camera_of_lens
-        lenses = tuple(given.get(i, lens) for i, lens in zip(ids, self.frames.lenses, strict=True))
-        self.frames = replace(self.frames, lenses=lenses)
-        self.source = with_rays_of(self.frames, self.source)
+        self._move(self.images.with_lenses([given.get(lens.id, lens) for lens in self.images.lenses]))
         self.lenses = self.lenses.holding(camera_ids)
         undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *camera_ids)))
         self.refined = self.refined._replace(undetermined=undetermined, free=self.lenses)
+
+    def _camera_ids(self) -> list[int]:
+        """Return the ids of the lenses."""
+        return [lens.id for lens in self.images.lenses]
+
+    def _move(self, images: Images) -> None:
+        """Let images stand and look as these; the tracks get the rays of lenses that changed."""
+        pairs = zip(self.images.lenses, images.lenses, strict=True)
+        changed = np.array([before.parameters != after.parameters for before, after in pairs], dtype=np.bool_)
+        self.images = images
+        if changed.any() and self.source is not None:
+            self.source = with_rays_of(self.views, images, self.source, changed)
 
     def _solve(
         self, problem: AdjustmentProblem, scale: float, fall: float, first_damping: float = _FIRST_DAMPING
     ) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = self.loss_scale_px = scale * self.options.max_reprojection_error_px
-        problem = self.lenses.apply(problem, self.frames.colmap_camera_of_lens)
+        problem = self.lenses.apply(problem, self._camera_ids())
         adjusted = adjust(
             self.weight.apply(problem, self.given_rotations),
             loss_scale_px=loss_scale_px,
@@ -287,17 +305,7 @@ class AdjustmentRun:
             noise_px=self.weight.noise_px,
             **self.lenses.overrides(),
         )
-        found = adjusted.problem
-        lenses = tuple(found.lenses)
-        self.frames = replace(self.frames, rotations=found.rotations, centers=found.centers, lenses=lenses)
-        if found.rig is not None:
-            self.frames = replace(
-                self.frames,
-                sensor_rotations=found.rig.rotations,
-                sensor_translations=found.rig.translations,
-            )
-        if self.lenses.doubts:
-            self.source = with_rays_of(self.frames, self.source)
+        self._move(self.views.images_of(self.images, adjusted.problem))
         self.iterations += adjusted.iterations
         self.converged = adjusted.converged
         return adjusted.problem
@@ -315,28 +323,42 @@ class AdjustmentRun:
         returned = frames_not_gained(before, after, self.loss_scale_px)
         rotations = np.where(returned[:, None, None], before.rotations, after.rotations)
         centers = np.where(returned[:, None], before.centers, after.centers)
-        self.frames = replace(self.frames, rotations=rotations, centers=centers)
+        self.images = self.images.posed(rotations, centers)
         return replace(after, rotations=rotations, centers=centers)
 
-    def uncertainty(self, problem: AdjustmentProblem) -> Uncertainty:
-        """Return how well centers and scale are known at the optimum last solved for."""
+    def estimate(
+        self,
+        last: AdjustmentProblem,
+        *,
+        errors: RotationErrors | None = None,
+        initial_error_px: float = math.nan,
+        with_sensors: bool = True,
+    ) -> Estimate:
+        """Return where the images stand, and how well that is known at the optimum last solved for."""
+        known = self._center_errors(last)
+        return Estimate(
+            images=self.images,
+            weight=self.weight,
+            errors=errors,
+            covariances=None if known is None else known.covariances[self.images.frame_of],
+            scale_sigma=None if known is None else known.scale_sigma,
+            lenses=self.refined,
+            sensors=self._judge_sensors(last) if with_sensors else NO_SENSORS,
+            initial_error_px=initial_error_px,
+            converged=self.converged,
+            iterations=self.iterations,
+        )
+
+    def _center_errors(self, problem: AdjustmentProblem) -> CenterErrors | None:
+        """Return how well centers and scale are known; None if that is not known."""
         if problem.num_frames > MOST_FRAMES:
-            return Uncertainty()
+            return None
         try:
-            found = estimate_center_errors(
+            return estimate_center_errors(
                 self._of_checked_points(problem), self._options_at_optimum(), self.weight.open_rad()
             )
         except UnsolvableError:
-            return Uncertainty()
-        of_camera = found.covariances[self.frames.frame_of_camera]
-        by_image = {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
-        return Uncertainty(by_image, found.scale_sigma)
-
-    def posed(self, seed: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Return a copy of the seed without points, its frames where they stand now."""
-        copy = copy_without_points(seed)
-        set_poses(copy, self.start, self.frames)
-        return copy
+            return None
 
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the loss that the errors of a problem call for, in pixel thresholds."""
@@ -356,22 +378,26 @@ class AdjustmentRun:
         self._judge_lenses(adjusted)
         return joined, found, adjusted
 
-    def adjust_all(
-        self, seed: pycolmap.Reconstruction, tracks: TrackSource
-    ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
-        """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
+    def adjust_all(self) -> tuple[Points, float, AdjustmentProblem]:
+        """Return the adjusted points, not filtered; the first mean error; and the problem solved last."""
         joined, found = self._triangulate(1.0, checked=True)
         loosely, loose = self._triangulate(_THIN_LIMIT, checked=True)
-        refuse_without_points(len(loose.points))
-        initial_error_px = _mean_error_px(self.frames.problem(joined, found))
+        _refuse_without_points(len(loose.points))
+        initial_error_px = _mean_error_px(self._problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self._adjust_by_few(self._thin_problem(loosely, loose))
         joined, found, adjusted = self.adjust_by_all_points()
-        answer = self.posed(seed)
         found = replace(found, points=adjusted.points).of_length(self.checked_length)
-        colors = None if isinstance(tracks, MatchedKeypoints) else tracks
-        add_points(answer, self.frames, joined, found, colors)
-        return answer, initial_error_px, adjusted
+        return self.views.seen_points(joined, found), initial_error_px, adjusted
+
+
+def _refuse_without_points(num_points: int) -> None:
+    """Raise UnsolvableError if there is no point to adjust."""
+    if num_points == 0:
+        raise UnsolvableError(
+            "no 3D point can be triangulated at these camera positions, so there is nothing to adjust; "
+            "run with --adjust none"
+        )
 
 
 def _mean_error_px(problem: AdjustmentProblem) -> float:

@@ -28,10 +28,9 @@ from sfm_shapefit.adjustment.residuals import (
     sum_losses,
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 

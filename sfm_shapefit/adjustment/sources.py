@@ -1,56 +1,53 @@
-"""Where points come from: the matches of a database, or the points of a model with the same points2D."""
+"""Where points come from: the matches of images, or the points of a model with the same keypoints."""
 
 import itertools
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
-import pycolmap
 
-from sfm_shapefit.adjustment import AdjustmentProblem
-from sfm_shapefit.adjustment.views import CUBE, PosedFrames, read_frames
+from sfm_shapefit.adjustment.views import CUBE, Views, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.lenses import focal_length_px, is_adjusted
-from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
+from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 
-TrackSource = MatchedKeypoints | pycolmap.Reconstruction
-"""The matches between the posed images of a model, or another model with the same points2D."""
-
-Tracks = TypeVar("Tracks", bound=ObservedTracks | MatchedKeypoints)
+Links = MatchedKeypoints | ObservedTracks
+"""Matches, from which tracks are joined anew at each pose, or the tracks of a model."""
 
 # Matches that are looked at together.
 _MATCHES_A_SLICE = 1_000_000
 
 
 def collect_matches(
-    seed: pycolmap.Reconstruction, image_ids: IntArray, batches: Iterable[KeypointMatches], num_matches: int
+    images: Images,
+    pictures: Pictures,
+    place: IntArray,
+    batches: Iterable[KeypointMatches],
+    num_matches: int,
 ) -> MatchedKeypoints:
-    """Return all matches between registered images; batches are consumed one at a time.
+    """Return all matches between posed images; batches are consumed one at a time.
 
     Args:
-        seed: the placed images, with the points2D that the matches refer to.
-        image_ids: (n,) ids of the images that the batches' pairs index (`PosedModel.image_ids`).
-        batches: matches; pairs with an image that is not registered in `seed` are skipped.
+        images: all of them posed.
+        pictures: of the images.
+        place: (n,) row in `images` of each image that the batches' pairs index; -1 for those to be left out.
+        batches: matches.
         num_matches: that the batches have at most.
 
     Raises:
         InputError: if a match refers to a keypoint that its image does not have.
     """
-    frames = read_frames(seed)
-    counts = np.array([seed.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
+    counts = np.array([pictures.count(k) for k in range(images.num_images)], dtype=np.int64)
     begins = np.append(0, np.cumsum(counts))
-    registered: BoolArray = np.asarray(np.isin(image_ids, frames.image_ids))
-    place = np.where(registered, np.searchsorted(frames.image_ids, image_ids), 0)
     number = np.uint32 if begins[-1] < 2**32 else np.int64
     # Memory is taken as rows are written; one array of each batch, to be joined, would take it twice.
     room, end = np.empty((num_matches, 2), dtype=number), 0
     is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
     for batch in batches:
-        kept = registered[batch.pairs].all(axis=1)
+        kept = (place[batch.pairs] >= 0).all(axis=1)
         lengths, own = np.diff(batch.offsets), batch.keypoints
         if not kept.all():
             lengths, own = lengths[kept], own[np.repeat(kept, lengths)]
@@ -58,7 +55,7 @@ def collect_matches(
         missing = (own >= np.repeat(counts[ends], lengths, axis=0)).any(axis=1)
         if missing.any():
             pair = ends[np.repeat(np.arange(len(ends)), lengths)[np.argmax(missing)]]
-            names = " and ".join(seed.image(frames.image_ids[i]).name for i in pair.tolist())
+            names = " and ".join(images.names[k] for k in pair.tolist())
             raise InputError(
                 f"the pair {names} has matches of keypoints that do not exist; match the images again"
             )
@@ -70,8 +67,8 @@ def collect_matches(
     for first in range(0, end, _MATCHES_A_SLICE):
         numbers = room[first : min(first + _MATCHES_A_SLICE, end)]
         numbers[:] = row_of[numbers] - 1
-    images, keypoints = _images_of(np.flatnonzero(is_matched), begins)
-    cameras, pixels, on_plane = _look_up(frames, seed, images, keypoints)
+    taken, keypoints = _images_of(np.flatnonzero(is_matched), begins)
+    cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
     return MatchedKeypoints(
         cameras=cameras.astype(np.int32),
         keypoints=keypoints,
@@ -87,86 +84,47 @@ def _images_of(numbers: IntArray, begins: IntArray) -> tuple[Int32Array, Int32Ar
     return images.astype(np.int32), (numbers - begins[images]).astype(np.int32)
 
 
-def collect_tracks(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction
-) -> ObservedTracks:
-    """Return the tracks of a model's points that posed images observe.
-
-    Args:
-        frames: of `reconstruction`, which has the keypoints of its images.
-        reconstruction: the same.
-        source: the model, of the same keypoints.
-    """
-    seen = [observed_points(source.image(i)) for i in frames.image_ids]
-    images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
-    keypoints = np.concatenate([keypoints for keypoints, _ in seen])
-    points = np.concatenate([ids for _, ids in seen]).astype(np.int64)
-    cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
-    order = np.argsort(points, kind="stable")
-    names, lengths = np.unique(points, return_counts=True)
+def collect_tracks(images: Images, pictures: Pictures, points: Points) -> ObservedTracks:
+    """Return the tracks of points that posed images observe; they keep the points' ids and order."""
+    order = np.argsort(points.images, kind="stable")
+    cameras, pixels, on_plane = _look_up(images, pictures, points.images[order], points.keypoints[order])
+    back = np.argsort(points.points_seen()[order], kind="stable")
     return ObservedTracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        cameras=cameras[order],
-        keypoints=keypoints[order],
-        pixels=pixels[order],
-        on_plane=on_plane[order],
-        ids=names,
+        offsets=points.offsets,
+        cameras=cameras[back],
+        keypoints=points.keypoints[order][back],
+        pixels=pixels[back],
+        on_plane=on_plane[back],
+        ids=points.ids,
         may_split=False,
     )
 
 
-def with_rays_of(frames: PosedFrames, tracks: Tracks) -> Tracks:
-    """Return the same observations with the rays that the lenses of the frames give them now."""
-    lens = frames.lens_of_camera[tracks.cameras]
-    on_plane = tracks.on_plane.copy()
-    for k, own in enumerate(frames.lenses):
+def with_rays_of(views: Views, images: Images, links: Links, changed: BoolArray) -> Links:
+    """Return the same observations with the rays that lenses (l,) which have changed give them now."""
+    lens, on_plane = images.lens_of[views.images][links.cameras], links.on_plane.copy()
+    for k in np.flatnonzero(changed).tolist():
         rows = np.flatnonzero(lens == k)
-        if not own.fixed and len(rows):
-            camera = pycolmap.Camera(model=own.model, width=1, height=1, params=list(own.parameters))
-            on_plane[rows] = np.asarray(camera.cam_from_img(tracks.pixels[rows])).reshape(-1, 2)
-    return replace(tracks, on_plane=on_plane)
-
-
-def read_bundle(
-    reconstruction: pycolmap.Reconstruction, frames: PosedFrames
-) -> tuple[IntArray, AdjustmentProblem]:
-    """Return the points that posed images observe, by id, and the problem of all that they observe.
-
-    An observation that its lens gives no ray is left out.
-
-    Args:
-        reconstruction: with points.
-        frames: of it.
-    """
-    tracks = collect_tracks(frames, reconstruction, reconstruction)
-    points = np.array([reconstruction.point3D(i).xyz for i in tracks.ids.tolist()]).reshape(-1, 3)
-    has_ray = np.isfinite(tracks.on_plane).all(axis=1)
-    seen = np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
-    problem = frames.problem_of(points, tracks.cameras[has_ray], seen[has_ray], tracks.pixels[has_ray])
-    return tracks.ids, problem
+        on_plane[rows] = images.lenses[k].undistort(links.pixels[rows])
+    return replace(links, on_plane=on_plane)
 
 
 def _look_up(
-    frames: PosedFrames,
-    reconstruction: pycolmap.Reconstruction,
-    images: IntArray | Int32Array,
-    keypoints: IntArray | Int32Array,
+    images: Images, pictures: Pictures, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return camera, pixels (m, 2) and rays on the plane z = 1 (m, 2) of keypoints; `images` ascend."""
-    cameras = np.searchsorted(frames.images, images)
-    pixels, on_plane = np.empty((len(images), 2)), np.empty((len(images), 2))
-    ends = np.searchsorted(images, np.arange(len(frames.image_ids) + 1)).tolist()
+    """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
+    cameras = np.searchsorted(views_of(images).images, of)
+    seen, on_plane = np.empty((len(of), 2)), np.empty((len(of), 2))
+    ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
     for k, (begin, end) in enumerate(itertools.pairwise(ends)):
-        image = reconstruction.image(frames.image_ids[k])
-        camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
-        xy = points2d_xy(image)[keypoints[own]]
-        if is_adjusted(camera):
-            pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+        own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
+        pixels, rays = pictures.look_up(k, keypoints[own])
+        if lens.is_adjustable:
+            seen[own], on_plane[own] = pixels, rays[:, :2] / rays[:, 2:]
             continue
-        rays = camera_rays(camera, xy)
         view = np.argmax(rays @ CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
         local = np.einsum("mab,mb->ma", CUBE[view], rays)
         on_plane[own] = local[:, :2] / local[:, 2:]
-        pixels[own] = focal_length_px(camera) * on_plane[own]
+        seen[own] = lens.focal_px * on_plane[own]
         cameras[own] += view
-    return cameras, pixels, on_plane
+    return cameras, seen, on_plane

@@ -1,5 +1,7 @@
-"""The array types that every module shares, the one way to freeze an array, and sums of rows by label."""
+"""The array types that every module shares, frozen arrays, sums of rows by label, and freed memory."""
 
+import ctypes
+import os
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,6 +24,18 @@ def frozen(array: AnyArray) -> AnyArray:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def hand_back_memory() -> None:
+    """Hand back what the C library keeps of freed memory, where it is glibc; elsewhere nothing is done.
+
+    glibc keeps arrays of up to 32 MB in its heap, of which only the end goes back by itself: one object that
+    lives on keeps all below it. After the first placement of 2,500 images that is 345 of 837 MB. To hand it
+    back takes milliseconds, so it is done between stages, and before what takes most.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
+    if trim is not None:
+        trim(ctypes.c_size_t(0))
 
 
 Int32Array = npt.NDArray[np.int32]

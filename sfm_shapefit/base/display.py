@@ -1,10 +1,20 @@
-"""How results show themselves: one line in a console, a table in a notebook, plain values for JSON."""
+"""How results show themselves: one line in a console, a table or their report in a notebook, plain for JSON.
+
+The report is drawn by a layer above this one, which says here how.
+"""
 
 import html
 from abc import abstractmethod
+from collections.abc import Callable, Iterable
 from typing import Any
 
 _MOST_TEXT = 300
+_MOST_BYTES = 8_000_000
+"""A notebook that holds a larger page opens slowly."""
+_COLORS = {"good": "#2e7d32", "look": "#b26a00", "do not use": "#c62828"}
+_FRAME_HEIGHT_PX = 720
+
+_drawers: list[Callable[[Any], str]] = []
 
 
 class Displayed:
@@ -24,12 +34,39 @@ class Displayed:
         return f"<{type(self).__name__}: {self._headline()}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of the summary; names in it come from strangers, and are escaped."""
-        rows = [
-            f"<tr><th>{html.escape(name.replace('_', ' '))}</th><td>{html.escape(_text_of(value))}</td></tr>"
-            for name, value in self.summary().items()
-        ]
-        return f"<table><caption>{html.escape(repr(self))}</caption>{''.join(rows)}</table>"
+        """Return a table of the summary."""
+        rows = ((name.replace("_", " "), _text_of(value)) for name, value in self.summary().items())
+        return f"<table><caption>{html.escape(repr(self))}</caption>{_table_rows(rows)}</table>"
+
+
+def draw_pages_by(draw: Callable[[Any], str]) -> None:
+    """Let a function draw the page that a result shows in a notebook."""
+    _drawers[:] = [draw]
+
+
+def report_in_notebook(found: Any, rows: Iterable[tuple[str, str]]) -> str:
+    """Return the verdict on a result, a table of labels and texts, and the page of its report.
+
+    The page runs in a frame that can reach nothing. It is left out where it is too large, or nobody draws it.
+    """
+    color, statement = _COLORS[found.verdict.grade.value], html.escape(found.verdict.statement)
+    table = _table_rows(rows, " style='text-align:left'")
+    shown = f"<b style='color:{color}'>{statement}</b><table>{table}</table>"
+    page = _drawers[0](found) if _drawers else ""
+    if page and len(page) <= _MOST_BYTES:
+        shown += (
+            f"<iframe sandbox='allow-scripts' style='width:100%;height:{_FRAME_HEIGHT_PX}px;border:0' "
+            f'srcdoc="{html.escape(page, quote=True)}"></iframe>'
+        )
+    return f"<div>{shown}</div>"
+
+
+def _table_rows(rows: Iterable[tuple[str, str]], style: str = "") -> str:
+    """Return labels and texts as rows of a table; names in them come from strangers, and are escaped."""
+    return "".join(
+        f"<tr><th{style}>{html.escape(label)}</th><td{style}>{html.escape(text)}</td></tr>"
+        for label, text in rows
+    )
 
 
 def _text_of(value: Any) -> str:

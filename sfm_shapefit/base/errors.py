@@ -11,3 +11,10 @@ class InputError(ShapeFitError):
 
 class UnsolvableError(ShapeFitError):
     """The input is sound, but the view graph does not determine the camera positions."""
+
+
+class MissingExtraError(ShapeFitError):
+    """A package that one option needs is not installed."""
+
+    def __init__(self, what: str, package: str, extra: str) -> None:
+        super().__init__(f"{what} needs {package}: pip install '.[{extra}]' in the folder of sfm_shapefit")

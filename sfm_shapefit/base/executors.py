@@ -3,12 +3,9 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 from sfm_shapefit.base.errors import ShapeFitError
-
-ExecutorKind = Literal["serial", "processes", "dask"]
-"""No executor, processes of this machine, or a cluster."""
 
 Advance = Callable[[int, int], None]
 """Called with the work done so far and the work in all."""

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from sfm_shapefit.base.errors import ShapeFitError, UnsolvableError
-from sfm_shapefit.base.extras import MissingExtraError
+from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
     from sfm_shapefit.facts.grade import ModelVerdict

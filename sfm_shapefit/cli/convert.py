@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from sfm_shapefit.cli.console import print_table, report_errors
-from sfm_shapefit.cli.flags import GroupedCommand, InputPath, ModelArgument, OutputPath, Quiet, one_path
+from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
 
-_FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
+_FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv", "glb", "ply")
 
 
 @app.command(
@@ -19,7 +19,10 @@ _FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
     epilog="Example: sfm-shapefit convert out transforms.json",
 )
 def convert_command(
-    model: ModelArgument = None,
+    model: Annotated[
+        Path | None,
+        typer.Argument(metavar="MODEL", help="COLMAP model folder, or OpenSfM's reconstruction.json."),
+    ] = None,
     out: Annotated[Path | None, typer.Argument(metavar="OUT", help="File or folder to be made.")] = None,
     *,
     input_path: InputPath = None,
@@ -28,14 +31,14 @@ def convert_command(
         str | None,
         typer.Option(
             "--format",
-            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory) or csv; by "
-            "default that of OUT's suffix: none, .json, .tum or .txt, .csv.",
+            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory), csv, or glb or "
+            "ply (a mesh); by default that of OUT's suffix: none, .json, .tum or .txt, .csv, .glb, .ply.",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write MODEL, COLMAP's or a file of Bundler, openMVG or OpenSfM, in another format."""
+    """Write MODEL, COLMAP's or OpenSfM's, in another format."""
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     if target_format is not None and target_format not in _FORMATS:

@@ -1,6 +1,7 @@
 """Flags are the fields of the settings classes, in their groups, and their help is each field's sentence."""
 
 import inspect
+import re
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -10,7 +11,6 @@ from typing import Annotated, Any, TypeVar, get_type_hints
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.base.executors import ExecutorKind
 from sfm_shapefit.base.settings import Settings, groups_of, option
 
 Options = TypeVar("Options", bound=Settings)
@@ -19,9 +19,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="MODEL", help="COLMAP model folder, binary or text; or a file of Bundler, openMVG or OpenSfM."
-    ),
+    typer.Argument(metavar="MODEL", help="COLMAP model folder, binary or text."),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
@@ -43,23 +41,27 @@ PriorsFile = Annotated[
         "folder of the images, for the GPS positions of their EXIF data.",
     ),
 ]
+
+
+def _check_executor(name: str) -> str:
+    """Refuse an executor that does not exist."""
+    if not re.fullmatch("serial|processes|dask(:.+)?", name):
+        raise typer.BadParameter(f"{name!r} is not one of serial, processes, dask, dask:ADDRESS")
+    return name
+
+
 ExecutorName = Annotated[
-    ExecutorKind,
+    str,
     typer.Option(
         "--executor",
-        help="Who measures pairs and triangulates tracks: this process, as many others as --threads says, or "
-        "a cluster of dask.",
+        metavar="serial|processes|dask[:ADDRESS]",
+        callback=_check_executor,
+        help="Where pairs are measured and tracks triangulated: in this process, in as many others as "
+        "--threads says, or on a cluster of dask, started here or that of a running scheduler's address.",
     ),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Scene = Annotated[
-    bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
-]
 Images = Annotated[
     Path | None,
     typer.Option(
@@ -75,6 +77,7 @@ _METAVARS: dict[Any, str] = {
     "without": "FILE",
     "control_points": "FILE",
     "gravity": "FILE|database",
+    "rotations": "auto|held|free|SIGMA_DEG",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",
@@ -87,11 +90,40 @@ _METAVARS: dict[Any, str] = {
 _REPEATED = {"known_distance": (str, str, float)}
 """Flags of several values that may be repeated, of which typer knows none, and the types of their values."""
 
+_WORDS_OR_NUMBERS = {"rotations"}
+"""Flags that take a word or a number, of which typer knows none either."""
+
 # No argument of a program can hold this.
 _JOINT = "\0"
 
 _EARLIER_NAMES: dict[str, str] = {}
 """Flags that are taken beside their present names, without standing in any help."""
+
+
+_PLACE = (
+    *("rotations", "max_rotation_error", "reverse", "objective", "refine", "g2o", "onedsfm", "threads"),
+    *("overwrite", "report", "json", "strict", "quiet", "verbose"),
+)
+_FIRST_SCREEN = {
+    "locate": (
+        *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
+    ),
+    "map": (
+        *("priors", "control_points", "known_distance", "gravity", "without", "sequence", "join"),
+        *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
+    ),
+    "place": _PLACE,
+    "solve": _PLACE,
+    "synth": (
+        *("shape", "num_images", "num_points", "rig", "images", "pixel_noise_px", "wrong_match_fraction"),
+        *("corrupted_pair_fraction", "rotation_noise_deg", "repeated_fraction", "model", "database", "seed"),
+    ),
+}
+"""Options that `--help` lists, in their order, of the commands that have many; `--help-all` lists all."""
+_HELP_ALL = "--help-all"
+_ALL_OPTIONS = "sfm_shapefit.all_options"
+"""Key of a context's `meta` that is set where the help is to list all options."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +133,6 @@ class OutputFlags(Settings):
     config: str = option("", "Options from a TOML file; flags win over it.")
     overwrite: bool = option(False, "Replace an earlier output of this command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
-    scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
     images: str = option("", "Folder of the images: report.html has small pictures of them, 4 MB at most.")
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
@@ -112,7 +143,7 @@ class OutputFlags(Settings):
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists its options by the group that they belong to."""
+    """A command whose `--help` lists what is used most, and `--help-all` all options by their groups."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words of the usage line: arguments are needed, though COLMAP's flags may give them."""
@@ -120,22 +151,37 @@ class GroupedCommand(TyperCommand):
         return [piece if piece == self.options_metavar else piece.strip("[]") for piece in pieces]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write arguments first, then the command's own options, then each group under its title."""
-        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx)
-            own = "Arguments" if parameter.param_type_name == "argument" else "Options"
-            if record is not None:
-                record = (record[0].strip("[]"), record[1]) if own == "Arguments" else record
-                title = getattr(parameter, "rich_help_panel", None) or own
-                groups.setdefault(title, []).append(record)
-        for title, records in groups.items():
+        """Write arguments first, then the options."""
+        for title, records in self._sections(ctx).items():
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
 
+    def _sections(self, ctx: Any) -> dict[str, list[tuple[str, str]]]:
+        """Return names and sentences of arguments, and of options used most or all by their groups."""
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        first = () if _ALL_OPTIONS in ctx.meta else _FIRST_SCREEN.get(self.name or "", ())
+        by_name: dict[str, tuple[str, str]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None:
+                continue
+            by_name[parameter.name or ""] = record
+            if parameter.param_type_name == "argument":
+                groups["Arguments"].append((record[0].strip("[]"), record[1]))
+            elif not first:
+                title = getattr(parameter, "rich_help_panel", None) or "Options"
+                groups.setdefault(title, []).append(record)
+        if first:
+            shown = [(by_name[name][0], _first_words(by_name[name][1])) for name in first]
+            groups["Options"] = [*shown, (_HELP_ALL, "Show all options."), by_name["help"]]
+        return groups
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse flags by their present names, where an earlier one is given, and several values as one."""
+        if _HELP_ALL in args and not ctx.resilient_parsing:
+            ctx.meta[_ALL_OPTIONS] = True
+            args = ["--help"]
         known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
         renamed = []
         for arg in args:
@@ -148,6 +194,12 @@ class GroupedCommand(TyperCommand):
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)
         return extra
+
+
+def _first_words(text: str) -> str:
+    """Return what an option is, without what its values mean, and its default."""
+    words = re.split(r"[.:;] | \[default: ", text, maxsplit=1)[0].rstrip(".")
+    return words + "".join(re.findall(r" \[default: [^]]*\]", text))
 
 
 def _refuse_extra(ctx: Any, extra: Sequence[str]) -> None:
@@ -206,10 +258,10 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
                 rich_help_panel=group.title,
                 metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
             )
-            repeated = item.name in _REPEATED
-            annotation: Any = Annotated[(list[str] if repeated else kinds[item.name]) | None, flagged]
-            kind = inspect.Parameter.KEYWORD_ONLY
-            parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
+            kind = str if item.name in _WORDS_OR_NUMBERS else kinds[item.name]
+            annotation: Any = Annotated[(list[str] if item.name in _REPEATED else kind) | None, flagged]
+            keyword = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(item.name, keyword, default=None, annotation=annotation))
     return parameters
 
 
@@ -242,6 +294,14 @@ def _values_of(name: str, text: str) -> tuple[Any, ...]:
         raise typer.BadParameter(f"{_flag_of(name)} takes {_METAVARS[name]}") from error
 
 
+def _word_or_number(text: str) -> str | float:
+    """Return the number that a text is, or the text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
     """Return options from a TOML file, if there is one, and the flags that were given, which win.
 
@@ -254,9 +314,11 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
     earlier = {item.metadata["also"]: item.name for item in fields(settings)}
     known = {item.name for item in fields(settings)}
     values = _read_toml(config, known, earlier) if config else {}
-    values |= {name: value for name, value in given.items() if value is not None and name in known}
-    for name in _REPEATED.keys() & {name for name in known if given.get(name) is not None}:
-        values[name] = tuple(_values_of(name, text) for text in given[name])
+    flags = {name: value for name, value in given.items() if value is not None and name in known}
+    for name in _REPEATED.keys() & flags.keys():
+        flags[name] = tuple(_values_of(name, text) for text in flags[name])
+    flags |= {name: _word_or_number(flags[name]) for name in _WORDS_OR_NUMBERS & flags.keys()}
+    values |= flags
     try:
         return settings(**values)
     except (TypeError, ValueError) as error:

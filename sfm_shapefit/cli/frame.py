@@ -67,8 +67,8 @@ class Run(Generic[Options]):
     def writing(self) -> dict[str, Any]:
         """How the result is written; keywords of `write_result`."""
         flags = self.flags
-        how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
-        return how | {"protect": self.protect, "images": flags.images}
+        how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
+        return how | {"protect": self.protect}
 
     def show(self, title: str, facts: dict[str, Any], told: "Callable[[], Told]") -> None:
         """Print the facts as JSON, or what is told of them, or nothing, once the output is complete."""

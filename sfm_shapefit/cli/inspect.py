@@ -56,10 +56,6 @@ def inspect_command(
     *,
     input_path: InputPath = None,
     database: Database = None,
-    theory: Annotated[
-        bool,
-        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centers."),
-    ] = False,
     as_json: Json = False,
     **given: Any,
 ) -> None:
@@ -72,24 +68,17 @@ def inspect_command(
 
         catch_termination()
         with show_progress(not as_json) as progress:
-            found = inspect_model(source, database, options=options, theory=theory, progress=progress)
+            found = inspect_model(source, database, options=options, progress=progress)
         if as_json:
             print_json(found.summary())
         else:
-            what = "node" if _is_graph(source) else "image"
+            what = "node" if source.is_file() else "image"
             print_table(f"{counted(found.num_images, what)} of {source}", _inspection_table(found))
             if not found.diagnosis.obstacle:
                 command = "place" if what == "node" else "locate"
                 print_steps([f"sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)
-
-
-def _is_graph(source: Path) -> bool:
-    """Tell a bare graph's file from a model, which may be another program's file."""
-    from sfm_shapefit.files.models import is_model_file
-
-    return source.is_file() and not is_model_file(source)
 
 
 def _inspection_table(found: "Inspection") -> Rows:
@@ -118,5 +107,4 @@ def _inspection_table(found: "Inspection") -> Rows:
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
         *([("will take", found.expected.statement)] if found.expected else []),
-        *([("theory", found.theory.statement)] if found.theory else []),
     ]

@@ -11,7 +11,7 @@ from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import OutputFlags
 
 if TYPE_CHECKING:
-    from sfm_shapefit.adjustment.adjusted import Adjusted
+    from sfm_shapefit.adjustment.estimate import Estimate
 
 
 def further_piece_rows(facts: dict[str, Any]) -> Rows:
@@ -68,7 +68,7 @@ def describe_points(facts: dict[str, Any]) -> str:
     return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
 
 
-def describe_adjustment(adjusted: "Adjusted") -> str:
+def describe_adjustment(adjusted: "Estimate") -> str:
     """Say how bundle adjustment went."""
     state = "converged" if adjusted.converged else "stopped at its limit"
     before, after = adjusted.initial_error_px, adjusted.final_error_px
@@ -81,11 +81,6 @@ def picture_rows(flags: OutputFlags, names: Iterable[str]) -> Rows:
     if not flags.images or not flags.report or any((folder / name).is_file() for name in names):
         return []
     return [("warning", f"{folder} has none of the images, so the report has no pictures")]
-
-
-def name_pictures(flags: OutputFlags) -> str:
-    """Name the pictures that were written, to follow the names of other files."""
-    return ", report.html" * flags.report + ", scene.glb, scene.ply" * flags.scene
 
 
 def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str]:

@@ -15,7 +15,6 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
-    Scheduler,
     one_path,
     takes,
 )
@@ -26,7 +25,6 @@ from sfm_shapefit.cli.lines import (
     describe_points,
     further_piece_rows,
     intrinsics_rows,
-    name_pictures,
     next_steps,
     picture_rows,
     rig_rows,
@@ -55,7 +53,6 @@ def locate_command(
     database: Database = None,
     priors: PriorsFile = None,
     executor: ExecutorName = "serial",
-    scheduler: Scheduler = None,
     **given: Any,
 ) -> None:
     """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
@@ -66,7 +63,7 @@ def locate_command(
         from sfm_shapefit.pipeline.locate import locate
         from sfm_shapefit.pipeline.write import write_result
 
-        with open_executor(executor, run.options.num_threads(), scheduler) as workers:
+        with open_executor(executor, run.options.num_threads()) as workers:
             found = locate(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
@@ -112,7 +109,7 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
         verdict=found.verdict,
         steps=next_steps(facts, out, flags),
         timings_s=found.timings_s,
-        written=f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
+        written=f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{', report.html' * flags.report}",
     )
 
 
@@ -131,7 +128,5 @@ def _describe_pairs(facts: dict[str, Any]) -> str:
 
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
-    filtered = facts["num_pairs_filtered"]
-    of_them = f", {filtered} left out by the filter" if filtered else ""
     others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
-    return "\n".join([f"{usable} usable ({contradicting} contradict the solution{of_them})", *others])
+    return "\n".join([f"{usable} usable ({contradicting} contradict the solution)", *others])

@@ -14,7 +14,6 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
-    Scheduler,
     one_path,
     takes,
 )
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     "map",
     cls=GroupedCommand,
     short_help="From the matches of a database alone: rotations, then locate.",
-    epilog="Example: sfm-shapefit map database.db out --bundle-adjust",
+    epilog="Example: sfm-shapefit map database.db out --adjust full",
 )
 @takes(MapOptions, OutputFlags)
 def map_command(
@@ -53,7 +52,6 @@ def map_command(
     output_path: OutputPath = None,
     priors: PriorsFile = None,
     executor: ExecutorName = "serial",
-    scheduler: Scheduler = None,
     **given: Any,
 ) -> None:
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
@@ -64,7 +62,7 @@ def map_command(
         from sfm_shapefit.pipeline.map import map_database
         from sfm_shapefit.pipeline.write import write_result
 
-        with open_executor(executor, run.options.num_threads(), scheduler) as workers:
+        with open_executor(executor, run.options.num_threads()) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
         write_result(found, target, **run.writing)
         title = f"{counted(found.num_images, 'image')} of {source}"

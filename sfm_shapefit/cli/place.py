@@ -9,7 +9,7 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import further_piece_rows, name_pictures, next_steps
+from sfm_shapefit.cli.lines import further_piece_rows, next_steps
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
 
@@ -94,7 +94,6 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     rejected = counted(len(placement.rejected_pairs), "pair")
-    filtered = f", {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
     return Told(
         figures=[
             *figure_rows(facts),
@@ -105,7 +104,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
         details=[
             ("directions", found.statement),
             ("dimension", str(placement.graph.dimension)),
-            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution{filtered}"),
+            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution"),
             ("residuals", _describe_residuals(facts["residuals_deg"])),
             ("locations", placement.refined.statement()),
             ("certificate", found.departure.statement),
@@ -113,7 +112,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
         verdict=found.verdict,
         steps=next_steps(facts, out, flags),
         timings_s=found.timings_s,
-        written=f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
+        written=f"{out}: locate.json, cameras.csv, pairs.csv{', report.html' * flags.report}",
     )
 
 

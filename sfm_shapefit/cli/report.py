@@ -1,8 +1,6 @@
-"""`sfm-shapefit report OUT` and `sfm-shapefit view OUT`: what an earlier run found, to be looked at."""
+"""`sfm-shapefit report OUT`: what an earlier run found, or any COLMAP model, to be looked at."""
 
 import shlex
-import time
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,25 +13,18 @@ from sfm_shapefit.cli.console import (
     report_errors,
     show_progress,
 )
-from sfm_shapefit.cli.flags import Database, GroupedCommand, Images, Scene, one_path
+from sfm_shapefit.cli.flags import Database, GroupedCommand, Images, one_path
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
-
-Output = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="OUT", help="A folder that locate or place wrote, or one model of map, such as out/0."
-    ),
-]
 
 
 @app.command(
     "report",
     cls=GroupedCommand,
     short_help="Explain a model in one page: what locate wrote, or any COLMAP model.",
-    epilog="Example: sfm-shapefit report out --scene",
+    epilog="Example: sfm-shapefit report out",
 )
 def report_command(
     source: Annotated[
@@ -51,7 +42,6 @@ def report_command(
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
-    scene: Scene = False,
     images: Images = None,
 ) -> None:
     """Write OUT/report.html anew from the other files of OUT; of any other COLMAP model, write FILE.
@@ -67,15 +57,14 @@ def report_command(
             for name, value in (("--database", database), ("--write-to", write_to)):
                 if value is not None:
                     raise typer.BadParameter(f"{name} is for COLMAP models; {folder} is an output of locate")
-            _report_output(folder, scene, images)
+            _report_output(folder, images)
         else:
             _report_model(folder, database, write_to or Path("report.html"), overwrite, images)
 
 
-def _report_output(folder: Path, scene: bool, images: Path | None) -> None:
+def _report_output(folder: Path, images: Path | None) -> None:
     """Write the report of what `locate` or `place` wrote."""
     from sfm_shapefit.base.errors import InputError
-    from sfm_shapefit.report.mesh import write_meshes
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.read_back import read_output
 
@@ -83,10 +72,7 @@ def _report_output(folder: Path, scene: bool, images: Path | None) -> None:
     pictures = _pictures(drawn, images)
     try:
         write_report(drawn, facts, folder / "report.html", pictures)
-        if scene:
-            write_meshes(drawn, folder)
-        names = ["report.html", *(["scene.glb", "scene.ply"] if scene else [])]
-        print_table(str(folder), [("written", ", ".join(names))])
+        print_table(str(folder), [("written", "report.html")])
         print_steps([f"open {shlex.quote(str(folder / 'report.html'))}"])
     except OSError as error:
         what = f"{folder} cannot be written ({error.strerror})"
@@ -130,38 +116,3 @@ def _pictures(drawn: "Drawing", images: Path | None) -> dict[int, str] | None:
     if pictures is not None and not pictures:
         raise InputError(f"{images} has none of the images, such as {shorten(drawn.cameras.names[0])}")
     return pictures
-
-
-@app.command(
-    "view",
-    cls=GroupedCommand,
-    short_help="Explore OUT in the browser.",
-    epilog="Example: sfm-shapefit view out --port 8090",
-)
-def view_command(
-    out: Output = None,
-    *,
-    host: Annotated[
-        str, typer.Option("--host", help="Address to listen on; others than this machine's let others in.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port to listen on.")] = 8080,
-    open_browser: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
-) -> None:
-    """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
-    folder = one_path(out, None, "OUT")
-    with report_errors():
-        from sfm_shapefit.report.read_back import read_output
-        from sfm_shapefit.report.viewer import serve
-
-        drawn, facts = read_output(folder)
-        server = serve(drawn, facts, host, port)
-        catch_termination()
-        try:
-            address = f"http://{host}:{server.get_port()}"
-            print(f"{address}  (end with Ctrl-C)", flush=True)  # noqa: T201
-            if open_browser:
-                webbrowser.open(address)
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
-            server.stop()

@@ -20,14 +20,11 @@ from sfm_shapefit.cli.console import (
 
 _GROUPS = {
     "Place cameras": ("locate", "map", "place"),
-    "Look at models and results": ("inspect", "evaluate", "report", "view"),
+    "Look at models and results": ("inspect", "evaluate", "report"),
     "Make and convert": ("convert", "synth"),
     "Set up": ("warm-up",),
 }
 """The commands in the help, the most used first."""
-
-_HOMES = {"view": "report", "warm-up": "warm_up"}
-"""The modules of commands that are not named as they are."""
 
 # New objects after which unused ones are looked for. Modules make a hundred thousand that stay; to go through
 # them as often as the interpreter does by itself takes a twentieth of a short run.
@@ -85,7 +82,7 @@ def load_commands(words: Sequence[str] = ()) -> None:
     known = [name for names in _GROUPS.values() for name in names]
     called = next((word for word in words if not word.startswith("-")), None)
     for name in [called] if called in known else known:
-        import_module(f"sfm_shapefit.cli.{_HOMES.get(name, name)}")
+        import_module(f"sfm_shapefit.cli.{name.replace('-', '_')}")
 
 
 def main() -> None:

@@ -26,9 +26,9 @@ class Departure:
 
     statement: str
     """What is certified, what is delivered, and how far apart they are."""
-    median: float | None
-    """Of the distances, as a share of the scene's radius; None if nothing is certified."""
-    largest: float | None
+    median: float
+    """Of the distances, as a share of the scene's radius."""
+    largest: float
 
 
 def compare_with_certified(placement: Placement, centers: FloatArray, *, adjusted: bool) -> Departure:
@@ -42,8 +42,6 @@ def compare_with_certified(placement: Placement, centers: FloatArray, *, adjuste
     solved, refined = placement.certified, placement.refined
     delivered = f"{refined.start}, refined in angles" if refined.is_refined else refined.start
     delivered += ", then adjusted" if adjusted else ""
-    if not solved.status.has_certificate:
-        return Departure(statement=f"nothing is certified; delivered: {delivered}", median=None, largest=None)
     to = f"to {max(solved.gap, 0.0):.1e}"
     certified = f"ShapeFit's optimum is certified {to}{_OTHERS[solved.unique]}"
     if solved.status is not Status.CONVERGED:

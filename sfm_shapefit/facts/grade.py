@@ -32,7 +32,7 @@ import numpy as np
 
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.warnings import match_warnings, uncertain_cameras
-from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.judgement.judged import Judged
 
 if TYPE_CHECKING:
     from sfm_shapefit.facts.result import GraphResult, LocateResult
@@ -111,7 +111,7 @@ def judge_graph(found: "GraphResult") -> ModelVerdict:
 
 
 def _judge(
-    placement: Placement, shares: _Shares, outside: list[str], suspicions: tuple[str, ...]
+    placement: Judged, shares: _Shares, outside: list[str], suspicions: tuple[str, ...]
 ) -> ModelVerdict:
     """Apply the rules of the module's header."""
     bad = tuple(_reasons_against(placement, shares))
@@ -133,7 +133,7 @@ def _judge(
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
 
 
-def _reasons_against(placement: Placement, shares: _Shares) -> Iterator[str]:
+def _reasons_against(placement: Judged, shares: _Shares) -> Iterator[str]:
     """Yield why a model should not be used; a share that is not known is no reason."""
     level = placement.assessment.level_deg
     if level > _MOST_LEVEL_DEG:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import UNREFINED, RefinedLenses
+from sfm_shapefit.adjustment.estimate import UNREFINED, RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.json_types import CameraIntrinsics
@@ -139,7 +139,7 @@ def intrinsics_warnings(intrinsics: Intrinsics, rows: list[CameraIntrinsics]) ->
             "undetermined",
             "which the matches do not tell: the scene is flat, or the camera hardly turns and shifts",
         ),
-        ("held", "which stays as it is: --refine-intrinsics auto, and an adjustment, would refine it"),
+        ("held", "which stays as it is: --intrinsics auto, and an adjustment, would refine it"),
     ):
         cameras = [str(row["camera"]) for row in guessed if row["decided_by"] == how]
         if cameras:

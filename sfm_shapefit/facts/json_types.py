@@ -75,7 +75,7 @@ class Piece(TypedDict):
 class Solve(TypedDict):
     """The certified ShapeFit solve of the largest piece."""
 
-    status: Annotated[str, "converged, inaccurate, max_iterations, cancelled, or not_solved for a baseline."]
+    status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
     objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]
     dual_bound: Annotated[float | None, "No placement has a lower objective."]
     gap: Annotated[float | None, "objective - dual_bound."]
@@ -145,7 +145,7 @@ class RotationRefinement(TypedDict):
 
 
 class BundleAdjustment(TypedDict):
-    """What --bundle-adjust reached; mean reprojection errors."""
+    """What --adjust full reached; mean reprojection errors."""
 
     converged: Annotated[bool, "Whether the last round met its tolerance."]
     iterations: Annotated[int, "Steps of all rounds together."]
@@ -208,7 +208,7 @@ class Delivered(TypedDict):
     from_certified_median: Annotated[
         float | None,
         "Of the distances from the certified optimum after the similarity that fits best, as a share of the "
-        "scene's radius; null if nothing is certified.",
+        "scene's radius; null where there is no distance.",
     ]
     from_certified_max: Annotated[float | None, "The largest of these distances."]
 
@@ -226,7 +226,6 @@ class PlacementSummary(TypedDict):
     num_pairs_rejected: Annotated[
         int, "Pairs without a usable direction, and those that contradict the solution."
     ]
-    num_pairs_filtered: Annotated[int, "Pairs that --filter left out."]
     sigma_of: Annotated[
         str,
         "What the standard deviations of cameras.csv know of: matching noise only, or, after an adjustment, "
@@ -429,7 +428,6 @@ class Averaging(TypedDict):
     """How rotations were averaged, and how well they agree with the pairs."""
 
     statement: Annotated[str, "How the rotations were found, in words."]
-    averaging: Annotated[str, "Who averaged: own or pycolmap."]
     num_registered: Annotated[int, "Images that have a rotation."]
     num_pairs: Annotated[int, "Pairs whose residuals count."]
     agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
@@ -505,7 +503,6 @@ class InspectSummary(TypedDict):
     statuses: Annotated[dict[str, int], "Pairs by the sentence that says what became of them."]
     points: Annotated[str, "Whether 3D points join the graph, and why."]
     diagnosis: Annotated[Diagnosis, "What the view graph says before anything is solved."]
-    theory: Annotated[dict[str, Any] | None, "Constants of the recovery theorems, if asked for."]
     expected: Annotated[Expected | None, "What locate will take; null for a bare graph."]
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
 

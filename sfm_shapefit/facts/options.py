@@ -11,16 +11,17 @@ from sfm_shapefit.base.settings import explained, option
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
-from sfm_shapefit.rotations.options import Averaging, Sequencing
-from sfm_shapefit.tracks.options import Adjuster, StructureOptions
+from sfm_shapefit.rotations.options import Sequencing
+from sfm_shapefit.tracks.options import StructureOptions
 
-Rotations = Literal["auto", "measured", "free"]
+Rotations = Literal["auto", "held", "free"] | float
 Points = Literal["auto", "never", "always"]
-Source = Literal["auto", "matches", "relative-poses", "tracks"]
-Relative = Literal["matches", "stored"]
+Source = Literal["auto", "matches", "tracks"]
 KnownDistance = tuple[str, str, float]
-Refined = Literal["auto", "focal", "all", "none"]
+IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
+RigFreedom = Literal["held", "free"]
 Join = Literal["never", "safe"]
+Adjust = Literal["none", "seed", "full"]
 
 
 FIX_SOLVED = "solved"
@@ -42,8 +43,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
 
     directions: Source = option(
         "auto",
-        "Where directions come from: the database's inlier matches, its stored relative poses, or the "
-        'model\'s own tracks; "auto" takes matches if there is a database, else tracks.',
+        "Where directions come from: the database's inlier matches, or the model's own tracks; "
+        '"auto" takes matches if there is a database, else tracks.',
     )
     points: Points = option(
         "auto",
@@ -87,42 +88,31 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Let the position priors that set the scale also pull the cameras, each by its standard "
         "deviation; priors that are far off have no part.",
     )
-    adjust: bool = option(
-        True,
-        "Adjust centers and points to the pixels after placement, all tracks at once, and rotations as far "
-        "as they are doubtful; up to 2,000 cameras. Not with objectives that deliver an optimum as it is.",
+    adjust: Adjust = option(
+        "seed",
+        'What is adjusted to the pixels: "seed", the placed cameras by all tracks at once, and rotations as '
+        "far as they are doubtful, up to 2,000 cameras and not with objectives that deliver an optimum as it "
+        'is; "full", poses and points once more by bundle adjustment from the seed; "none", nothing.',
     )
     rotations: Rotations = option(
         "auto",
-        'What to make of the given rotations: "measured", as by instruments, are held and not doubted; '
-        '"free" are forgotten by the adjustment; "auto" asks the matches how far off they are, and which '
-        "cameras are turned.",
+        'What to make of the given rotations: "held", as measured by instruments, and not doubted; "free", '
+        "forgotten by the adjustment; a number, pulled to by that standard deviation about each axis in "
+        'degrees; "auto" asks the matches how far off they are, and which cameras are turned.',
     )
-    rotation_sigma_deg: float = option(
-        0.0,
-        "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
-    )
-    bundle_adjust: bool = option(
-        False,
-        "Refine poses and points by bundle adjustment from the seed; intrinsics as refine_intrinsics says.",
-    )
-    adjuster: Adjuster = option(
-        "own",
-        "What adjusts if bundle_adjust is asked for: our own, whose answer is the same bit by bit and "
-        "several times faster, or pycolmap's Ceres.",
-    )
-    refine_intrinsics: Refined = option(
+    intrinsics: IntrinsicsFreedom = option(
         "auto",
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
         'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
-        'their distortion too; "none", nothing. What was given pulls by its own weight, and stays where the '
+        'their distortion too; "held", nothing. What was given pulls by its own weight, and stays where the '
         "matches do not tell it. Cameras that images share stay shared.",
     )
-    refine_rigs: bool = option(
-        False,
-        "Let the adjustments change where sensors stand in their rigs, each by one pose for all frames. "
-        "The reference sensors stay, and so does the mean distance of the others from them: the scale is "
-        "still that of the rigs. Refused where the matches do not tell a sensor's pose.",
+    rigs: RigFreedom = option(
+        "held",
+        'Where sensors stand in their rigs: "held", where they are; "free", the adjustments change it, each '
+        "by one pose for all frames. The reference sensors stay, and so does the mean distance of the others "
+        "from them: the scale is still that of the rigs. Refused where the matches do not tell a sensor's "
+        "pose.",
     )
     min_trust: float = option(
         0.6,
@@ -143,31 +133,19 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
-        if self.refine_intrinsics in ("focal", "all") and not (self.adjust or self.bundle_adjust):
-            raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
-        if self.refine_rigs and not (self.adjust or self.bundle_adjust):
-            raise ValueError("refine_rigs needs an adjustment; leave out no-adjust")
-        if self.adjuster != "own" and not self.bundle_adjust:
-            raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
+        if self.intrinsics in ("focal", "all") and self.adjust == "none":
+            raise ValueError(f"intrinsics={self.intrinsics} needs an adjustment; leave out adjust=none")
+        if self.rigs == "free" and self.adjust == "none":
+            raise ValueError("rigs=free needs an adjustment; leave out adjust=none")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
-        if (
-            self.max_rotation_error_deg != DirectionOptions.max_rotation_error_deg
-            and self.directions != "relative-poses"
-        ):
-            raise ValueError("max_rotation_error_deg belongs to directions=relative-poses; leave out one")
 
     def _check_rotations(self) -> None:
-        """Refuse what is said of rotations where it has no effect."""
-        if not 0.0 <= self.rotation_sigma_deg < 180.0:
-            raise ValueError(f"rotation_sigma_deg must lie in [0, 180), got {self.rotation_sigma_deg}")
-        if self.rotation_sigma_deg and self.rotations != "auto":
-            raise ValueError(
-                f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
-            )
-        said = self.rotation_sigma_deg or self.rotations == "free"
-        if said and not (self.adjust or self.bundle_adjust):
-            raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
+        """Refuse a standard deviation that is none, and freedom that no adjustment uses."""
+        if not isinstance(self.rotations, str) and not 0.0 < self.rotations < 180.0:
+            raise ValueError(f"rotations must lie between 0 and 180 degrees, got {self.rotations}")
+        if self.rotations not in ("auto", "held") and self.adjust == "none":
+            raise ValueError("what rotations are worth matters only to an adjustment; leave out adjust=none")
 
     def _check_control_points(self) -> None:
         """Refuse what would set the scale beside control points."""
@@ -203,7 +181,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def adjusts_cameras(self, num_cameras: int) -> bool:
         """Return whether placed cameras are adjusted; the optimum as it is, is not."""
         as_found = self.objective not in ("auto", "lud") or not self.refine
-        return self.adjust and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
+        return self.adjust != "none" and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
         """Say whether 3D points join the view graph of so many cameras, and why."""
@@ -237,26 +215,14 @@ class MapOptions(LocateOptions):
         "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
         "keeps all. Even a wrong pose finds a few points.",
     )
-    adjust: bool = option(
-        True,
-        "Adjust a first placement together with its rotations on few tracks that cover the images, and "
-        "locate from there. Averaged rotations are far coarser.",
-    )
-    relative_rotations: Relative = option(
-        "matches",
-        "Relative rotations to be averaged: estimated from each pair's inlier matches, or those the "
-        "database stores, which is faster but less exact and keeps more false pairs.",
-        also="relative",
-    )
-    averaging: Averaging = option(
-        "own",
-        "Who averages the relative rotations: this package, with standard deviations and a certificate, or "
-        "pycolmap.",
+    adjust: Adjust = option(
+        "seed",
+        'What is adjusted to the pixels: "seed", a first placement together with its rotations on few tracks '
+        'that cover the images, to locate from there; "full", poses and points once more by bundle '
+        'adjustment from the seed; "none", nothing: averaged rotations are far coarser.',
     )
     min_matches: int = option(
-        0,
-        "Pairs with fewer inlier matches are left out of the averaging. 0 leaves none out; pycolmap's "
-        "averaging then tries 15, 20, 30, 50 and 80 and keeps the rotations that agree with most matches.",
+        0, "Pairs with fewer inlier matches are left out of the averaging; 0 leaves none out."
     )
     sequence: Sequencing = option(
         "auto",
@@ -280,8 +246,8 @@ class MapOptions(LocateOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.directions == "tracks":
-            raise ValueError("a database has no tracks; directions must be auto, matches or relative-poses")
-        if self.rotations != "auto" or self.rotation_sigma_deg:
+            raise ValueError("a database has no tracks; directions must be auto or matches")
+        if self.rotations != "auto":
             raise ValueError(
                 "map finds the rotations itself; what given ones are worth is for locate to know"
             )

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted, AdjustedPlacement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Displayed, report_in_notebook
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.certified import Departure, compare_with_certified
 from sfm_shapefit.facts.columns import Column, TableName, table_of
@@ -18,8 +18,7 @@ from sfm_shapefit.facts.grade import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.facts.intrinsics import Intrinsics
 from sfm_shapefit.facts.json_types import ControlPoint, GraphSummary, Join, LocateSummary, RefinedSensor
 from sfm_shapefit.facts.key_figures import figure_rows
-from sfm_shapefit.facts.notebook import notebook_html
-from sfm_shapefit.facts.options import LocateOptions, Source
+from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.summary import summarize_graph, summarize_model
 from sfm_shapefit.facts.tables import CameraRow, PairRow
@@ -27,12 +26,12 @@ from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
-from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.matches import PairNames
@@ -55,10 +54,8 @@ class Inputs:
     """The model folder; None for a reconstruction in memory."""
     database: Path | None
     """The database whose matches were used, if any."""
-    source: Source
-    """Where the directions came from; never "auto"."""
     statement: str
-    """How that choice was made, for the user."""
+    """Where the directions came from, and how that choice was made, for the user."""
     left_out: PairNames = frozenset()
     """Pairs that are taken for unmatched."""
 
@@ -93,7 +90,7 @@ class LocateResult(Displayed):
     """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
     directions: PairDirections
     """All pairs that were looked at, with their support."""
-    placement: Placement
+    placement: Judged
     """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
     largest rigid piece solved, and the evidence for it, in the solver's units."""
     kept: BoolArray
@@ -101,9 +98,9 @@ class LocateResult(Displayed):
     points."""
     gauge: Gauge
     """From the solver's units to the output's."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
-    adjustment: AdjustedPlacement | None
+    adjustment: Estimate | None
     """What became of the placement and of the given rotations, before any bundle adjustment; None if the
     placement stayed as it was found."""
     timings_s: dict[str, float]
@@ -113,7 +110,7 @@ class LocateResult(Displayed):
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
     where it was kept; None if there was none."""
-    further: "tuple[FurtherPiece, ...]" = ()
+    further: "tuple[LocateResult, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
@@ -166,7 +163,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -222,6 +219,13 @@ class LocateResult(Displayed):
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
+    @cached_property
+    def own_cameras(self) -> list[CameraRow]:
+        """One row per camera of the piece that is placed."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+
     @property
     def agreeing_pairs(self) -> float:
         """Of the pairs of cameras in the output that say anything of a direction, the share that agrees.
@@ -232,8 +236,8 @@ class LocateResult(Displayed):
         is_in = np.zeros(placement.num_cameras, dtype=np.bool_)
         is_in[placement.cameras[self.kept]] = True
         judged = is_in[placement.graph.edges[placement.edges[placement.pairs]]].all(axis=1)
-        against = [k for k, status in enumerate(self.directions.status) if status in CONTRADICTIONS]
-        num_against = int(np.sum(is_in[self.directions.pairs[against].reshape(-1, 2)].all(axis=1)))
+        against = self.directions.pairs[self.directions.contradicting()]
+        num_against = int(np.sum(is_in[against].all(axis=1)))
         agreeing = int(np.sum(placement.assessment.inliers[placement.pairs] & judged))
         total = int(np.sum(judged)) + num_against
         return agreeing / total if total else math.nan
@@ -316,28 +320,6 @@ def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FurtherPiece:
-    """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
-
-    placement: Placement
-    """Its solution; `placement.piece` is its number."""
-    kept: BoolArray
-    """Which of the placement's cameras are in its model; the others are not trusted enough."""
-    gauge: Gauge
-    """From the solver's units to those of its model, a unit of its own."""
-    reconstruction: "pycolmap.Reconstruction"
-    """Its seeded model."""
-    image_ids: IntArray
-    """(k,) the images of the placement's cameras."""
-
-    @cached_property
-    def camera_rows(self) -> list[CameraRow]:
-        """One row per camera of the piece."""
-        centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
-        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class GraphResult(Displayed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
@@ -347,8 +329,8 @@ class GraphResult(Displayed):
     statement: str
     """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
-    placement: Placement
-    further: tuple[Placement, ...]
+    placement: Judged
+    further: tuple[Judged, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
@@ -372,7 +354,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
+        return report_in_notebook(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

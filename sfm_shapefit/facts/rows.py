@@ -11,23 +11,23 @@ from sfm_shapefit.facts.json_types import Piece
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.graph.rigidity import left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import PairDirections
-from sfm_shapefit.placement.place import Placement, count_large
+from sfm_shapefit.placement.place import count_large
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
-_FILTERED = "left out by the filter"
 _OUTSIDE = "outside the pieces that are solved"
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
 
 
 def camera_rows(
-    placement: Placement,
+    placement: Judged,
     centers: FloatArray,
     scale: float,
-    further: Sequence[Placement] = (),
+    further: Sequence[Judged] = (),
     axes: FloatArray | None = None,
 ) -> list[CameraRow]:
     """Return one row per camera of a placed graph.
@@ -46,7 +46,7 @@ def camera_rows(
     for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
         for camera in placement.pieces[k].nodes.tolist():
             homes[camera] = k
-    reasons = left_out_reasons(placement.considered, placement.pieces)
+    reasons = left_out_reasons(graph, placement.pieces)
     folders: dict[int, list[str]] = {}
     for piece in further:
         for camera in piece.cameras.tolist():
@@ -71,7 +71,7 @@ def camera_rows(
 
 
 def own_camera_rows(
-    placement: Placement, centers: FloatArray, scale: float, axes: FloatArray | None = None
+    placement: Judged, centers: FloatArray, scale: float, axes: FloatArray | None = None
 ) -> list[CameraRow]:
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
     graph, assessment = placement.graph, placement.assessment
@@ -130,7 +130,7 @@ def correlations_of(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.clip(found, -1.0, 1.0))
 
 
-def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:
+def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = ()) -> list[PairRow]:
     """Return one row per pair of cameras.
 
     Args:
@@ -139,13 +139,10 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
         further: the other pieces that are solved; their pairs are judged by them.
     """
     graph = placement.graph
-    judged: dict[int, tuple[Placement, int, float]] = {}
+    judged: dict[int, tuple[Judged, int, float]] = {}
     for piece in (placement, *further):
         dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
-        if not piece.certified.status.has_certificate:
-            dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
-    dropped = set(placement.dropped.tolist())
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
@@ -159,8 +156,7 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             inner = placement.groups is not None and bool(
                 placement.groups.group_of[i] == placement.groups.group_of[j]
             )
-            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
-            rows.append(replace(row, reason=_INNER if inner else elsewhere))
+            rows.append(replace(row, reason=_INNER if inner else _OUTSIDE))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment
@@ -178,7 +174,7 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     return rows
 
 
-def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
+def piece_rows(placement: Judged, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
     """Return what locate.json says of each parallel-rigid piece of three cameras or more, and of the largest.
 
     Args:

@@ -30,7 +30,7 @@ from sfm_shapefit.facts.key_figures import NOISE_ONLY, SOLVER_UNITS, UNITS, key_
 from sfm_shapefit.facts.rows import piece_rows
 from sfm_shapefit.facts.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.facts.warnings import graph_warnings
-from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.judgement.judged import Judged
 
 if TYPE_CHECKING:
     import pycolmap
@@ -156,7 +156,6 @@ def _summarize(
         "figures": key_figures(found.cameras, residuals["quantile_50"], *measures),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
-        "num_pairs_filtered": len(placement.dropped),
         "sigma_of": sigma_of(placement),
         "residual_level_deg": placement.assessment.level_deg,
         "residuals_deg": residuals,
@@ -193,7 +192,7 @@ def _summarize(
     }
 
 
-def sigma_of(placement: Placement) -> str:
+def sigma_of(placement: Judged) -> str:
     """Say what the standard deviations of the cameras know of, and what they are relative to."""
     if placement.adjusted_covariances is None:
         return f"{NOISE_ONLY}; relative to the centroid and scale of the cameras that are held"
@@ -212,7 +211,7 @@ def _pick(kind: Any, source: object) -> Any:
     return None if source is None else {key: getattr(source, key) for key in kind.__annotations__}
 
 
-def residuals_deg(placement: Placement) -> dict[str, float]:
+def residuals_deg(placement: Judged) -> dict[str, float]:
     """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
     residuals = placement.assessment.residuals_deg[placement.pairs]
     facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}

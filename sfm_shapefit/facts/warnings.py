@@ -10,10 +10,11 @@ from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.judgement.uncertainty import standard_deviations
-from sfm_shapefit.pairs.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
-from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
 
@@ -34,11 +35,9 @@ half of the cameras were shifted by a house without a contradiction."""
 _FEWEST_TWOFOLD = 3
 
 
-def quality_warnings(placement: Placement) -> Iterator[str]:
+def quality_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if not placement.certified.status.has_certificate:
-        yield placement.certified.status.value
-    elif placement.certified.status is not Status.CONVERGED:
+    if placement.certified.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
@@ -60,19 +59,19 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
         yield placement.second_configuration.statement()
 
 
-def uncertain_cameras(placement: Placement) -> IntArray:
+def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
     return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
 
 
-def _largest_sigmas(placement: Placement) -> FloatArray:
+def _largest_sigmas(placement: Judged) -> FloatArray:
     """Return the largest of each camera's standard deviations along the axes."""
     return np.asarray(standard_deviations(placement.covariances).max(axis=1))
 
 
-def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
+def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
     largest, uncertain = _largest_sigmas(placement), uncertain_cameras(placement)
     if np.isnan(largest).any():
@@ -106,7 +105,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
             "contradiction behind; compare images of neighboring cameras before trusting them"
         )
-    against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
+    against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
             f"the matches of {against} of {len(directions.pairs)} pairs contradict the given rotations: the "
@@ -114,7 +113,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
         )
 
 
-def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
+def trust_warnings(placement: Judged, kept: BoolArray) -> Iterator[str]:
     """Yield which cameras are left out for want of trust, if any are."""
     lost = np.flatnonzero(~kept)
     if len(lost):
@@ -144,7 +143,7 @@ def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
         )
 
 
-def ambiguity_warnings(placement: Placement) -> Iterator[str]:
+def ambiguity_warnings(placement: Judged) -> Iterator[str]:
     """Yield which cameras stand as well turned as they do as placed."""
     doubts = placement.assessment.doubts
     if doubts is None:
@@ -164,7 +163,7 @@ def focal_warnings(
 ) -> Iterator[str]:
     """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
     for doubt in doubts:
-        advice = "--refine-intrinsics focal lets it change"
+        advice = "--intrinsics focal lets it change"
         if doubt.camera in tried:
             advice = "the adjustment could not tell, so calibrate that camera"
         focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())
@@ -175,7 +174,7 @@ def focal_warnings(
         )
 
 
-def graph_warnings(placement: Placement) -> Iterator[str]:
+def graph_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
     yield from quality_warnings(placement)
     floor = LocateOptions().min_trust
@@ -187,7 +186,7 @@ def graph_warnings(placement: Placement) -> Iterator[str]:
         )
 
 
-def _least_trusted(placement: Placement, rows: IntArray) -> str:
+def _least_trusted(placement: Judged, rows: IntArray) -> str:
     """Return the name of the least trusted of some of the placed cameras, and why it is."""
     worst = int(rows[np.argmin(placement.assessment.trust[rows])])
     return f"{placement.graph.name_of(int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"

@@ -7,11 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
-
-_TOLERANCE = 1e-4
 
 
 def read_json(file: Path) -> Any:
@@ -87,21 +84,6 @@ class JsonNode:
             raise self.error("is no whole number")
         return int(number)
 
-    def rotation(self) -> FloatArray:
-        """Return a (3, 3) rotation given by rows."""
-        rows = self.elements()
-        if len(rows) != 3:
-            raise self.error("is no list of 3 rows")
-        matrix = np.array([row.numbers(3) for row in rows])
-        if not is_rotation(matrix):
-            raise self.error("is no rotation")
-        return matrix
-
     def error(self, what: str) -> InputError:
         """Return the error that names file and key."""
         return InputError(f"{self.file}: {self.where.lstrip('/') or 'the file'} {what}")
-
-
-def is_rotation(matrix: FloatArray) -> bool:
-    """Return whether a (3, 3) matrix is a rotation up to what printing with few digits costs."""
-    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= _TOLERANCE and np.linalg.det(matrix) > 0.0)

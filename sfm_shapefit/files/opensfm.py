@@ -18,38 +18,28 @@ Source: https://opensfm.org/docs/geometry.html and dataset.html.
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.json_node import JsonNode
+from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.scene.posed_model import (
-    Intrinsics,
-    PosedImage,
-    PosedModelFile,
-    model_of_images,
-    observation_arrays,
-)
+from sfm_shapefit.scene.posed_model import Intrinsics, PosedImage, PosedModelFile, model_of_images
 
 _TRACKS_FILE = "tracks.csv"
 _MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
 
 
-def is_opensfm(content: object) -> bool:
-    """Return whether the content of a JSON file is a list of reconstructions."""
-    first = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and "shots" in first
-
-
-def read_opensfm(file: Path, content: object) -> PosedModelFile:
-    """Read the largest reconstruction of a file whose JSON is `content`.
+def read_opensfm(file: Path) -> PosedModelFile:
+    """Read the largest reconstruction of a file.
 
     Raises:
-        InputError: naming the key that is missing or wrong.
+        InputError: if it is no reconstruction.json, or malformed; the message names the key.
     """
-    # Here, since it takes long to import, and every command that reads a model loads this module.
-    from scipy.spatial.transform import Rotation
-
+    content = read_json(file)
+    first = content[0] if isinstance(content, list) and content else None
+    if not (isinstance(first, dict) and "shots" in first):
+        raise InputError(f"{file} is no model: give OpenSfM's reconstruction.json or a COLMAP folder")
     reconstructions = JsonNode(file, "", content).elements()
     chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
     cameras = {key: _camera(node) for key, node in chosen.get("cameras").items()}
@@ -128,4 +118,7 @@ def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntA
             if track in point_of and image in image_of:
                 observed.append((point_of[track], image_of[image]))
                 coordinates.append((x, y))
-    return observation_arrays(observed, coordinates)
+    return (
+        np.array(observed, dtype=np.int64).reshape(-1, 2),
+        np.array(coordinates, dtype=np.float64).reshape(-1, 2),
+    )

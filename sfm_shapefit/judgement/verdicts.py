@@ -1,19 +1,7 @@
 """What the solved locations say of each pair and camera: residual, verdict, uncertainty, trust.
 
-The residual of a pair is the angle between its measured direction and the solved baseline. It is judged
-against its own covariance and an excess s that all pairs share and that no pair can know of itself, above all
-errors of the given rotations:
-
-    chi2_e = r_e^T (Sigma_e + s^2 I)^-1 r_e,    r_e in the tangent plane of v_e.
-
-s makes the median of chi2 over the agreeing pairs what it should be. Whether a pair agrees is judged with the
-level of all residuals in place of s, which is more: neither covariances nor locations are exact. A residual
-is smaller than its error, because the solution bends towards the measurement: over least squares by the
-redundancy 1 - unknowns / equations, while a sum of norms fits as many directions exactly as it has unknowns,
-and leaves the others alone. The locations tell which of the two they come from.
-
-How uncertain the locations are, and how much a pair decides for itself, is `uncertainty`; what all pairs of a
-camera say together is `trust`.
+Residuals, and which pairs agree, are `refinement.agreement`. How uncertain the locations are, and how much a
+pair decides for itself, is `uncertainty`; what all pairs of a camera say together is `trust`.
 """
 
 import enum
@@ -22,11 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import angle_between_deg, distances_in_spreads, normalized, tangent_bases
+from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
@@ -35,24 +22,9 @@ from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.placement.conditioning import LooseGroup, condition
-from sfm_shapefit.solver.program import along, differences
+from sfm_shapefit.refinement.agreement import Agreement, find_agreement, own_covariances
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# Probability that a normal residual counts as wrong; in 3D a chi-square of 25, "5 sigma".
-_OUTLIER_PROBABILITY = 3.7e-6
-# Keeps the quantile below 0.65, so that a third of the pairs may be wrong.
-_LARGEST_FITTED_SHARE = 0.3
-# Share of the equations that unknowns take up, beyond which residuals hardly speak.
-_LARGEST_SHARE = 0.9
-# Of the median residual; a normal residual is below it once in a million times.
-_EXACTLY_FITTED = 1e-3
-# With so large a share of exactly fitted pairs the locations come from a sum of norms.
-_MIN_FITTED_SHARE = 0.02
-# Exact data have a finite information all the same.
-_MIN_LEVEL_RAD = 1e-9
-# Rounds of "who agrees?" and "how large are the residuals of those who do?".
-_LEVEL_ROUNDS = 5
-_BISECTIONS = 50
 # Cameras; two have no shape, so nothing in it is uncertain.
 _SMALLEST_RIGID = 3
 # Directions whose error samples are worked on at a time.
@@ -126,6 +98,7 @@ def assess(
     *,
     undetermined_nodes: IntArray | None = None,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
+    agreement: Agreement | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -136,22 +109,14 @@ def assess(
         undetermined_nodes: nodes whose position is a placeholder, such as those that the refinement reset:
             their standard deviations are infinite, and they hold no others; none if None.
         max_bytes: that the factor for standard deviations may take.
+        agreement: of the same graph with the same locations; found anew if None.
     """
     graph, groups, k = measured.graph, measured.groups, measured.num_cameras
-    freedom = graph.dimension - 1
-    own = np.zeros((graph.num_edges, freedom, freedom))
-    if measured.covariance is not None:
-        own = np.nan_to_num(measured.covariance)
-    baselines = differences(locations, graph.edges)
-    residuals = _tangential_residuals(graph.directions, baselines)
-    behind = along(baselines, graph.directions) <= 0.0
-    num_groups = graph.num_nodes if groups is None else groups.num_groups
-    num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
-    excess, inliers = _excess(residuals, own, behind, num_unknowns)
+    freedom, own = graph.dimension - 1, own_covariances(measured)
+    agreement = agreement or find_agreement(measured, locations)
+    angles, inliers, excess = agreement.angles_rad, agreement.agrees, agreement.excess_rad
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
-
     bases = tangent_bases(graph.directions)
-    angles = np.linalg.norm(residuals, axis=1)
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
@@ -173,7 +138,7 @@ def assess(
         residuals_deg=np.degrees(angles),
         inliers=inliers,
         leverages=leverages,
-        level_deg=float(np.degrees(_level(angles, num_unknowns, freedom))),
+        level_deg=float(np.degrees(agreement.level_rad)),
         excess_deg=float(np.degrees(excess)),
         trust=judged.trust,
         reasons=judged.reasons,
@@ -182,78 +147,6 @@ def assess(
         loose_groups=conditioning.groups,
         covariances=covariances,
     )
-
-
-def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> FloatArray:
-    """Return the residual angles as vectors (m, d - 1) in tangent bases; pi long where cameras coincide."""
-    units = normalized(baselines)
-    angles = np.radians(angle_between_deg(directions, units))
-    tangential = np.einsum("edk,ed->ek", tangent_bases(directions), units)
-    vectors = normalized(tangential) * angles[:, None]  # the angle, also beyond 90 deg
-    lost = ~np.isfinite(vectors).all(axis=1)  # no tangential part: an angle of 0 or pi, or no baseline
-    angles = np.where(np.isnan(angles), np.pi, angles)
-    vectors[lost] = 0.0
-    vectors[lost, 0] = angles[lost]
-    return vectors
-
-
-def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[float, bool]:
-    """Return unknowns / equations, within limits, and whether the residuals are those of a sum of norms."""
-    share = num_unknowns / max(freedom * len(angles), 1)
-    middle = float(np.median(angles[angles > 0.0])) if np.any(angles > 0.0) else 0.0
-    fitted = float(np.mean(angles <= _EXACTLY_FITTED * middle))
-    is_exact = fitted > min(_MIN_FITTED_SHARE, 0.5 * share)
-    return min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE), is_exact
-
-
-def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
-    """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
-    share, is_exact = _fitted_share(angles, num_unknowns, freedom)
-    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
-    quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
-    shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
-    return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
-
-
-def _excess(
-    residuals: FloatArray, own: FloatArray, behind: BoolArray, num_unknowns: int
-) -> tuple[float, BoolArray]:
-    """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
-    freedom = residuals.shape[1]
-    angles = np.linalg.norm(residuals, axis=1)
-    values, vectors = np.linalg.eigh(own)
-    squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
-    limit = chdtri(freedom, _OUTLIER_PROBABILITY)
-    used: BoolArray = np.ones(len(angles), dtype=np.bool_)
-    inliers = used
-    for _ in range(_LEVEL_ROUNDS):
-        level = _level(angles[used], num_unknowns, freedom)
-        inliers = (np.sum(squares / (values + level**2), axis=1) <= limit) & ~behind
-        if not inliers.any():
-            return level, inliers
-        if np.array_equal(inliers, used):
-            break
-        used = inliers
-    share, is_exact = _fitted_share(angles[inliers], num_unknowns, freedom)
-    rank = (1.0 + share) / 2.0 if is_exact else 0.5
-    wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
-    return _matching_excess(squares[inliers], values[inliers], rank, wanted), inliers
-
-
-def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wanted: float) -> float:
-    """Return s, at least the rounding level, at which a quantile of the chi-squares is as wanted."""
-
-    def too_large(excess: float) -> bool:
-        chi2 = np.sum(squares / (np.maximum(variances, 0.0) + excess**2), axis=1)
-        return float(np.quantile(chi2, rank)) > wanted
-
-    low, high = _MIN_LEVEL_RAD, np.pi
-    if not too_large(low):
-        return low
-    for _ in range(_BISECTIONS):
-        middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if too_large(middle) else (low, middle)
-    return high
 
 
 class _Sampled(NamedTuple):

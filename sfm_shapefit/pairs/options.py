@@ -31,9 +31,6 @@ class DirectionOptions(Settings):
         2.0,
         "Largest Sampson error of an inlier; a Sampson error of 2 px allows 2.8 px off the epipolar line.",
     )
-    max_rotation_error_deg: float = option(
-        10.0, "Largest angle between a stored relative rotation and the given ones (relative poses only)."
-    )
     num_hypotheses: int = option(200, "Two-match hypotheses per pair.")
 
     def __post_init__(self) -> None:
@@ -44,5 +41,4 @@ class DirectionOptions(Settings):
         self.check_range("min_sign_majority", 1.0)
         self.check_range("max_sigma_deg", 1e-6, 90.0)
         self.check_range("inlier_threshold_px", 1e-3)
-        self.check_range("max_rotation_error_deg", 1e-6, 180.0)
         self.check_range("num_hypotheses", 1, 10_000)

@@ -21,11 +21,7 @@ class DirectionStatus(enum.Enum):
     NO_PARALLAX = "no parallax: the matches do not determine the direction"
     TWO_MOTIONS = "the matches agree on two different directions"
     AMBIGUOUS_SIGN = "points lie in front of the cameras for either sign of the direction"
-    ROTATION_MISMATCH = "the relative rotation contradicts the given rotations"
 
-
-CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MISMATCH)
-"""The reasons that speak against the given rotations."""
 
 # Good rotations leave so much in any direction; matches that promise more are no better.
 _FLOOR_DEG = 0.05
@@ -58,9 +54,18 @@ class PairDirections:
     covariance: FloatArray
     """(k, 2, 2) covariance of the direction in rad^2, in the basis `tangent_bases(directions)`."""
 
+    def subset(self, rows: IntArray) -> "PairDirections":
+        """Return some rows, in the order given."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        return PairDirections(status=[self.status[row] for row in rows.tolist()], **columns)
+
     def usable(self) -> IntArray:
         """Return the rows that have a direction."""
         return np.flatnonzero(is_usable(self.status))
+
+    def contradicting(self) -> IntArray:
+        """Return the rows whose matches speak against the given rotations."""
+        return np.flatnonzero([value is DirectionStatus.LOW_INLIER_RATIO for value in self.status])
 
     def counts(self) -> dict[DirectionStatus, int]:
         """Return how many pairs have each status, most frequent first."""
@@ -76,17 +81,20 @@ class PairDirections:
         """Return what each pair counts in the program, with median 1 over the usable ones, shape (k,).
 
         w = ratio^2 / sqrt(1 + (sigma / 0.05 deg)^2), not below 0.02 of the median: ratio is the share of the
-        matches that are inliers, sigma the largest standard deviation of the direction. A pair whose
-        uncertainty is not known counts as a certain one. NaN where there is no direction.
+        matches that are inliers, sigma the largest standard deviation of the direction. NaN where there is
+        no direction.
         """
         usable = self.usable()
-        sigmas_deg = np.nan_to_num(self.sigma_deg()[usable])
+        sigmas_deg = self.sigma_deg()[usable]
         ratios = self.num_inliers[usable] / np.maximum(self.num_matches[usable], 1)
         relative = ratios**2 / np.sqrt(1.0 + (sigmas_deg / _FLOOR_DEG) ** 2)
         weights = np.full(len(self.pairs), np.nan)
         if len(usable):
             weights[usable] = np.maximum(relative / np.median(relative), _MIN_WEIGHT)
         return weights
+
+
+_ARRAYS = tuple(item.name for item in fields(PairDirections) if item.name != "status")
 
 
 def first_reasons(*rules: tuple[BoolArray, DirectionStatus]) -> list[DirectionStatus]:

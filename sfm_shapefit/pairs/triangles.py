@@ -12,7 +12,7 @@ shape trouble", CVPR 2018, sections 3 and 4. Written from the paper.
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between, normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency
@@ -23,15 +23,6 @@ _SHARPEST = 20.0
 # Two sides are opposite if one is so near to the other turned round; a noise of 0.05 then bends the
 # plane by 0.3.
 _OPPOSITE_RAD = 0.2
-# This score, in radians, lies between those of wrong pairs, around one, and those of noisy ones.
-_KEPT = 0.2
-
-
-def filter_triangles(
-    graph: ViewGraph, threshold_rad: float = _KEPT, iterations: int = _ITERATIONS
-) -> BoolArray:
-    """Return the (m,) pairs whose score, see `triangle_scores`, stays below the threshold."""
-    return np.asarray(triangle_scores(graph, iterations) < threshold_rad)
 
 
 def triangle_scores(graph: ViewGraph, iterations: int = _ITERATIONS) -> FloatArray:

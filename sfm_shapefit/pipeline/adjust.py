@@ -15,10 +15,15 @@ from sfm_shapefit.adjustment import (
     estimate_covariances,
     isotropic_information,
 )
-from sfm_shapefit.adjustment.sources import read_bundle
-from sfm_shapefit.adjustment.views import read_frames, with_points, with_poses
+from sfm_shapefit.adjustment.sources import collect_tracks
+from sfm_shapefit.adjustment.views import Bounds, observations, views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.points import ModelPictures, move_model, points_of
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.links import ObservedTracks
 
 if TYPE_CHECKING:
     import pycolmap
@@ -60,7 +65,7 @@ def bundle_adjust(
         adjusted = bundle_adjust(model, hold_rotations=True)             # rotations that were measured
         adjusted = bundle_adjust(model, rotation_sigma_deg=0.03)         # or pulled to, so far
 
-    Unlike `locate(..., bundle_adjust=True)`, nothing is triangulated or filtered here. Rigs hold their
+    Unlike `locate(..., adjust="full")`, nothing is triangulated or filtered here. Rigs hold their
     sensors. Lenses that are no case of OPENCV, such as fisheyes, are undistorted and stay what they are.
 
     Args:
@@ -76,18 +81,30 @@ def bundle_adjust(
         InputError: if no posed image observes a point, or a number is impossible.
     """
     options = merge_options(options, AdjustmentOptions, overrides)
-    frames = read_frames(reconstruction, fixed_frames)
-    point_ids, problem = read_bundle(reconstruction, frames)
+    images, points, tracks = read_bundle(reconstruction)
+    has_ray = np.isfinite(tracks.on_plane).all(axis=1)
+    seen = observations(tracks, np.where(has_ray, points.points_seen(), -1))
+    views, bounds = views_of(images), Bounds(np.isin(images.frames.ids, sorted(fixed_frames)))
+    problem = views.problem(images, bounds, points.xyz, seen)
     if rotation_sigma_deg is not None:
-        sigmas = np.full(len(frames.frame_ids), np.radians(rotation_sigma_deg))
-        prior = RotationPrior(rotations=frames.rotations, information=isotropic_information(sigmas))
+        sigmas = np.full(problem.num_frames, np.radians(rotation_sigma_deg))
+        prior = RotationPrior(rotations=problem.rotations, information=isotropic_information(sigmas))
         problem = replace(problem, rotation_prior=prior)
     adjusted = adjust(problem, options)
     found = adjusted.problem
-    moved = replace(frames, rotations=found.rotations, centers=found.centers, lenses=tuple(found.lenses))
+    moved = views.images_of(images, found), replace(points, xyz=found.points)
     return AdjustedModel(
-        reconstruction=with_points(with_poses(reconstruction, frames, moved), point_ids, found.points),
-        frame_ids=frames.frame_ids,
+        reconstruction=move_model(reconstruction, *moved),
+        frame_ids=tuple(images.frames.ids.tolist()),
         adjusted=adjusted,
         covariances=estimate_covariances(found, options) if covariances else None,
     )
+
+
+def read_bundle(reconstruction: "pycolmap.Reconstruction") -> tuple[Images, Points, ObservedTracks]:
+    """Return the posed images of a model in the order of their ids, its points, and the tracks of these."""
+    every = images_of(reconstruction)
+    images = every.part(np.flatnonzero(every.is_posed))
+    images = images.part(np.argsort(images.ids))
+    points = points_of(reconstruction, images)
+    return images, points, collect_tracks(images, ModelPictures(reconstruction, images), points)

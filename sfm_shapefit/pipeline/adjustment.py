@@ -10,21 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement, Uncertainty
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.model import PosedModel, with_frame_rotations
+from sfm_shapefit.files.colmap.model import PosedModel, turned_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
+from sfm_shapefit.pipeline.seed import Located, PosedPart, pose_images, posed_part, read_links
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
@@ -41,9 +42,9 @@ _SAID_OF_MATCHES = (
 
 def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     """Return how given rotations are treated; None: as the matches say."""
-    if options.rotation_sigma_deg:
-        return RotationWeight(sigma_rad=math.radians(options.rotation_sigma_deg))
-    return {"auto": None, "measured": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+    if not isinstance(options.rotations, str):
+        return RotationWeight(sigma_rad=math.radians(options.rotations))
+    return {"auto": None, "held": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
 
 
 def pull_cameras(
@@ -55,8 +56,8 @@ def pull_cameras(
         UnsolvableError: if the factor would take more memory than the options allow.
     """
     pulled = pull_to_priors(located.placement, located.gauge, priors, options)
-    frame_ids = model.frame_ids[pulled.placement.nodes[pulled.anchors.indices]]
-    given = located.given._replace(centers=pulled.anchors._replace(indices=frame_ids))
+    frames = model.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
+    given = located.given._replace(centers=pulled.anchors._replace(indices=frames))
     return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 
@@ -68,9 +69,11 @@ class AfterAdjustment(NamedTuple):
     directions: PairDirections
     """Measured anew at these, as far as they are usable there too."""
     placement: Placement
-    """Moved to the adjusted centers and judged there, by those directions."""
-    adjusted: AdjustedPlacement
+    """Moved to the adjusted centers, with those directions."""
+    adjusted: Estimate
     """How it went."""
+    part: PosedPart
+    """The images that were adjusted, as they were before."""
 
 
 def adjust_placed(
@@ -87,41 +90,37 @@ def adjust_placed(
         UnsolvableError: if no point can be triangulated.
     """
     model, placement = source.model, located.placement
-    fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    seed = seed_of(source, everyone)
-    tracks = read_tracks(source, everyone, seed, clock.advance)
-    adjusted = adjust_placement(seed, tracks, options, weight, fixed_frames=fixed, given=located.given)
-    images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
-    centers = np.array([image.projection_center() for image in images])
-    similarity = located.gauge.similarity
-    locations = (centers - similarity.translation) / similarity.scale
+    posed = posed_part(pose_images(model, everyone))
+    links = read_links(source, everyone, posed, clock.advance)
+    adjusted = adjust_placement(posed.images, links, options, weight, located.given_of(posed, model))
+    del links
+    similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
+    centers[posed.rows] = adjusted.images.centers
+    locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     if not adjusted.weight.hold or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.at(with_frame_rotations(model, adjusted.reconstruction))
-        corrected = np.array(adjusted.frame_ids)[adjusted.weight.singled_out(len(adjusted.frame_ids))]
-        directions = _measure_again(source, directions, np.isin(model.frame_ids, corrected), options, clock)
+        source = source.at(turned_model(model, adjusted.images))
+        corrected = posed.frames[adjusted.weight.singled_out(len(posed.frames))]
+        is_corrected = np.isin(model.images.frame_of, corrected)
+        directions = _measure_again(source, directions, is_corrected, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
             measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
         placement = replace(placement, measured=measured)
-    moved = with_uncertainty(
-        move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
-    )
-    return AfterAdjustment(source, directions, moved, adjusted)
+    return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted, posed)
 
 
-def with_uncertainty(
-    placement: Placement, model: PosedModel, uncertainty: Uncertainty, scale: float
-) -> Placement:
+def with_uncertainty(placement: Judged, model: PosedModel, known: Estimate, scale: float) -> Judged:
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
-    covariances = uncertainty.covariances
-    if not covariances:
+    if known.covariances is None:
         return placement
-    unknown = np.full((3, 3), np.nan)
-    ids = model.image_ids[placement.cameras].tolist()
-    own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
-    return replace(placement, adjusted_covariances=own, scale_sigma=uncertainty.scale_sigma)
+    own = np.full((len(placement.cameras), 3, 3), np.nan)
+    _, rows, there = np.intersect1d(
+        model.image_ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
+    )
+    own[rows] = known.covariances[there] / scale**2
+    return replace(placement, adjusted_covariances=own, scale_sigma=known.scale_sigma)
 
 
 def _measure_again(
@@ -135,8 +134,6 @@ def _measure_again(
 
     Of images whose rotations were clearly wrong, and are `corrected`, it is what their matches say now.
     """
-    if source.kind == "relative-poses":
-        return before
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
     batches = source.view.batches(without=others, advance=clock.advance)

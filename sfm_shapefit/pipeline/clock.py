@@ -2,10 +2,11 @@
 
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sfm_shapefit.base.heap import hand_back_memory
+from sfm_shapefit.base.arrays import hand_back_memory
 from sfm_shapefit.solver.options import IterationInfo
 
 Progress = Callable[[str, int, int], None]
@@ -14,11 +15,18 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(slots=True)
 class Clock:
-    """Measures stages and passes their progress on."""
+    """One run of a command: its seconds by stage, who hears of its progress, and who shares its work."""
 
     progress: Progress = field(default=lambda _stage, _done, _total: None)
     seconds: dict[str, float] = field(default_factory=dict)
     stage: str = ""
+    executor: Executor | None = None
+    """Shares out pairs and tracks among its workers; None: all is done in this process."""
+
+    @classmethod
+    def of(cls, progress: Progress | None, executor: Executor | None = None) -> "Clock":
+        """Return the clock of a run whose caller may want to hear of its progress."""
+        return cls(executor=executor) if progress is None else cls(progress, executor=executor)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

@@ -18,12 +18,11 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gravity import refine_with_gravity
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.trusted import average_consistently
 from sfm_shapefit.scene.given import Gravity
 
-# Our own averaging leaves out what only unsound pairs tie to the rest, or pairs below `min_matches`;
-# pycolmap's what contradicts its answer, too.
+# What only unsound pairs, or pairs below `min_matches`, tie to the rest.
 _UNTIED = (
     "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
     "contradict the rest"
@@ -96,13 +95,13 @@ class ComponentAveraging(NamedTuple):
         """Average rotations, by the arrangement of the frames that the matches speak for."""
 
         def average(some: RelativeRotations) -> AveragedRotations:
-            return average_consistently(
-                num_frames,
-                some,
-                self.options.min_matches,
-                averaging=self.options.averaging,
-                threads=self.options.num_threads(),
-            )
+            used = some.num_matches >= self.options.min_matches
+            if not used.any():
+                raise UnsolvableError(
+                    f"none of {counted(len(used), 'pair')} has {self.options.min_matches} inlier matches; "
+                    "lower min_matches"
+                )
+            return average_relative_rotations(num_frames, some.subset(used), self.options.num_threads())
 
         averaged = average(relative)
         if not evidence.any():

@@ -12,6 +12,7 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.pairs.essential import (
     MANY_PAIRS,
@@ -22,7 +23,6 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.scene.matches import MatchBatch, RayMatches, join_rays
 
 # A pair of so few matches is never sound, see `RelativeRotations.are_sound`.
@@ -56,17 +56,21 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource, directions: PairDirections, options: LocateOptions, among: IntArray | None = None
 ) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted."""
-    if options.rotations == "measured" or source.kind == "relative-poses":
+    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
+
+    Only pairs `among` some images are asked, by their index; None: all.
+    """
+    if options.rotations == "held":
         return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
         return concatenate([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    for batch in source.view.batches():
+    without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
+    for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         likely = None
@@ -91,25 +95,21 @@ def _poses_as_given(model: PosedModel, directions: PairDirections, rows: IntArra
 
 
 def doubt_cameras(
-    placement: Placement,
+    placement: Judged,
     directions: PairDirections,
     relative: RelativeRotations | None,
     model: PosedModel,
-    options: LocateOptions,
-) -> Placement:
+) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
     Args:
         placement: of some of the images.
         directions: of all pairs.
-        relative: what `ask_pairs` returned; if None, trust stays as it is.
+        relative: what `ask_pairs` returned; if None, the given rotations are believed.
         model: that has the given rotations.
-        options: whether these were measured.
     """
-    if options.rotations == "measured":
-        return replace(placement, assessment=believe_rotations(placement.assessment))
     if relative is None:
-        return placement
+        return replace(placement, assessment=believe_rotations(placement.assessment))
     place_of = np.full(model.num_images, -1)
     place_of[placement.cameras] = np.arange(len(placement.cameras))
     pairs = weigh_pairs(directions, _agreements(placement, directions), relative, model.rotations)
@@ -129,11 +129,9 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, options: 
     As `doubt_cameras` judges them, but for the baselines, which are not known yet.
     """
     model = source.model
-    if options.rotations == "measured":
-        return np.ones(model.num_images, dtype=np.bool_)
     relative = ask_pairs(source, directions, options)
     if relative is None:
-        return np.zeros(model.num_images, dtype=np.bool_)
+        return np.ones(model.num_images, dtype=np.bool_)
     pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
     pairs = pairs.subset(_weighed(directions, model.num_images))
     _, labels = np.unique(model.frame_ids, return_inverse=True)
@@ -151,7 +149,7 @@ def question_focal_lengths(
     model = source.model
     images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
     ids, labels = np.unique([image.camera_id for image in images], return_inverse=True)
-    if source.kind != "matches" or not 1 < len(ids) <= _MOST_CAMERAS:
+    if not source.has_database or not 1 < len(ids) <= _MOST_CAMERAS:
         return ()
     kinds = [model.camera(k).model_name for k in range(model.num_images)]
     lenses = Lenses(
@@ -245,7 +243,7 @@ def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> Ra
     )
 
 
-def _agreements(placement: Placement, directions: PairDirections) -> FloatArray:
+def _agreements(placement: Judged, directions: PairDirections) -> FloatArray:
     """Return 1 where a direction agrees with the solution, 0 where not, NaN where it has no part, (k,)."""
     agreements = np.full(len(directions.pairs), np.nan)
     assessment, rows = placement.assessment, placement.pairs

@@ -42,7 +42,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.pipeline.measure import measure_directions
+from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
 
 _FAR_DEG, _FAR_LEVELS = 1.0, 6.0
@@ -79,7 +79,7 @@ def examine(
     Raises:
         InputError: if the model or the database cannot be used.
     """
-    options, clock = LocateOptions(), Clock(progress) if progress else Clock()
+    options, clock = LocateOptions(), Clock.of(progress)
     with clock("read"):
         model = read_model(folder)
         inputs = choose_inputs(folder, database, options.directions)
@@ -110,7 +110,7 @@ def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -
         quality = image_quality(model)
     with clock("directions"):
         try:
-            directions = measure_directions(matches, options, clock)
+            directions = measure(matches, options, clock).directions
         except UnsolvableError:  # no pair shares anything
             directions = None
     pairs, level_deg = _pair_rows(model, directions)

@@ -18,26 +18,27 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
-from sfm_shapefit.baselines import FILTERS, LOCATORS
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.pairs.triplets import score_triplets
+from sfm_shapefit.pipeline.adjust import read_bundle
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.pipeline.inspect import inspect
 from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
-from sfm_shapefit.rotations.average import check_pairs
+from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
-from sfm_shapefit.rotations.trusted import average_consistently
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import IterativeSolver
@@ -75,8 +76,9 @@ def start_by_lud(_folder: Path) -> None:
 
 
 def judge_placement(_folder: Path) -> None:
-    """Judge the answer of a baseline, which takes no solver of ours."""
-    place(_random_graph(), objective="least-squares")
+    """Judge exact locations, which takes no solver."""
+    problem = synthetic.random_graph_problem(20, 0.6, sigma=0.02, q=0.1, seed=1)
+    assess(MeasuredGraph(problem.view_graph), problem.locations)
 
 
 def refine_in_angles(_folder: Path) -> None:
@@ -153,8 +155,8 @@ def locate_model(folder: Path) -> None:
 def locate_from_tracks(folder: Path) -> None:
     """Locate the cameras of a model without a database, and inspect it."""
     model = _workspace(folder, WorkspaceOptions(database=False))
-    locate(model, threads=1, bundle_adjust=True)
-    inspect(model, theory=True)
+    locate(model, threads=1, adjust="full")
+    inspect(model)
 
 
 def locate_rigs(folder: Path) -> None:
@@ -189,21 +191,11 @@ def relate_images(folder: Path) -> None:
     score_triplets(len(found.names), found)
 
 
-def compare_baselines(_folder: Path) -> None:
-    """Place a graph by the objectives and filters that ours are compared with."""
-    graph = _random_graph()
-    for locator in LOCATORS:
-        place(graph, objective=locator)
-    for name in FILTERS:
-        place(graph, filter=name)
-
-
 def average_graphs(_folder: Path) -> None:
     """Average rotations with a factor, and as on large graphs without one."""
     edges = np.ascontiguousarray(_random_graph().edges)
     problem = rotation_problem(20, edges)
-    average_consistently(20, problem.relative, threads=2)
-    average_consistently(20, problem.relative, averaging="pycolmap")
+    average_relative_rotations(20, problem.relative, threads=2)
     given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
     for is_expander in (False, True):
         system = replace(
@@ -228,8 +220,9 @@ def draw_images(folder: Path) -> None:
 
 def adjust_bundle(folder: Path) -> None:
     """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
-    model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
-    adjust_thinly(model, lambda: model)
+    model = read_model(_workspace(folder, WorkspaceOptions(database=False)))
+    images, _, tracks = read_bundle(model.reconstruction)
+    adjust_thinly(images, lambda: tracks)
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
     estimate_covariances(adjusted.problem)
     estimate_center_errors(adjusted.problem, AdjustmentOptions())

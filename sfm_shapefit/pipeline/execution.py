@@ -21,9 +21,8 @@ from functools import partial
 from multiprocessing import get_context, resource_tracker
 from typing import Any, Generic, TypeVar
 
-from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.executors import Advance, ExecutorKind, WorkerError, answers
-from sfm_shapefit.base.extras import MissingExtraError
+from sfm_shapefit.base.errors import MissingExtraError
+from sfm_shapefit.base.executors import Advance, WorkerError, answers
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 Measured = TypeVar("Measured")
@@ -72,31 +71,27 @@ def measure_part(work: PairWork[Measured], part: MatchPart) -> list[Measured]:
 
 
 @contextmanager
-def open_executor(
-    kind: ExecutorKind, workers: int, scheduler: str | None = None
-) -> Iterator[Executor | None]:
+def open_executor(name: str, workers: int) -> Iterator[Executor | None]:
     """Open an executor by its name, and close it in the end.
 
     Args:
-        kind: "serial" is none, "processes" a pool on this machine, "dask" a cluster.
+        name: "serial" is none, "processes" a pool on this machine, "dask" a cluster on this machine, and
+            "dask:ADDRESS" that of a running scheduler. Whoever can reach a scheduler can run code on its
+            workers: keep it inside a trusted network.
         workers: processes on this machine.
-        scheduler: address of a dask scheduler that runs already; a cluster of this machine if None. Whoever
-            can reach a scheduler can run code on its workers: keep it inside a trusted network.
 
     Raises:
-        InputError: if dask is not installed, or a scheduler is named for another executor.
+        MissingExtraError: if dask is not installed.
         WorkerError: if the scheduler cannot be reached.
     """
-    if scheduler is not None and kind != "dask":
-        raise InputError("a scheduler belongs to the executor dask; add --executor dask, or leave it out")
-    if kind == "serial":
+    if name == "serial":
         yield None
-    elif kind == "processes":
+    elif name == "processes":
         # Processes are spawned, because forking clashes with threads.
         with _Pool(workers, mp_context=get_context("spawn")) as pool:
             yield pool
     else:
-        with _dask_client(workers, scheduler) as client:
+        with _dask_client(workers, name.partition(":")[2]) as client:
             yield client.get_executor(retries=_RETRIES)
 
 
@@ -141,13 +136,13 @@ def _interrupts_wait() -> Iterator[None]:
 
 
 @contextmanager
-def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
+def _dask_client(workers: int, scheduler: str) -> Iterator[Any]:
     """Connect to a scheduler, or start a cluster of worker processes here."""
     try:
         from distributed import Client, LocalCluster
     except ModuleNotFoundError:
         raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
-    if scheduler is None:
+    if not scheduler:
         with ExitStack() as opened:
             with _interrupts_wait(), _children_are_not_interrupted():
                 # The port of the dashboard is taken where another run has a cluster.

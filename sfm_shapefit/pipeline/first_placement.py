@@ -5,43 +5,42 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
-from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import AdjustedPlacement
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.measure import build_graph, measure_directions
+from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.rigs import place_cameras
-from sfm_shapefit.pipeline.seed import Located, read_tracks, seed_of
+from sfm_shapefit.pipeline.seed import Located, pose_images, posed_part, read_links
 from sfm_shapefit.placement.gauge import unit_gauge
+from sfm_shapefit.placement.place import Near
 
 
 class FirstPlacement(NamedTuple):
     """What comes out of the adjustment of a first placement."""
 
-    adjusted: AdjustedPlacement
-    """With the intrinsics that it ended with, and how well the centers are known."""
+    adjusted: Estimate
+    """Of the images that the first placement has, in any scale and from any origin."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
     as the others were on average."""
-    centers: FloatArray
-    """(n, 3); NaN for images that the first placement lacks."""
+    stand: Near
+    """Where the images stand."""
 
     def parameters(self) -> dict[int, list[float]]:
         """Return the parameters of the cameras that were free, or turned out to be left open, by their id."""
-        cameras = [*self.adjusted.lenses.sigmas, *self.adjusted.lenses.undetermined]
-        return {i: self.adjusted.reconstruction.camera(i).params.tolist() for i in sorted(set(cameras))}
+        cameras = {*self.adjusted.lenses.sigmas, *self.adjusted.lenses.undetermined}
+        return {lens.id: [*lens.parameters] for lens in self.adjusted.images.lenses if lens.id in cameras}
 
 
 def adjust_first_placement(
@@ -51,41 +50,40 @@ def adjust_first_placement(
     lenses: FreeLenses,
     *,
     thorough: bool = True,
-    executor: Executor | None = None,
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
     Args:
         source: at the averaged rotations.
         rule: what sets the gauge, with the options of the run.
-        clock: hears of progress.
+        clock: of the run.
         lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
-        executor: shares out the pairs of a database; None: all is done here.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
     model, options = source.model, rule.options
-    directions = measure_directions(source, options, clock, executor)
-    measured = rule.rigid.apply(build_graph(source, directions, options))
-    placement = place_cameras(measured, options, clock)
+    measured = measure(source, options, clock, Wanted(tracks=wants_points(source, options)))
+    graph = rule.rigid.apply(build_graph(model, measured))
+    del measured  # arrays of all pairs
+    placement = next(place_cameras(graph, options, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = unit_gauge(placement.locations)
     if placement.unit is not None:  # the offsets of sensors have theirs
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
-    seed = seed_of(source, located)
-    del directions, measured  # arrays of all pairs
-    tracks = partial(read_tracks, source, located, seed, clock.advance)
-    given = GivenPoses(lenses=lenses, free_rigs=options.refine_rigs)
-    adjusted = adjust_thinly(seed, tracks, options, given=given, thorough=thorough)
-    rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
-    centers = np.full((model.num_images, 3), np.nan)
-    for k in np.flatnonzero(posed).tolist():
-        centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
-    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, posed), centers)
+    del graph
+    posed = posed_part(pose_images(model, located))
+    links = partial(read_links, source, located, posed, clock.advance)
+    given = GivenPoses(lenses=lenses, free_rigs=options.rigs == "free")
+    adjusted = adjust_thinly(posed.images, links, options, given, thorough=thorough)
+    rotations, centers = model.rotations.copy(), np.full((model.num_images, 3), np.nan)
+    rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
+    is_posed = np.isin(np.arange(model.num_images), posed.rows)
+    stand = Near(centers, placement.refined)
+    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, is_posed), stand)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

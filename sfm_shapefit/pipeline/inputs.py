@@ -11,9 +11,9 @@ from sfm_shapefit.facts.options import LocateOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.model import PosedModel
-from sfm_shapefit.files.colmap.own_tracks import TrackMatches
 from sfm_shapefit.files.colmap.point_colors import PointColors, read_colors
 from sfm_shapefit.files.colmap.seed import copy_without_keypoints
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.scene.matches import Matches, View
@@ -39,9 +39,9 @@ class MatchSource:
         return self.view.images
 
     @property
-    def kind(self) -> Source:
-        """What directions are made from; never "auto"."""
-        return self.inputs.source
+    def has_database(self) -> bool:
+        """Whether the matches are those of a database; else the model's own tracks serve."""
+        return self.inputs.database is not None
 
     def at(self, model: PosedModel, economy: Economy | None = None) -> "MatchSource":
         """Return the same matches as another model's images see them, or with more that is given up."""
@@ -83,12 +83,12 @@ def see_matches(
         InputError: if there is no way to stay below the limit.
     """
     source = MatchSource(matches=matches, view=matches.at(model, inputs.left_out), inputs=inputs)
-    if options is None or not options.max_memory_mb or source.kind == "tracks":
-        return source  # of tracks, what there is to do is known once they are measured
+    if options is None or not options.max_memory_mb or not source.has_database:
+        return source
     bare = replace(
         source.workload(),
         adjusts=options.adjusts_cameras(model.num_images),
-        adjusts_bundle=options.bundle_adjust,
+        adjusts_bundle=options.adjust == "full",
     )
     work = replace(bare, has_points=options.uses_points(model.num_images))
     return source.at(model, choose_economy(work, bare, options.max_memory_mb))
@@ -138,9 +138,7 @@ def choose_inputs(
     if source == "tracks":
         if database is not None:
             raise InputError("directions from tracks use no database; leave out one of the two")
-        return Inputs(
-            folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
-        )
+        return Inputs(folder=folder, database=None, statement="the model's own tracks, as asked")
     # The pixels of other programs' model files may differ from those of a database beside them.
     is_folder = folder is not None and not folder.is_file()
     found = find_database(folder) if folder is not None and is_folder else None
@@ -149,8 +147,6 @@ def choose_inputs(
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one with --database")
         statement = "the model's own tracks; no database.db was given or found beside the model"
-        return Inputs(folder=folder, database=None, source="tracks", statement=statement)
-    what = "stored relative poses" if source == "relative-poses" else "inlier matches"
-    statement = f"{what} of {path}" + (" (found beside the model)" if database is None else "")
-    chosen: Source = "relative-poses" if source == "relative-poses" else "matches"
-    return Inputs(folder=folder, database=path, source=chosen, statement=statement)
+        return Inputs(folder=folder, database=None, statement=statement)
+    statement = f"inlier matches of {path}" + (" (found beside the model)" if database is None else "")
+    return Inputs(folder=folder, database=path, statement=statement)

@@ -1,6 +1,6 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,21 +10,21 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.graph_text import read_graph
-from sfm_shapefit.files.models import is_model_file
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import (
+    Wanted,
+    add_evidence,
     build_graph,
-    collect_evidence,
     count_work,
-    measure_directions,
-    view_graph,
+    measure,
+    wants_points,
 )
 from sfm_shapefit.pipeline.memory import Forecast, describe_work, forecast
 from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
-from sfm_shapefit.placement.diagnosis import Diagnosis, Theory, diagnose, theory_of
+from sfm_shapefit.placement.diagnosis import Diagnosis, diagnose
 
 if TYPE_CHECKING:
     import pycolmap
@@ -43,8 +43,6 @@ class Inspection(Displayed):
     points: str
     """Whether 3D points join the view graph, and why."""
     diagnosis: Diagnosis
-    theory: Theory | None
-    """None if not asked for."""
     expected: Forecast | None = None
     """The memory that `locate` will take; None for a bare graph."""
     rigs: str = "none: every image is a frame of its own"
@@ -55,13 +53,6 @@ class Inspection(Displayed):
         facts = asdict(self)
         if self.expected is not None:
             facts["expected"] |= {"peak_mb": self.expected.peak_mb}
-        if self.theory is not None and self.theory.conditions is not None:
-            conditions = self.theory.conditions
-            facts["theory"]["conditions"] |= {
-                "granted": conditions.granted,
-                "granted_in_space": conditions.granted_in_space,
-                "feasible": conditions.feasible,
-            }
         return facts
 
     def _headline(self) -> str:
@@ -74,7 +65,6 @@ def inspect(
     database: Path | str | None = None,
     *,
     options: LocateOptions | None = None,
-    theory: bool = False,
     progress: Progress | None = None,
     **overrides: Any,
 ) -> Inspection:
@@ -85,7 +75,6 @@ def inspect(
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
         **overrides: single options by name.
-        theory: also compute the constants of the recovery theorems at the model's centers.
         progress: called as stages advance.
 
     Returns:
@@ -97,39 +86,35 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = merge_options(options, LocateOptions, overrides)
-    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
+    if isinstance(source, Path | str) and Path(source).is_file():
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         graph = read_graph(source)
-        no_theory = Theory(conditions=None, statement="left out: a bare graph has no centers")
         return Inspection(
             directions=f"as given in {source}",
             num_images=graph.num_nodes,
             statuses={DirectionStatus.USABLE.value: graph.num_edges},
             points="no: a bare graph has no matches",
             diagnosis=diagnose(graph, options),
-            theory=no_theory if theory else None,
         )
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress)
     with clock("read"):
         model = read_model(source)
         inputs = choose_inputs(source, database, options.directions)
     with open_source(model, inputs) as matches:
         with clock("directions"):
-            directions = measure_directions(matches, options, clock)
+            measured = measure(matches, options, clock, Wanted(tracks=wants_points(matches, options)))
+            directions = measured.directions
         with clock("diagnosis"):
-            measured = build_graph(matches, directions, options)
-            measured = replace(measured, evidence=collect_evidence(directions))
-            grouped = group_frames(model, measured)
+            with_points = add_evidence(build_graph(model, measured), measured)
+            grouped = group_frames(model, with_points)
             work = describe_work(count_work(matches, directions), grouped, options)
-            pairs = view_graph(model, directions)
             return Inspection(
                 directions=inputs.statement,
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
-                points=options.points_statement(model.num_images, measured.num_points),
-                diagnosis=diagnose(measured, options, confirm_rotations(matches, directions, options)),
-                theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+                points=options.points_statement(model.num_images, with_points.num_points),
+                diagnosis=diagnose(with_points, options, confirm_rotations(matches, directions, options)),
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),
             )

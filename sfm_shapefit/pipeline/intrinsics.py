@@ -29,20 +29,20 @@ def settle_intrinsics(
     Args:
         model: as given, of which nothing changes.
         file: the database, if there is one, which says which intrinsics are guesses.
-        options: `refine_intrinsics`.
+        options: `intrinsics`.
         left_out: pairs that say nothing of focal lengths.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    wanted = options.refine_intrinsics
+    wanted = options.intrinsics
     guessed = {} if file is None else find_uncalibrated(file, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
     origins |= {i: found.origin for i, found in guessed.items()}
-    doubts = {} if wanted == "none" else doubt_lenses(cameras, origins)
+    doubts = {} if wanted == "held" else doubt_lenses(cameras, origins)
     factors = {}
-    if file is not None and guessed and wanted != "none":
+    if file is not None and guessed and wanted != "held":
         asked = [found.database_id for found in guessed.values()]
         by_database = calibrate_view_graph(file, asked, left_out)
         factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}

@@ -47,7 +47,7 @@ _SIGMA_OF = (
 _ARBITRARY = ("unit", "input")
 
 
-class Told(NamedTuple):
+class ToldOfJoins(NamedTuple):
     """What the user told of images of several models."""
 
     priors: PositionPriors | None = None
@@ -70,7 +70,7 @@ def tell_group(
     group: Group,
     models: Sequence[MappedModel],
     matches: Matches,
-    told: Told,
+    told: ToldOfJoins,
     clock: Clock,
 ) -> JoinedModel:
     """Return joined models with what can be said of them.

@@ -18,7 +18,7 @@ from sfm_shapefit.files.colmap.model import PosedModel, observed_points
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.joined import Group, Told, tell_group
+from sfm_shapefit.pipeline.joined import Group, ToldOfJoins, tell_group
 from sfm_shapefit.placement.join import (
     ModelJoin,
     PlacedByPriors,
@@ -50,7 +50,11 @@ class JoinedModels(NamedTuple):
 
 
 def join_models(
-    models: Sequence[MappedModel], unposed: PosedModel, matches: DatabaseMatches, told: Told, clock: Clock
+    models: Sequence[MappedModel],
+    unposed: PosedModel,
+    matches: DatabaseMatches,
+    told: ToldOfJoins,
+    clock: Clock,
 ) -> JoinedModels:
     """Join each model to the first larger one that it can be joined to safely.
 

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Uncertainty
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS
+from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -42,11 +41,11 @@ from sfm_shapefit.pipeline.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.pipeline.gravity import read_gravity
 from sfm_shapefit.pipeline.inputs import choose_inputs, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.joined import Told
+from sfm_shapefit.pipeline.joined import ToldOfJoins
 from sfm_shapefit.pipeline.joins import JoinedModels, join_models
-from sfm_shapefit.pipeline.locate import Locating, locate_source
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.settle import Told, settle
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -79,7 +78,7 @@ def map_database(
         database: with keypoints and two-view geometries, or the folder that holds it as database.db; it is
             never changed. Intrinsics are the database's.
         options: settings, see `help(MapOptions)`; defaults if None.
-        **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
+        **overrides: single options by name: `map_database(database, adjust="full")`.
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
             "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
@@ -95,16 +94,16 @@ def map_database(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = merge_options(options, MapOptions, overrides)
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
-        return _map_opened(_start(file, options, clock, priors)._replace(executor=executor))
+        return _map_opened(_start(file, options, clock, priors))
 
 
 def _map_opened(run: "_Run") -> MapResult:
     """Do what `map_database` does, once the matches are open."""
     options, path, clock = run.options, run.matches.file.path, run.clock
     relative = run.measure()
-    if options.adjust and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
+    if options.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = run.refine_intrinsics(relative)
         if differ_in_rays(known, run.unposed):
             run = run._replace(unposed=known)
@@ -119,7 +118,7 @@ def _map_opened(run: "_Run") -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            told = Told(run.priors, options.known_distance, run.without)
+            told = ToldOfJoins(run.priors, options.known_distance, run.without)
             found = join_models(models, run.unposed, run.matches, told, clock)
     left_out = {
         name: reasons[frame]
@@ -167,8 +166,8 @@ def _start(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path |
         unposed = read_model(images.reconstruction)
         frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
         if not _has_shared_frames(frame_of_image):
-            if options.refine_rigs:
-                raise InputError(f"{path} has no rig of several cameras to refine; leave out refine_rigs")
+            if options.rigs == "free":
+                raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
             if options.scale == "rig":
                 raise InputError(
                     f"{path} has no rig of several cameras to take the scale from; use another scale"
@@ -219,17 +218,14 @@ class _Run(NamedTuple):
     gravity: Gravity | None
     without: PairNames
     """Pairs that are taken for unmatched."""
-    executor: Executor | None = None
-    """Shares out pairs and tracks, if there is one."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
     """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
-            sharing = Sharing(self.options.num_threads(), self.executor, self.clock.advance)
-            source = self.options.relative_rotations
-            return measure_rotations(self.view(), LEAST_MATCHES, source, sharing)
+            sharing = Sharing(self.options.num_threads(), self.clock.executor, self.clock.advance)
+            return measure_rotations(self.view(), LEAST_MATCHES, sharing)
 
     def view(self) -> View[PosedModel]:
         """Return the matches of all images, but for the pairs that are left out."""
@@ -294,9 +290,7 @@ class _Run(NamedTuple):
             with suppress(UnsolvableError):
                 with self.clock("first placement"):
                     free = self.intrinsics.free
-                    first = adjust_first_placement(
-                        source, rule, self.clock, free, thorough=False, executor=self.executor
-                    )
+                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
                 found = first.parameters() | found
         return with_parameters(self.unposed, found)
 
@@ -374,33 +368,28 @@ class _Run(NamedTuple):
             inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         averaged = see_matches(self.matches, model, inputs, options)
-        source, centers, uncertainty = averaged, None, Uncertainty()
-        intrinsics, sensors = self.intrinsics, NO_SENSORS
-        if self.options.adjust:
+        source, first, intrinsics = averaged, None, self.intrinsics
+        if self.options.adjust != "none":
             with self.clock("first placement"):
                 rule = GaugeRule(model, rigid, options, priors)
-                first = adjust_first_placement(
-                    averaged, rule, self.clock, intrinsics.free, executor=self.executor
-                )
-            centers, uncertainty = first.centers, first.adjusted.uncertainty
+                first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
             intrinsics = intrinsics.after(first.adjusted.lenses)
-            sensors = first.adjusted.sensors
             source = averaged.at(self._pose_as(image_ids, first))
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-        locating = Locating(
+        told = Told(
+            inputs,
             rigid,
-            priors,
-            self.executor,
-            centers=centers,
-            uncertainty=uncertainty,
-            intrinsics=intrinsics,
-            sensors=sensors,
-            rigs=sensors_of(model.reconstruction),
+            RotationWeight(),
+            priors=priors,
             control=control,
             gravity=gravity,
+            intrinsics=intrinsics,
+            rigs=sensors_of(model.reconstruction),
+            near=first,
         )
         with self.clock("locate"):
-            found = locate_source(source, locating, options, Clock(self.clock.progress))
+            own = Clock.of(self.clock.progress, self.clock.executor)
+            found = settle(source, told, options, own)
         ends = members[found.directions.pairs].tolist()
         unknown = (np.nan, np.nan)
         scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
@@ -428,7 +417,7 @@ class _Run(NamedTuple):
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = _has_shared_frames(self.frame_of_image[members])
-        settings["refine_rigs"] = settings["refine_rigs"] and has_rigs
+        settings["rigs"] = settings["rigs"] if has_rigs else "held"
         if settings["scale"] == "rig" and not has_rigs:  # that of other components
             settings["scale"] = "auto"
         is_told = bool(known or has_priors or has_rigs or self.options.control_points)
@@ -439,7 +428,7 @@ class _Run(NamedTuple):
 
     def _pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
         """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
-        rigs = self.images.rigs.with_sensors_of(first.adjusted.reconstruction)
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
         run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
         return run._pose(image_ids, first.rotations, first.parameters())
 

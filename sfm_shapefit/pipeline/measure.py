@@ -1,8 +1,8 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
-from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,23 +10,18 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
-from sfm_shapefit.pairs.estimate import estimate_directions, from_relative_poses
-from sfm_shapefit.pairs.pair_directions import (
-    CONTRADICTIONS,
-    DirectionStatus,
-    PairDirections,
-    concatenate,
-)
+from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
-from sfm_shapefit.tracks.node_tracks import build_tracks, covering_set, join_points
+from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
 # Beyond so many pairs standard deviations take the pairs as independent.
@@ -39,28 +34,95 @@ _ADVICE = {
 """What to do where no pair has a direction, by the most frequent reason."""
 
 
-def measure_directions(
-    source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
-) -> PairDirections:
-    """Return the direction of every pair that the source has; an executor shares them out, if it can."""
-    model, view = source.model, source.view
-    if source.kind == "relative-poses":
-        poses = relative_poses(view)
-        if len(poses.pairs) == 0:
-            raise UnsolvableError("the database has no stored relative pose; use directions from matches")
-        return from_relative_poses(poses, model.rotations, options)
-    if executor is not None and source.kind != "tracks":
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Measured:
+    """What one pass over the matches tells."""
+
+    directions: PairDirections
+    """Of all pairs."""
+    tracks: Tracks | None = None
+    """Points seen by three cameras or more, which may become nodes; None where they were not asked for."""
+    errors: list[FloatArray] | None = None
+    """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
+    where directions count as independent."""
+
+
+class Wanted(NamedTuple):
+    """What a pass over the matches is to tell beside the directions."""
+
+    tracks: bool = False
+    errors: bool = False
+
+
+DIRECTIONS = Wanted()
+"""Nothing beside them."""
+
+
+def measure(
+    source: MatchSource, options: LocateOptions, clock: Clock, wanted: Wanted = DIRECTIONS
+) -> Measured:
+    """Measure the direction of every pair that the source has, and what is wanted beside, in one pass.
+
+    Workers of an executor estimate the directions of a database's pairs; what is wanted beside takes a second
+    pass then.
+
+    Raises:
+        UnsolvableError: if no pair has a match.
+    """
+    threads, beside = options.num_threads(), _Beside(source, options, wanted)
+    if clock.executor is not None and source.has_database:
         work = PairWork(estimate=partial(estimate_directions, options=options))
-        parts = measure_with_workers(view, work, executor, clock.advance)
+        parts = measure_with_workers(source.view, work, clock.executor, clock.advance)
+        if parts and any(wanted):
+            directions = concatenate(parts)
+            row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
+            for batch in source.view.batches():
+                rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
+                beside.add(batch, directions.subset(rows))
     else:
-        threads = options.num_threads()
-        batches = view.batches(advance=clock.advance)
-        parts = [estimate_directions(batch, options, threads) for batch in batches]
+        parts = []
+        for batch in source.view.batches(advance=clock.advance):
+            parts.append(estimate_directions(batch, options, threads))
+            beside.add(batch, parts[-1])
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
         )
-    return concatenate(parts)
+    return Measured(directions=concatenate(parts), tracks=beside.tracks(), errors=beside.errors)
+
+
+class _Beside:
+    """What is made of each batch beside its directions."""
+
+    def __init__(self, source: MatchSource, options: LocateOptions, wanted: Wanted) -> None:
+        view, threshold_px = source.view, options.inlier_threshold_px
+        self._threshold_px, self._num_usable = threshold_px, 0
+        self.errors: list[FloatArray] | None = [] if wanted.errors else None
+        self._joiner = None
+        if wanted.tracks:
+            self._joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
+
+    def add(self, batch: MatchBatch, directions: PairDirections) -> None:
+        """Take a batch and its directions."""
+        if self._joiner is not None:
+            self._joiner.add(batch, directions)
+        usable = directions.usable()
+        self._num_usable += len(usable)
+        if self._num_usable > _MAX_SAMPLED_PAIRS:
+            self.errors = None
+        if self.errors is not None:
+            sampled = sample_direction_errors(
+                batch,
+                directions.directions,
+                directions.covariance,
+                SIGMA_PER_MEDIAN * directions.median_residual_px,
+                self._threshold_px,
+            )
+            self.errors.append(sampled[usable])
+
+    def tracks(self) -> Tracks | None:
+        """Return the tracks, if they are wanted."""
+        return None if self._joiner is None else self._joiner.tracks()
 
 
 def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
@@ -82,87 +144,58 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def build_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> MeasuredGraph:
-    """Return the measured graph, with 3D points as further nodes if the options want them."""
-    model, view = source.model, source.view
+def wants_points(source: MatchSource, options: LocateOptions) -> bool:
+    """Return whether 3D points join the view graph."""
+    return options.uses_points(source.model.num_images) and source.economy.points
+
+
+def build_graph(model: PosedModel, measured: Measured) -> MeasuredGraph:
+    """Return the graph of the usable directions, with 3D points as further nodes if there are tracks."""
+    directions, tracks = measured.directions, measured.tracks
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
-    if not (options.uses_points(model.num_images) and source.economy.points):
+    if tracks is None:
         return MeasuredGraph(graph, covariance=covariance)
-    tracks = build_tracks(view.batches(), directions, options.inlier_threshold_px, view.num_keypoints)
     chosen = tracks.subset(covering_set(tracks, model.num_images))
     return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 
 
-def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
-    """Return whether the errors of the directions are sampled together."""
-    if source.kind == "relative-poses" or not source.economy.samples:
-        return False
-    return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
-
-
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:
     """Return what there is to do, as far as it is known once the directions are measured."""
+    usable = directions.usable()
+    is_sampled = source.economy.samples and len(usable) <= _MAX_SAMPLED_PAIRS
     return replace(
         source.workload(),
         num_pairs=len(directions.pairs),
         num_matches=int(directions.num_matches.sum()),
-        num_sampled=len(directions.usable()) if samples_errors(source, directions) else 0,
+        num_sampled=len(usable) if is_sampled else 0,
     )
 
 
-def sample_errors(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
-) -> FloatArray | None:
-    """Return samples of the usable directions' errors, which share keypoints; None if not known."""
-    if not samples_errors(source, directions):
-        return None
-    row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
-    usable = directions.usable()
-    place = np.full(len(directions.pairs), -1)
-    place[usable] = np.arange(len(usable))
-    errors = np.zeros((len(usable), NUM_SAMPLES, 2))
-    for batch in source.view.batches():
-        rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
-        found = sample_direction_errors(
-            batch,
-            directions.directions[rows],
-            directions.covariance[rows],
-            SIGMA_PER_MEDIAN * directions.median_residual_px[rows],
-            options.inlier_threshold_px,
-        )
-        kept = place[rows] >= 0
-        errors[place[rows[kept]]] = found[kept]
-    return errors
+def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
+    """Return the graph with what the matches say of its cameras; a direction to a point has one match.
 
-
-def collect_evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
-    """Return what the matches say of the cameras beyond the usable directions."""
-    usable = directions.usable()
-    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
-    return Evidence(
-        support=directions.num_matches[usable],
+    The errors of directions to points are independent draws of their own covariance. The samples of
+    `measured` are given up part by part, since they are the largest arrays of a placement.
+    """
+    assert graph.covariance is not None
+    directions, usable = measured.directions, measured.directions.usable()
+    own = graph.covariance[len(usable) :]
+    against = directions.contradicting()
+    errors = None
+    if measured.errors is not None:
+        errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, own.shape[1]))
+        filled = 0
+        while measured.errors:
+            part = measured.errors.pop(0)
+            errors[filled : filled + len(part)] = part
+            filled += len(part)
+        drawn = errors[filled:]  # in place
+        np.random.default_rng(0).standard_normal(out=drawn)
+        drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
+    evidence = Evidence(
+        support=np.concatenate([directions.num_matches[usable], np.ones(len(own), dtype=np.int64)]),
         contradicting=directions.pairs[against].reshape(-1, 2),
         contradicting_support=directions.num_matches[against],
         errors=errors,
     )
-
-
-def add_evidence(
-    measured: MeasuredGraph, source: MatchSource, directions: PairDirections, options: LocateOptions
-) -> MeasuredGraph:
-    """Return the measured graph with what the matches say; a direction to a point has one match.
-
-    The errors of directions to points are independent draws of their own covariance.
-    """
-    evidence = collect_evidence(directions, sample_errors(source, directions, options))
-    assert measured.covariance is not None
-    own = measured.covariance[len(evidence.support) :]
-    support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
-    errors = evidence.errors
-    if errors is not None:
-        sampled, errors = errors, np.empty((len(errors) + len(own), *errors.shape[1:]))
-        errors[: len(sampled)] = sampled
-        drawn = errors[len(sampled) :]  # in place: these are the largest arrays of a placement
-        np.random.default_rng(0).standard_normal(out=drawn)
-        drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
-    return replace(measured, evidence=replace(evidence, support=support, errors=errors))
+    return replace(graph, evidence=evidence)

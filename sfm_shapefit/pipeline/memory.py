@@ -178,8 +178,6 @@ def keep_within_memory(
     )
     if not economy.factor:
         options = replace(options, factor_memory_mb=NO_FACTOR, refine=False)
-    if not economy.adjustment:
-        options = replace(options, adjust=False)
     return economy, measured if economy.points else bare, options
 
 
@@ -200,7 +198,7 @@ def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOption
         num_sampled=graph.num_edges if work.num_sampled else 0,
         has_points=measured.num_points > 0,
         adjusts=options.adjusts_cameras(work.num_images),
-        adjusts_bundle=options.bundle_adjust,
+        adjusts_bundle=options.adjust == "full",
         factor_entries=entries,
         needs_factor=needs_factor,
     )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import sfm_shapefit.pipeline.notebook_page  # noqa: F401  so that results show their report in notebooks
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
@@ -15,16 +15,50 @@ from sfm_shapefit.files.g2o import is_g2o, read_g2o, read_g2o_rotations
 from sfm_shapefit.files.glomap_text import is_relative_poses, read_relative_poses
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.placement.place import place, place_further
+from sfm_shapefit.placement.place import place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.rotations.rotation_averaging import average_rotations
+from sfm_shapefit.rotations.average import average_rotations
+from sfm_shapefit.solver.options import OnIteration
 
 if TYPE_CHECKING:
     import pycolmap
 
 MAX_ROTATION_ERROR_DEG = 10.0
+
+
+def place(
+    measured: MeasuredGraph | ViewGraph,
+    options: PlacementOptions | None = None,
+    *,
+    on_iteration: OnIteration | None = None,
+    **overrides: Any,
+) -> Judged:
+    """Place the largest rigid piece of a view graph: both convex starts, refinement, verdicts, trust.
+
+        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
+        placed = place(graph)
+        placed.cameras, placed.locations, placed.assessment.trust
+
+    This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
+    collapses on long chains and under heavy corruption.
+
+    Args:
+        measured: any view graph with at least one edge, best with what is known of its directions; what its
+            largest rigid piece leaves out is not placed.
+        options: settings, see `help(PlacementOptions)`; defaults if None.
+        on_iteration: as of `place_pieces`.
+        **overrides: single options by name: `place(graph, refine=False)`.
+
+    Raises:
+        InputError, UnsolvableError: as `place_pieces`.
+    """
+    options = merge_options(options, PlacementOptions, overrides)
+    graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
+    return judge(next(place_pieces(graph, options, on_iteration=on_iteration)), options)
 
 
 def place_graph_file(
@@ -45,7 +79,7 @@ def place_graph_file(
             see `formats.read_g2o`, or a pose graph.
         options: settings; defaults if None.
         rotations: of the cameras of relative poses: 1DSfM's rots.txt, see `formats.read_rotations`, or the
-            vertices of a g2o file; averaged by pycolmap if None.
+            vertices of a g2o file; averaged if None, see `average_rotations`.
         max_rotation_error_deg: relative poses whose rotation contradicts those of the cameras by more are
             left out, as `locate` leaves them out.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
@@ -57,7 +91,7 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress)
     cam_from_world, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -65,7 +99,8 @@ def place_graph_file(
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
         with clock("rotations"):
-            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg)
+            threads = options.num_threads()
+            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg, threads)
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
@@ -75,15 +110,15 @@ def place_graph_file(
         if reverse:
             graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
-        placement = place(graph, options, on_iteration=clock.iteration)
-    with clock("further pieces"):
-        further = tuple(place_further(placement, options))
+        placed = list(place_pieces(MeasuredGraph(graph), options, on_iteration=clock.iteration))
+    with clock("trust"):
+        judged = [judge(piece, options) for piece in placed]
     return GraphResult(
         path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
         statement=statement,
         options=options,
-        placement=placement,
-        further=further,
+        placement=judged[0],
+        further=tuple(judged[1:]),
         timings_s=clock.seconds,
         geometries=geometries,
         rotations=cam_from_world,
@@ -102,7 +137,7 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
 
 
 def _orient(
-    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float
+    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float, threads: int
 ) -> tuple[ViewGraph, FloatArray, str]:
     """Return the directions of the pairs that agree with the rotations, of a file or averaged, and these."""
     if path is not None:
@@ -110,8 +145,10 @@ def _orient(
         (rotations, known), origin = read(path, geometries.names), f"of {path}"
     else:
         total = len(geometries.names)
-        rotations, known = average_rotations(total, geometries.pairs, geometries.rotations)
-        origin = "averaged by pycolmap"
+        averaged = average_rotations(
+            geometries.pairs, geometries.rotations, num_images=total, threads=threads
+        )
+        rotations, known, origin = averaged.rotations, averaged.registered, "averaged"
     agreeing = np.flatnonzero(geometries.mismatch_deg(rotations) <= max_rotation_error_deg)
     total, kept = len(geometries.pairs), len(agreeing)
     if kept == 0:

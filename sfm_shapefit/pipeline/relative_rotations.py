@@ -5,15 +5,15 @@ from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 from sfm_shapefit.base.executors import Advance, nobody
-from sfm_shapefit.facts.options import MapOptions, Relative
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
+    RelativeSource,
     concatenate,
     estimate_relative_rotations,
     stored_relative_rotations,
@@ -22,6 +22,7 @@ from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotatio
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.scene.matches import View
+from sfm_shapefit.solver.options import SolverOptions
 
 # About a second of work, be they many pairs of few matches or few of many.
 _MATCHES_PER_TASK = 100_000
@@ -49,7 +50,7 @@ def relative_rotations(
     database: Path | str,
     *,
     min_matches: int = LEAST_MATCHES,
-    source: Relative = "matches",
+    source: RelativeSource = "matches",
     threads: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -77,15 +78,20 @@ def relative_rotations(
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options = MapOptions(relative_rotations=source, threads=threads)
+    options = SolverOptions(threads=threads)
+    if source not in get_args(RelativeSource):
+        raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    clock = Clock(progress) if progress else Clock()
+    clock = Clock.of(progress)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         model = read_model(read_images(file).reconstruction)
         view = DatabaseMatches(file, model.names).at(model)
         sharing = Sharing(options.num_threads(), executor, clock.advance)
-        found = measure_rotations(view, min_matches, source, sharing)
+        if source == "stored":
+            found = stored_relative_rotations(view, min_matches)
+        else:
+            found = measure_rotations(view, min_matches, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 
@@ -93,15 +99,13 @@ def relative_rotations(
 def measure_rotations(
     view: View[PosedModel],
     min_matches: int = LEAST_MATCHES,
-    source: Relative = "matches",
     sharing: Sharing | None = None,
 ) -> RelativeRotations:
-    """Return the relative rotations of a database.
+    """Return relative rotations estimated from matches; pairs are indices into the model's images.
 
     Args:
         view: of images with the identity as their rotation (see `database_images`).
         min_matches: pairs with fewer inlier matches are left out.
-        source: estimated from the matches, or as stored.
         sharing: one thread if None.
 
     Raises:
@@ -109,8 +113,6 @@ def measure_rotations(
         WorkerError: if a worker died and the executor does not replace it.
     """
     sharing = sharing or Sharing()
-    if source == "stored":
-        return stored_relative_rotations(view, min_matches)
     if sharing.executor is None:
         parts = _estimate_here(view, min_matches, sharing)
     else:

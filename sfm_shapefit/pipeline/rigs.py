@@ -5,23 +5,27 @@ has them: two or more are one group, whose offsets are their centers; of a singl
 taken.
 """
 
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
+from sfm_shapefit.placement.place import Near, Placement, place_pieces
+from sfm_shapefit.placement.tied_groups import is_scaled
+from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Extent of the fixed centers, of their distance from the origin, that counts as none.
@@ -57,8 +61,8 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
-    if options.refine_rigs and not model.has_rigs:
-        raise InputError("the model has no rig of several cameras to refine; leave out refine_rigs")
+    if options.rigs == "free" and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
     if count and has_priors:
         raise InputError(
             "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"
@@ -76,7 +80,7 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
             f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
             "points"
         )
-    refuse_options_of_groups(options)
+    refuse_admm(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
@@ -108,31 +112,40 @@ def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
-def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock) -> Placement:
-    """Place the measured graph; with rigid groups, 3D points take part only where they are needed.
+def place_cameras(
+    measured: MeasuredGraph, options: LocateOptions, clock: Clock, near: Near | None = None
+) -> Iterator[Placement]:
+    """Place the rigid pieces of a graph; with rigid groups, 3D points take part only where they are needed.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     hand_back_memory()  # of what the graph was made of
+    placed = partial(place_pieces, options=options, near=near, on_iteration=clock.iteration)
     if measured.groups is None or not measured.num_points or options.points == "always":
-        return place(measured, options, on_iteration=clock.iteration)
+        yield from placed(measured)
+        return
+    first = second = None
+    with suppress(UnsolvableError):
+        first = next(placed(measured.without_points()))
+    held = 0 if first is None else _count_held(first, options)
+    if first is not None and held == len(first.cameras):
+        yield first
+        return
     try:
-        first = place(measured.without_points(), options, on_iteration=clock.iteration)
+        second = next(placed(measured))
     except UnsolvableError:
-        return place(measured, options, on_iteration=clock.iteration)
-    if not first.assessment.loose_groups:
-        return first
-    try:
-        second = place(measured, options, on_iteration=clock.iteration)
-    except UnsolvableError:
-        return first
-    return second if _count_held(second) > _count_held(first) else first
+        if first is None:
+            raise
+    is_better = second is not None and (first is None or _count_held(second, options) > held)
+    found = second if is_better else first
+    assert found is not None
+    yield found
 
 
-def _count_held(placement: Placement) -> int:
+def _count_held(placement: Placement, options: LocateOptions) -> int:
     """Return how many of the placed cameras do not hang loose."""
-    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+    loose = sum(len(group.cameras) for group in judge(placement, options).assessment.loose_groups)
     return len(placement.cameras) - loose
 
 

@@ -1,28 +1,28 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.adjusted import Adjusted
 from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
-from sfm_shapefit.adjustment.filter import filter_in_place
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.adjustment.sources import TrackSource, collect_matches
-from sfm_shapefit.adjustment.structure import triangulate_in_place
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
+from sfm_shapefit.adjustment.structure import triangulate
+from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.base.heap import hand_back_memory
 from sfm_shapefit.facts.options import LocateOptions
-from sfm_shapefit.facts.result import FurtherPiece
+from sfm_shapefit.files.colmap.filter import PointRules, filter_in_place
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.own_tracks import triangulate_own_tracks
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
+from sfm_shapefit.files.colmap.points import ModelPictures, add_points, points_of
 from sfm_shapefit.files.colmap.seed import build_seed, transform_model, turn_model
+from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
     ObservationShares,
     count_observations,
@@ -33,8 +33,10 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
-from sfm_shapefit.placement.place import Placement, place_further
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import PULLED
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.links import MatchedKeypoints
 
 if TYPE_CHECKING:
     import pycolmap
@@ -56,12 +58,20 @@ class Located(NamedTuple):
     rule: GaugeRule | None = None
     """What sets the gauge, and again after bundle adjustment; "unit" if None."""
     given: GivenPoses = GivenPoses()
-    """The rotations of the input, and position priors that pull at the cameras and hold the gauge by that."""
+    """What is known of the frames of the model: the rotations of the input, and position priors that pull at
+    the cameras and hold the gauge by that."""
 
     @property
     def cameras(self) -> IntArray:
         """The images that are in the output, ascending."""
         return self.placement.cameras[self.kept]
+
+    def given_of(self, posed: "PosedPart", model: PosedModel) -> GivenPoses:
+        """Return what is known of the frames of some posed images of the model."""
+        fixed = np.zeros(len(model.images.frames.ids), dtype=np.bool_)
+        if self.fixed is not None:
+            fixed[model.images.frame_of[self.fixed]] = True
+        return self.given._replace(fixed=fixed).of(posed.frames)
 
 
 class Seeded(NamedTuple):
@@ -70,7 +80,7 @@ class Seeded(NamedTuple):
     reconstruction: "pycolmap.Reconstruction"
     gauge: Gauge
     """From the solver's units to its own."""
-    adjusted: Adjusted | None
+    adjusted: Estimate | None
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
     """By the id of each image that was left out because it sees too few points, or hardly any of those that
@@ -82,11 +92,10 @@ class Seeded(NamedTuple):
 
     def moved(self, reconstruction: "pycolmap.Reconstruction", gauge: Gauge) -> "Seeded":
         """Return the same model in another gauge."""
-        adjusted = self.adjusted and replace(self.adjusted, reconstruction=reconstruction)
-        return self._replace(reconstruction=reconstruction, gauge=gauge, adjusted=adjusted)
+        return self._replace(reconstruction=reconstruction, gauge=gauge)
 
 
-def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
+def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
     kept: BoolArray = placement.assessment.trust >= min_trust
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
@@ -98,7 +107,6 @@ def build_seeded_model(
     options: LocateOptions,
     clock: Clock,
     colors: PointColors | None = None,
-    executor: Executor | None = None,
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
@@ -106,33 +114,13 @@ def build_seeded_model(
     from matches take the colors of the input's, if it had any. An executor shares out the tracks that are
     triangulated where nothing is adjusted.
     """
-    adjusted, gauge = None, located.gauge
+    gauge = located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
-    with clock("structure"):
-        seed = seed_of(source, located)
-        tracks = read_tracks(source, located, seed, clock.advance)
-    if not options.bundle_adjust:
-        with clock("triangulation"):
-            triangulate_in_place(seed, tracks, options, clock.advance, executor)
-            del tracks
-            filter_in_place(seed, options)
-            seeded = seed
-    else:  # which triangulates at the seed's poses itself
-        with clock("bundle adjustment"):
-            adjusted = bundle_adjust(
-                seed,
-                tracks,
-                options,
-                adjuster=options.adjuster,
-                fixed_frames=frames,
-                given=located.given,
-            )
-            seeded = adjusted.reconstruction
-            del tracks
+    seeded, adjusted = _make_points(source, located, options, clock)
     hand_back_memory()  # of the tracks, before their matches are read again
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     shares, unsupported = ObservationShares(math.nan, math.nan), dict[int, int]()
-    if source.kind != "tracks":  # points of the model's own tracks have their colors already
+    if source.has_database:  # points of the model's own tracks have their colors already
         batches = source.view.batches()
         counts = count_observations(seeded, source.model, batches, options.max_reprojection_error_px)
         unsupported = images_without_support(seeded, counts, frames)
@@ -146,14 +134,45 @@ def build_seeded_model(
     if poor:
         lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
         located = located._replace(kept=located.kept & ~lost)
-    is_held = located.given.centers is not None and options.adjuster == "own"
+    is_held = located.given.centers is not None
     if (adjusted is not None or poor) and not is_held:
         seeded, gauge = _set_gauge(seeded, source.model, located)
     elif gauge.axes is not None:
         seeded = turn_model(seeded, gauge.axes)
-    if adjusted is not None:
-        adjusted = replace(adjusted, reconstruction=seeded)
     return Seeded(seeded, gauge, adjusted, poor, frozenset(unsupported), shares)
+
+
+def _make_points(
+    source: MatchSource, located: Located, options: LocateOptions, clock: Clock
+) -> "tuple[pycolmap.Reconstruction, Estimate | None]":
+    """Return the seed with points, filtered, and how bundle adjustment went, if it was asked for."""
+    model, adjusted, links = source.model, None, None
+    own = None if source.has_database else model.reconstruction
+    rules = PointRules(
+        options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
+    )
+    with clock("structure"):
+        images = pose_images(model, located)
+        seed = build_seed(model, images, source.view.keypoints if source.has_database else None)
+        posed = posed_part(images)
+        if own is None or options.adjust == "full":
+            links = read_links(source, located, posed, clock.advance)
+    with clock("bundle adjustment" if options.adjust == "full" else "triangulation"):
+        if options.adjust == "full":  # which triangulates at the seed's poses itself
+            assert links is not None
+            adjusted, points = bundle_adjust(posed.images, links, options, located.given_of(posed, model))
+            put_images(seed, adjusted.images)
+        elif own is not None:
+            points = triangulate_own_tracks(seed, posed.images, own, rules, clock.advance, clock.executor)
+        else:
+            assert isinstance(links, MatchedKeypoints)
+            points = triangulate(posed.images, links, options, clock.advance, clock.executor)
+        del links
+        add_points(seed, posed.images, points, own)
+        filter_in_place(seed, rules)
+    if adjusted is not None:
+        adjusted = replace(adjusted, final_error_px=seed.compute_mean_reprojection_error())
+    return seed, adjusted
 
 
 def _set_gauge(
@@ -196,51 +215,36 @@ def _state(before: Gauge, after: Gauge) -> str:
     return f"{after.statement}{mark}{pulled}"
 
 
-def place_further_pieces(
-    source: MatchSource,
-    placement: Placement,
-    options: LocateOptions,
-    judge: Callable[[Placement], Placement],
-    colors: PointColors | None = None,
-) -> tuple[FurtherPiece, ...]:
-    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own.
+class PosedPart(NamedTuple):
+    """The placed images of a model, in the order of their ids: that of the sums of an adjustment."""
 
-    What is trusted of a piece is what `judge` makes of it, as of the largest one.
-    """
-    pieces = []
-    for further in map(judge, place_further(placement, options)):
-        kept = select_trusted(further, options.min_trust)
-        gauge = unit_gauge(further.locations[kept])
-        seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock(), colors)
-        pieces.append(
-            FurtherPiece(
-                placement=further.without_error_samples(),
-                kept=kept & ~np.isin(source.model.image_ids[further.cameras], list(seeded.poor)),
-                gauge=seeded.gauge,
-                reconstruction=seeded.reconstruction,
-                image_ids=source.model.image_ids[further.cameras],
-            )
-        )
-    return tuple(pieces)
+    images: Images
+    rows: IntArray
+    """(i,) their rows in the model."""
+    frames: IntArray
+    """(f,) rows of their frames among those of the model."""
 
 
-def seed_of(source: MatchSource, located: Located) -> "pycolmap.Reconstruction":
-    """Return the model with its cameras moved, without points."""
-    model, placement = source.model, located.placement
-    is_placed = np.zeros(model.num_images, dtype=np.bool_)
-    is_placed[located.cameras] = True
-    centers = np.full((model.num_images, 3), np.nan)
-    centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
-    return build_seed(model, is_placed, centers, source.view.keypoints, located.fixed)
+def pose_images(model: PosedModel, located: Located) -> Images:
+    """Return the images of the model where they are placed, fixed ones as they were; NaN where neither."""
+    locations = located.placement.locations[located.kept]
+    placed = model.images.placed(located.cameras, located.gauge.similarity.apply(locations))
+    if located.fixed is None:
+        return placed
+    frames, fixed = placed.frames, np.zeros((len(placed.frames.ids), 1), dtype=np.bool_)
+    fixed[model.images.frame_of[located.fixed]] = True
+    return placed.posed(frames.rotations, np.where(fixed, model.images.frames.centers, frames.centers))
 
 
-def read_tracks(
-    source: MatchSource,
-    located: Located,
-    seed: "pycolmap.Reconstruction",
-    advance: Advance,
-) -> TrackSource:
-    """Return the tracks to triangulate at the poses of a seed; all rays are forgotten.
+def posed_part(images: Images) -> PosedPart:
+    """Return those of a model's images that have a pose."""
+    rows = np.flatnonzero(images.is_posed)
+    rows = rows[np.argsort(images.ids[rows])]
+    return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
+
+
+def read_links(source: MatchSource, located: Located, posed: PosedPart, advance: Advance) -> Links:
+    """Return what joins the keypoints of placed images; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
@@ -248,6 +252,11 @@ def read_tracks(
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
-    if source.kind == "tracks":  # which are not made of matches
-        return model.reconstruction
-    return collect_matches(seed, model.image_ids, links, view.num_matches)
+    if not source.has_database:  # the model has its tracks already
+        pictures = ModelPictures(model.reconstruction, posed.images)
+        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
+    rows = posed.rows.tolist()
+    pictures = ModelPictures(model.reconstruction, posed.images, lambda k: view.keypoints(rows[k]))
+    place = np.full(model.num_images, -1)
+    place[posed.rows] = np.arange(len(posed.rows))
+    return collect_matches(posed.images, pictures, place, links, view.num_matches)

@@ -64,13 +64,12 @@ FURTHER = (
     "average_graphs",
     "map_matches",
     "relate_images",
-    "compare_baselines",
     "draw_images",
 )
 """Examples of the rest."""
 
 # Kernels of these rooms are compiled by further examples only, all but one.
-_ROOMS_OF_FURTHER = ("baselines", "rotations", "synthetic", "theory.py")
+_ROOMS_OF_FURTHER = ("rotations", "synthetic")
 # Each process takes 300 MB.
 _MOST_PROCESSES = 8
 _KERNEL = re.compile(r"^@kernel\s+def (\w+)", re.MULTILINE)

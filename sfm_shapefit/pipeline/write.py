@@ -1,4 +1,4 @@
-"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`, scenes if wanted.
+"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`.
 
 Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each. A
 bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `map.json` beside them; models
@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
+from sfm_shapefit.base.display import draw_pages_by
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.joins import JoinedModel
 from sfm_shapefit.facts.map_result import MapResult
-from sfm_shapefit.facts.result import FurtherPiece, GraphResult, LocateResult
+from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import folder_of, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_json, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
@@ -30,7 +31,6 @@ class WriteOptions(Settings):
         (), "Paths that the folder must not be or contain, beside the inputs of the result."
     )
     report: bool = option(True, "Write report.html, one page that explains the result and works offline.")
-    scene: bool = option(False, "Write scene.glb and scene.ply, cameras and points for any 3D viewer.")
     images: Path | str = option("", "Folder of the images, of which report.html is to have small pictures.")
 
 
@@ -88,12 +88,12 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     if isinstance(found, LocateResult):
         write_model(found.reconstruction, folder)
     for piece in found.further:
-        placement = piece.placement if isinstance(piece, FurtherPiece) else piece
+        placement = piece.placement if isinstance(piece, LocateResult) else piece
         subfolder = folder / folder_of(placement.piece)
         subfolder.mkdir(parents=True)
-        if isinstance(piece, FurtherPiece):
+        if isinstance(piece, LocateResult):
             write_model(piece.reconstruction, subfolder)
-            rows = piece.camera_rows
+            rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)
         write_rows(rows, CameraRow, dimension, subfolder / "cameras.csv")
@@ -102,8 +102,8 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     if isinstance(found, LocateResult) and found.doubtful_pairs:
         write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
     write_json(facts, folder / MARKER)
-    if options.report or options.scene:
-        _draw(found, folder, options)
+    if options.report:
+        _report(found, folder, options)
 
 
 def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
@@ -112,13 +112,23 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
     write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
     write_json(found.summary(), folder / MARKER)
-    if options.report or options.scene:
-        _draw(found, folder, options)
+    if options.report:
+        _report(found, folder, options)
 
 
-def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
-    """Write the report and the scenes that are wanted."""
-    from sfm_shapefit.report.mesh import write_meshes
+def draw_page(found: LocateResult | GraphResult) -> str:
+    """Return the page of a result's report, as notebooks show it."""
+    from sfm_shapefit.report.page import report_html
+    from sfm_shapefit.report.read_back import draw_result
+
+    return report_html(draw_result(found), found.summary())
+
+
+draw_pages_by(draw_page)
+
+
+def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
+    """Write report.html."""
     from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.read_back import draw_result, read_output
     from sfm_shapefit.report.thumbnails import thumbnails_of
@@ -127,8 +137,4 @@ def _draw(found: LocateResult | GraphResult | JoinedModel, folder: Path, options
         drawing, facts = read_output(folder)
     else:
         drawing, facts = draw_result(found), found.summary()
-    if options.report:
-        pictures = thumbnails_of(drawing, options.images)
-        write_report(drawing, facts, folder / "report.html", pictures)
-    if options.scene:
-        write_meshes(drawing, folder)
+    write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, left_out_reasons
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -37,12 +37,9 @@ from sfm_shapefit.placement.place import count_large, order_pieces, refuse_witho
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import has_second_start
 from sfm_shapefit.solver.solve import choose_method
-from sfm_shapefit.theory import RecoveryConditions, recovery_conditions
 
 WRONG_SCORE_RAD = 0.3
 """Mean angle to its triangles from which a pair counts as wrong; see above."""
-MAX_THEORY_CAMERAS = 2000
-"""The constants of the theorems take time with the cube of the cameras: minutes here."""
 
 # Beyond so many pairs, which take half a minute, nothing is said of corruption.
 _MAX_SCORED_PAIRS = 200_000
@@ -117,14 +114,6 @@ class Diagnosis:
     obstacle: Annotated[str, "Why nothing can be placed; empty if something can."]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Theory:
-    """The constants of the recovery theorems for given centers, or why they are left out."""
-
-    conditions: RecoveryConditions | None
-    statement: str
-
-
 def diagnose(
     measured: MeasuredGraph | ViewGraph,
     options: PlacementOptions | None = None,
@@ -176,28 +165,6 @@ def diagnose(
         plan=None if obstacle else _plan_placement(graph.restricted_to(pieces[0].edges)[0], options),
         obstacle=obstacle,
     )
-
-
-def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory:
-    """Return what the paper's theorems grant for the graph of all pairs and given centers.
-
-    Args:
-        graph: the pairs with usable directions; cameras without any are left aside.
-        centers: (n, d) true, or as good as true, centers of its cameras.
-        threads: the result does not depend on it.
-    """
-    joined, cameras = graph.restricted_to(np.arange(graph.num_edges))
-    if len(cameras) > MAX_THEORY_CAMERAS:
-        return Theory(
-            conditions=None,
-            statement=f"left out: {len(cameras)} cameras, and the time grows with their cube; at most "
-            f"{MAX_THEORY_CAMERAS} are looked at",
-        )
-    try:
-        found = recovery_conditions(centers[cameras], joined.edges, threads=threads)
-    except InputError as error:
-        return Theory(conditions=None, statement=f"left out: {error}")
-    return Theory(conditions=found, statement=_granted_in_words(found))
 
 
 def _find_weak_cameras(
@@ -277,13 +244,6 @@ def _in_triangle(graph: ViewGraph) -> BoolArray:
 
 def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlacement:
     """Return what a placement would do with the largest piece."""
-    if not options.solves_shapefit:
-        return PlannedPlacement(
-            solver=options.objective,
-            solver_reason="as asked; ShapeFit is not solved, so nothing is certified",
-            second_start=False,
-            finish="the baseline's answer is kept as it is",
-        )
     choice = choose_method(piece, options)
     second = has_second_start(piece)
     if options.objective == "shapefit":
@@ -299,19 +259,3 @@ def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlace
     return PlannedPlacement(
         solver=choice.method, solver_reason=choice.reason, second_start=second, finish=finish
     )
-
-
-def _granted_in_words(found: RecoveryConditions) -> str:
-    """Say what the theorems grant."""
-    if not found.typicality.holds:
-        return "the theorems say nothing here: the graph is p-typical for no p"
-    eps = max(found.granted, found.granted_in_space)
-    if eps == 0.0:
-        return "the theorems say nothing here: a constant is 0, as where three cameras are on a line"
-    wrong = int(eps * found.num_cameras)
-    if wrong == 0:
-        return (
-            f"recovery is granted for a share eps = {eps:.1e} of wrong pairs at every camera, which is less "
-            f"than one pair of {found.num_cameras} cameras: the theorems promise nothing here"
-        )
-    return f"recovery is granted whatever {wrong} wrong pairs at every camera are (eps = {eps:.1e})"

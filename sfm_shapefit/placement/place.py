@@ -1,4 +1,4 @@
-"""A measured graph placed: split into pieces, each solved, refined and judged.
+"""A measured graph placed: split into pieces, each solved and refined.
 
 Directions say nothing of the scale between two rigid pieces, nor of where they lie, so each is a placement of
 its own. The largest is the answer; the others are kept apart. Rigid groups, such as the frames of rigs and
@@ -6,29 +6,27 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.heap import hand_back_memory
-from sfm_shapefit.base.settings import merge_options
-from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
-from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
-from sfm_shapefit.refinement.options import Filter, PlacementOptions
+from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit
+from sfm_shapefit.refinement.agreement import Agreement, find_agreement
+from sfm_shapefit.refinement.near import stay_near
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.solve import refuse_admm, solve_groups
 from sfm_shapefit.solver.solve import solve
 
 SMALLEST_PIECE = 3
@@ -37,36 +35,36 @@ _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
+class Near(NamedTuple):
+    """Where an adjustment has cameras already."""
+
+    locations: FloatArray
+    """(n, 3) of all cameras, in any scale and from any origin; NaN for those it lacks."""
+    refined: RefinedPlacement
+    """The placement that it started from."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Placement(Displayed):
-    """The locations of one rigid piece of a measured graph, and the evidence for them."""
+    """The locations of one rigid piece of a measured graph, and which directions agree with them."""
 
     measured: MeasuredGraph
     """The whole graph."""
-    dropped: IntArray
-    """Its edges that the filter left out, ascending."""
     pieces: list[RigidPiece]
-    """The parallel-rigid pieces of the others, most cameras first; or the one of tied rigid groups."""
+    """Its parallel-rigid pieces, most cameras first; or the one of tied rigid groups."""
     piece: int
     """The one that is placed: 0, the largest, or one of the further ones."""
     certified: SolverResult
-    """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
-    `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
+    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to its
+    edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
-    assessment: Assessment
-    """Evidence at these locations for the same nodes and edges, in the solver's units."""
-    second_configuration: SecondConfiguration | None
-    """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
+    agreement: Agreement
+    """Which of these edges agree with these locations."""
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
     unit: float | None
     """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
-    adjusted_covariances: FloatArray | None = None
-    """(k, 3, 3) of the centers of `cameras` where an adjustment has them, squared solver's units; NaN where
-    they are not known, None without an adjustment."""
-    scale_sigma: float | None = None
-    """Relative standard deviation of the scale, where an adjustment knows it."""
 
     @property
     def graph(self) -> ViewGraph:
@@ -99,15 +97,6 @@ class Placement(Displayed):
         return self.refined.locations[: len(self.cameras)]
 
     @property
-    def covariances(self) -> FloatArray:
-        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only."""
-        directions = self.assessment.covariances[: len(self.cameras)]
-        if self.adjusted_covariances is None:
-            return directions
-        known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
-        return np.where(known, self.adjusted_covariances, directions)
-
-    @property
     def edges(self) -> IntArray:
         """The edges of the graph that place them, ascending."""
         return self.pieces[self.piece].edges
@@ -123,14 +112,9 @@ class Placement(Displayed):
         return len(self.measured.pairs)
 
     @property
-    def considered(self) -> ViewGraph:
-        """The whole graph without the edges that the filter left out."""
-        return _drop_edges(self.graph, self.dropped)[0]
-
-    @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
-        rejected = self.pairs[~self.assessment.inliers[self.pairs]]
+        rejected = self.pairs[~self.agreement.agrees[self.pairs]]
         return np.asarray(self.graph.edges[self.edges[rejected]])
 
     def summary(self) -> dict[str, Any]:
@@ -140,8 +124,7 @@ class Placement(Displayed):
             "num_placed": len(self.nodes),
             "num_pairs": self.num_pairs,
             "num_pairs_rejected": len(self.rejected_pairs),
-            "num_pairs_filtered": len(self.dropped),
-            "residual_level_deg": self.assessment.level_deg,
+            "residual_level_deg": float(np.degrees(self.agreement.level_rad)),
             "start": self.refined.start,
             "solve": self.certified.summary(),
         }
@@ -150,7 +133,7 @@ class Placement(Displayed):
         rejected = f"{len(self.rejected_pairs)} of {self.num_pairs} pairs rejected"
         return f"{len(self.nodes)} of {self.graph.num_nodes} nodes placed, {rejected}"
 
-    def without_error_samples(self) -> "Placement":
+    def without_error_samples(self) -> Self:
         """Return the placement without the samples of its directions' errors, its largest arrays."""
         evidence = self.measured.evidence
         if evidence is None:
@@ -163,121 +146,95 @@ class Placement(Displayed):
         return self.measured.part(self.edges)[0]
 
 
-def place(
-    measured: MeasuredGraph | ViewGraph,
-    options: PlacementOptions | None = None,
+def place_pieces(
+    measured: MeasuredGraph,
+    options: PlacementOptions,
     *,
+    near: Near | None = None,
     on_iteration: OnIteration | None = None,
-    **overrides: Any,
-) -> Placement:
-    """Place the cameras of a view graph: pieces, both convex starts, refinement, verdicts, trust.
-
-        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
-        placed = place(graph)
-        placed.cameras, placed.locations, placed.assessment.trust
-
-    This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
-    collapses on long chains and under heavy corruption.
+) -> Iterator[Placement]:
+    """Place the rigid pieces of a measured graph, each with a scale of its own, most cameras first.
 
     Args:
-        measured: any view graph with at least one edge, best with what is known of its directions; what its
-            largest rigid piece leaves out is not placed.
-        options: settings, see `help(PlacementOptions)`; defaults if None.
-        on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
-            False ends the solve there, and the placement goes on from the last iterate.
-        **overrides: single options by name: `place(graph, refine=False)`.
+        measured: with at least one edge, best with what is known of its directions.
+        options: settings.
+        near: a piece all of whose cameras are there is solved for its certificate only: they stay where the
+            adjustment has them.
+        on_iteration: called after each iteration of the largest piece's solve, on graphs where that costs
+            little; returning False ends the solve there, and the placement goes on from the last iterate.
+
+    Yields:
+        The largest piece, and further ones of three cameras or more but for those that the solver refuses.
 
     Raises:
         InputError: if an option does not go with rigid groups.
         UnsolvableError: if a graph of many cameras has no three that are rigid, if the pairs do not tie its
             rigid groups to one another, or see `solve`.
     """
-    if isinstance(measured, ViewGraph):
-        measured = MeasuredGraph(measured)
-    options = merge_options(options, PlacementOptions, overrides)
-    dropped, pieces = _split(measured, options)
-    return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
-
-
-def place_further(placement: Placement, options: PlacementOptions | None = None) -> Iterator[Placement]:
-    """Place the further rigid pieces of at least three cameras, each with a scale of its own.
-
-    Args:
-        placement: the graph and its largest piece.
-        options: as they were given to `place`.
-
-    Yields:
-        Placements, most cameras first; a piece that the solver refuses is left out.
-    """
-    options = options or PlacementOptions()
-    for k in range(1, count_large(placement.pieces, placement.num_cameras)):
-        try:
-            yield _place_piece(placement.measured, placement.dropped, placement.pieces, k, options)
-        except UnsolvableError:
-            continue
+    pieces = _split(measured, options)
+    yield _place_piece(measured, pieces, 0, options, near, on_iteration)
+    for k in range(1, count_large(pieces, measured.num_cameras)):
+        with suppress(UnsolvableError):
+            yield _place_piece(measured, pieces, k, options, near)
 
 
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
 def _place_piece(
     measured: MeasuredGraph,
-    dropped: IntArray,
     pieces: list[RigidPiece],
     k: int,
     options: PlacementOptions,
+    near: Near | None = None,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
-    """Solve piece k, refine it robustly, and judge its pairs and cameras."""
+    """Solve piece k, refine it robustly, and see which directions agree."""
     part, _ = measured.part(pieces[k].edges)
     solved, history = _solve_part(part, options, on_iteration)
-    refined = refine_starts(part, solved, options)
+    nodes = pieces[k].nodes
+    centers = None if near is None else near.locations[nodes[nodes < measured.num_cameras]]
+    if near is None or centers is None or not np.isfinite(centers).all():
+        refined = refine_starts(part, solved, options)
+    else:
+        refined = stay_near(part, solved, centers, near.refined)
     unit = None if part.groups is None else measure_unit(part, refined.locations)
-    assessment, second = _judge(part, pieces[k].nodes, refined, options)
     return Placement(
         measured=measured,
-        dropped=dropped,
         pieces=pieces,
         piece=k,
         certified=solved,
         refined=refined,
-        assessment=assessment,
-        second_configuration=second,
+        agreement=find_agreement(part, refined.locations),
         history=history,
         unit=unit,
     )
 
 
 @one_blas_thread()
-def replace_locations(
-    placement: Placement, refined: RefinedPlacement, options: PlacementOptions
-) -> Placement:
-    """Return a placement with other locations of the same nodes, judged anew."""
-    assessment, second = _judge(placement.measured_part(), placement.nodes, refined, options)
-    return replace(
-        placement,
-        refined=refined,
-        assessment=assessment,
-        second_configuration=second,
-        adjusted_covariances=None,
-        scale_sigma=None,
-    )
+def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
+    """Return a placement with other locations of the same nodes, and which directions agree with these.
+
+    What was judged of a placement is not of these.
+    """
+    moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
+    moved["refined"] = refined
+    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations)
+    return Placement(**moved)
 
 
-def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:
-    """Return the edges that the filter leaves out, and the pieces of the others, most cameras first."""
+def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiece]:
+    """Return the pieces, most cameras first; or the one of tied rigid groups."""
     if measured.groups is not None:
-        refuse_options_of_groups(options)
-        return np.zeros(0, dtype=np.int64), [find_tied_piece(measured)]
-    dropped = _filter_pairs(measured, options.filter)
-    considered, edge_of = _drop_edges(measured.graph, dropped)
-    pieces = order_pieces(considered, measured.num_cameras)
-    refuse_without_triangle(considered, pieces, measured.num_cameras)
-    return dropped, [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
+        refuse_admm(options)
+        return [find_tied_piece(measured)]
+    pieces = order_pieces(measured.graph, measured.num_cameras)
+    refuse_without_triangle(measured.graph, pieces, measured.num_cameras)
+    return pieces
 
 
 def _solve_part(
     part: MeasuredGraph, options: PlacementOptions, on_iteration: OnIteration | None
 ) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
-    """Return the optimum of the convex program, or a baseline's answer, and the iterations that led to it."""
+    """Return the optimum of the convex program, and the iterations that led to it."""
     history: list[IterationInfo] = []
 
     def watch(info: IterationInfo) -> bool | None:
@@ -287,45 +244,9 @@ def _solve_part(
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
         solved = solve_groups(part.graph, part.groups, options, watched)
-    elif options.solves_shapefit:
-        solved = solve(part.graph, options, on_iteration=watched)
     else:
-        solved = solve_baseline(part.graph, options.objective)
+        solved = solve(part.graph, options, on_iteration=watched)
     return solved, tuple(history)
-
-
-def _judge(
-    part: MeasuredGraph, nodes: IntArray, refined: RefinedPlacement, options: PlacementOptions
-) -> tuple[Assessment, SecondConfiguration | None]:
-    """Return the verdicts on a refined part, whose nodes these are in the whole graph."""
-    hand_back_memory()  # of the solve, before the samples are propagated
-    assessment = assess(
-        part,
-        refined.locations,
-        undetermined_nodes=refined.reset_nodes,
-        max_bytes=options.factor_memory_mb * 1_000_000,
-    )
-    second = find_second_configuration(part.graph, part.pairs, assessment.inliers, assessment.level_deg)
-    return assessment, None if second is None else replace(second, cameras=nodes[second.cameras])
-
-
-def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:
-    """Return the edges that a filter leaves out; it looks at pairs of cameras only."""
-    pairs = measured.pairs
-    if name == "none":
-        return pairs[:0]
-    dropped: IntArray = pairs[~FILTERS[name](measured.pair_graph)]
-    if len(dropped) == len(pairs):
-        raise UnsolvableError(
-            f"the filter {name} leaves none of the {len(pairs)} pairs; use another, or none"
-        )
-    return dropped
-
-
-def _drop_edges(graph: ViewGraph, dropped: IntArray) -> tuple[ViewGraph, IntArray]:
-    """Return a graph of the same nodes without some of its edges, and the index of each edge that is left."""
-    kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    return graph.subset(kept) if len(dropped) else graph, kept
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

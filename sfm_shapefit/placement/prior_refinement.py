@@ -23,7 +23,7 @@ class Pulled(NamedTuple):
     """A placement after position priors pulled at it."""
 
     placement: Placement
-    """Refined on directions and priors together, and judged anew."""
+    """Refined on directions and priors together."""
     gauge: Gauge
     """That of before; its statement says by how much the priors moved cameras."""
     anchors: KnownPositions
@@ -65,7 +65,7 @@ def pull_to_priors(
         reset_nodes=np.setdiff1d(refined.reset_nodes, held),
     )
     return Pulled(
-        replace_locations(placement, kept, options),
+        replace_locations(placement, kept),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),
         weighted_anchors(anchors, moved),
     )

@@ -7,26 +7,15 @@ scale of their offsets; the others hang free, with any scale.
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece
-from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # The largest offset, of the median baseline, below which the scale of the offsets means nothing.
 _LEAST_UNIT = 1e-6
-
-
-def refuse_options_of_groups(options: PlacementOptions) -> None:
-    """Raise InputError for options that rigid groups do not go with."""
-    if not options.solves_shapefit or options.filter != "none":
-        raise InputError(
-            "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
-        )
-    refuse_admm(options)
 
 
 def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:

@@ -6,9 +6,8 @@ from typing import Literal
 from sfm_shapefit.base.settings import explained, option
 from sfm_shapefit.solver.options import SolverOptions
 
-Filter = Literal["none", "1dsfm", "triangles"]
 Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
-Objective = Literal["auto", "shapefit", "lud", "least-squares", "linf"]
+Objective = Literal["auto", "shapefit", "lud"]
 
 
 @explained
@@ -20,24 +19,11 @@ class PlacementOptions(SolverOptions):
         "auto",
         'Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which '
         "does not collapse on long chains, refines both and keeps the one that fits the angles "
-        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its '
-        'fit. "least-squares" and "linf" are those baselines\' own answers, unrefined and without any '
-        "certificate, for comparison.",
-    )
-    filter: Filter = option(
-        "none",
-        'What drops pairs before anything is solved: "1dsfm", those that contradict the order of the '
-        'cameras along random axes; "triangles", those that contradict their triangles. Goes with '
-        "every objective.",
+        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit.',
     )
     refine: bool = option(
         True, 'Refine the start robustly in the angles of the directions; only for "auto" and "lud".'
     )
-
-    @property
-    def solves_shapefit(self) -> bool:
-        """Whether ShapeFit is solved, which alone is certified."""
-        return self.objective in ("auto", "shapefit", "lud")
 
     @property
     def refines(self) -> bool:

@@ -29,7 +29,7 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
-from sfm_shapefit.solver.options import SolverResult, Status
+from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
@@ -51,8 +51,10 @@ _LUD_PAIRS = 1_000_000
 _POINT_WEIGHT = 10.0
 # A relative difference of costs that says nothing where the starts disagree.
 _TIE = 1e-3
-# The width of the kernel at which unrefined starts are compared at most.
-_OPENING_RAD = 0.1
+# Length of a pair, as a share of the mean of all, below which its cameras stand in one place.
+_POINT_LENGTH = 1e-6
+OPENING_RAD = 0.1
+"""Largest width of the kernel at which unrefined starts are compared."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,7 +83,7 @@ class RefinedPlacement:
     locations: FloatArray
     """(n, d) centered, scaled like the solver's."""
     start: str
-    """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
+    """The program they come from: "ShapeFit" or "LUD"."""
     is_refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -146,17 +148,15 @@ def refine_starts(
     Args:
         measured: connected and parallel rigid, or rigid groups that are tied to one another, in which case
             every pair joins two of them.
-        solved: its certified ShapeFit solution, or a baseline's answer, which is kept as it is.
+        solved: its certified ShapeFit solution.
         options: which starts, and whether to refine.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    is_baseline = solved.status is Status.NOT_SOLVED
-    refines = options.refines and not is_baseline
-    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.num_threads())
-    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if refines else None)
+    lud, second = _find_second_start(measured, options.num_threads())
+    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    candidates = [(solved.method if is_baseline else "ShapeFit", solved.locations)]
+    candidates = [("ShapeFit", solved.locations)]
     if second is not None:
         candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
@@ -168,10 +168,8 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = starts[0], "the baseline's own answer, as asked"
-    if not is_baseline:
-        kept, reason = _choose(starts, costs, apart, options)
-    if problem.normal_solver is None and refines:
+    kept, reason = _choose(graph, starts, costs, apart, options)
+    if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _measure_moves(kept)
     # To the bit: the certificate is that of these very locations.
@@ -214,7 +212,7 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
         lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
-    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
+    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, OPENING_RAD)
     found = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
         locations = lud_over_groups(_weight_points(graph, classes, point_weight), groups)
@@ -247,7 +245,13 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     first = np.cumsum(degree) - degree
     ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
-    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
+    return np.asarray(np.maximum(0.5 * (low + high), _POINT_LENGTH * np.mean(lengths)))
+
+
+def _is_point(graph: ViewGraph, t: FloatArray) -> bool:
+    """Return whether most cameras of a start stand in one point, where angles say nothing any more."""
+    lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
+    return bool(np.median(lengths) <= _POINT_LENGTH * np.mean(lengths))
 
 
 def _refine_start(
@@ -310,13 +314,17 @@ def _common_levels(problem: _Problem, starts: list[Start]) -> FloatArray:
     """Return the levels at which costs are compared: the smallest of each class that a start ended with."""
     ended = [start.refined.levels_rad for start in starts if start.refined is not None]
     if not ended:
-        opening = np.full(int(problem.metric.classes.max()) + 1, _OPENING_RAD)
+        opening = np.full(int(problem.metric.classes.max()) + 1, OPENING_RAD)
         ended = [residual_levels(problem.graph, start.locations, problem.metric, opening) for start in starts]
     return np.asarray(np.min(ended, axis=0))
 
 
 def _choose(
-    starts: list[Start], costs: dict[str, float], apart: float | None, options: PlacementOptions
+    graph: ViewGraph,
+    starts: list[Start],
+    costs: dict[str, float],
+    apart: float | None,
+    options: PlacementOptions,
 ) -> tuple[Start, str]:
     """Return the start to keep and the reason."""
     by_name = {start.name: start for start in starts}
@@ -328,6 +336,8 @@ def _choose(
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
     assert apart is not None
+    if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
+        return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
     name = "LUD" if difference < 0.0 else "ShapeFit"
     if apart <= COLLAPSED:

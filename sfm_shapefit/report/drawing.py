@@ -1,4 +1,4 @@
-"""What is drawn of a result: cameras, pairs and points as plain arrays. Page, meshes and viewer share it.
+"""What is drawn of a result: cameras, pairs and points as plain arrays. Page and mesh share it.
 
 Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
 made of a result in memory or of its files. Positions are in the output's units and axes; what has no

@@ -13,7 +13,7 @@ from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, read_rows
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.report.drawing import Drawing, build_drawing, poses_of
 
 
@@ -33,6 +33,13 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
         input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
         history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
     )
+
+
+def draw_model(model: PosedModel) -> Drawing:
+    """Return the drawing of a model's posed images and points, without pairs and trust."""
+    centers = zip(model.names, model.centers.tolist(), strict=True)
+    rows = [CameraRow(name=name, placed=True, center=tuple(center)) for name, center in centers]
+    return build_drawing(rows, [], poses=poses_of(model, model.names), points=model.reconstruction)
 
 
 def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:

@@ -8,7 +8,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
-from sfm_shapefit.rotations.options import Averaging
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -22,8 +21,7 @@ class AveragedRotations(Displayed):
     sigmas_deg: FloatArray
     """(n,) standard deviation of each rotation per axis, relative to the mean turn of all. It counts errors
     of pairs as independent; what they share, as errors of the calibration, comes on top. Infinite where the
-    pairs that agree do not tie the image to the largest part of the others, NaN without rotation, or where
-    the averaging does not say."""
+    pairs that agree do not tie the image to the largest part of the others, NaN without rotation."""
     agreements: FloatArray
     """(n,) of the weight of each image's pairs, the share that agrees within 5 deg; NaN where it has none."""
     best_agreements: FloatArray
@@ -32,7 +30,6 @@ class AveragedRotations(Displayed):
     """Of the weight of all pairs of registered images: what agrees within 5 deg."""
     num_pairs: int
     """Pairs whose residuals count in the answer."""
-    averaging: Averaging = "own"
     num_tried: int = 1
     """How many answers it was chosen from."""
     num_repeated: int = 0
@@ -70,9 +67,8 @@ class AveragedRotations(Displayed):
     def statement(self) -> str:
         """How the rotations were found, for the user."""
         tried = f", the most consistent of {self.num_tried} tried" if self.num_tried > 1 else ""
-        by = "" if self.averaging == "own" else " by pycolmap"
         text = (
-            f"averaged{by} over {self.num_pairs} pairs{tried}; {self.share:.0%} of the pairs' weight agrees "
+            f"averaged over {self.num_pairs} pairs{tried}; {self.share:.0%} of the pairs' weight agrees "
             f"within {AGREEMENT_DEG:g} deg"
         )
         if self.certified is None:
@@ -89,7 +85,6 @@ class AveragedRotations(Displayed):
         known = self.sigmas_deg[np.isfinite(self.sigmas_deg)]
         return {
             "statement": self.statement,
-            "averaging": self.averaging,
             "num_registered": int(self.registered.sum()),
             "num_pairs": self.num_pairs,
             "agreeing_share": self.share,

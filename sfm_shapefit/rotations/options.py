@@ -2,7 +2,5 @@
 
 from typing import Literal
 
-Averaging = Literal["own", "pycolmap"]
-"""Who averages: this package, or pycolmap."""
 Sequencing = Literal["auto", "names", "none"]
 """Which images are taken for videos: those whose matches say so too, all whose names do, or none."""

@@ -1,4 +1,6 @@
-"""Lenses: the intrinsics of COLMAP's models that are cases of OPENCV, and how far given ones may be off.
+"""Lenses of any of COLMAP's models, those that an adjustment may change, and how far given ones may be off.
+
+What is adjusted are the five cases of OPENCV:
 
 u = x/z, v = y/z, s = u^2 + v^2,
 pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
@@ -30,22 +32,48 @@ _PLACES = {
 }
 
 
+# Newton steps that undo a distortion end when all are shorter, relative to the focal length.
+_MOST_STEPS, _STILL = 30, 1e-12
+_PIXELS_A_SLICE = 20_000  # whose arrays stay in the cache
+
+_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")
+"""How the names of models with a single focal length begin."""
+
+
 @dataclass(frozen=True, slots=True)
 class Lens:
     """The intrinsics that one or several cameras look through."""
 
     model: str
-    """SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
+    """COLMAP's name of it. What is said of OPENCV below holds for its cases only."""
     parameters: tuple[float, ...]
     """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
     fixed: bool = False
     """Whether it stays what it is even where focal lengths or distortion are free."""
     focal_fixed: bool = False
     """Whether its focal lengths stay even where they are free."""
+    id: int = 0
+    """COLMAP's id of the camera."""
+    width: int = 0
+    """Of the pictures, in pixels; 0 if unknown, as is the height."""
+    height: int = 0
 
-    def __post_init__(self) -> None:
-        """Refuse unknown models and impossible parameters."""
-        if self.model not in _PLACES:
+    @property
+    def is_adjustable(self) -> bool:
+        """Whether the model is a case of OPENCV; images through others are undistorted to be adjusted."""
+        return self.model in _PLACES
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
+        if self.model == "EQUIRECTANGULAR":
+            return self.parameters[0] / (2.0 * np.pi)  # its width covers a full turn
+        has_one = self.model.startswith(_ONE_FOCAL_LENGTH)
+        return self.parameters[0] if has_one else (self.parameters[0] + self.parameters[1]) / 2.0
+
+    def refuse_impossible(self) -> None:
+        """Raise InputError if the lens cannot be adjusted, or has impossible parameters."""
+        if not self.is_adjustable:
             known = ", ".join(_PLACES)
             raise InputError(
                 f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
@@ -74,6 +102,18 @@ class Lens:
         own[[max(place, 0) for place in _PLACES[self.model]]] = True
         return own
 
+    def undistort(self, pixels: FloatArray) -> FloatArray:
+        """Return x/z and y/z (m, 2) of the rays of pixels (m, 2), by Newton's method; NaN where it fails."""
+        fx, fy, cx, cy, *distortion = self.values().tolist()
+        distorted: FloatArray = (pixels - [cx, cy]) / [fx, fy]
+        if not any(distortion):
+            return distorted
+        found = np.empty_like(distorted)
+        for first in range(0, len(found), _PIXELS_A_SLICE):
+            part = slice(first, first + _PIXELS_A_SLICE)
+            found[part] = _undistort(distorted[part].T, *distortion).T
+        return found
+
     def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
         """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
         slots = np.full(NUM_VALUES, -1)
@@ -87,6 +127,33 @@ class Lens:
             slots[[_FX, _FY] if place < 0 else place] = unknown
             unknown += 1
         return slots
+
+
+def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float) -> FloatArray:
+    """Return the points (2, m) that a lens of focal length 1 maps to `distorted`; NaN where there is none."""
+    u, v = distorted.copy()
+    step = np.full_like(u, np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(_MOST_STEPS):
+            s, uv = u * u + v * v, u * v
+            radial, slope = 1.0 + s * (k1 + k2 * s), 2.0 * (k1 + 2.0 * k2 * s)
+            off_u = u * radial + 2.0 * p1 * uv + p2 * (s + 2.0 * u * u) - distorted[0]
+            off_v = v * radial + 2.0 * p2 * uv + p1 * (s + 2.0 * v * v) - distorted[1]
+            uu = radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
+            vv = radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v
+            cross = slope * uv + 2.0 * (p1 * u + p2 * v)
+            determinant = uu * vv - cross * cross
+            step_u, step_v = (
+                (vv * off_u - cross * off_v) / determinant,
+                (uu * off_v - cross * off_u) / determinant,
+            )
+            u, v, step = u - step_u, v - step_v, np.hypot(step_u, step_v)
+            if not (step > _STILL).any():
+                break
+    # Beyond the first extremum of r (1 + k1 r^2 + k2 r^4) the picture is folded.
+    folds = np.roots([5.0 * k2, 3.0 * k1, 1.0])
+    largest = min((float(s.real) for s in folds if s.imag == 0.0 and s.real > 0.0), default=np.inf)
+    return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
 
 
 LARGEST_SIGMA = 0.02

@@ -18,9 +18,8 @@ from weakref import WeakSet
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, hand_back_memory
 from sfm_shapefit.base.executors import Advance, nobody
-from sfm_shapefit.base.heap import hand_back_memory
 
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""

@@ -62,13 +62,3 @@ def model_of_images(
         centers=np.array(centers).reshape(-1, 3),
         **structure,
     )
-
-
-def observation_arrays(
-    observed: Sequence[tuple[int, int]], places: Sequence[Sequence[float]]
-) -> tuple[IntArray, FloatArray]:
-    """Return observations (o, 2), point and image, and their places (o, 2); there may be none."""
-    return (
-        np.array(observed, dtype=np.int64).reshape(-1, 2),
-        np.array(places, dtype=np.float64).reshape(-1, 2),
-    )

@@ -32,13 +32,7 @@ class Status(enum.Enum):
         "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
     )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
-    NOT_SOLVED = "another objective was asked for, so ShapeFit was not solved and nothing is certified"
     CANCELLED = "on_iteration cancelled the solve; these are the last iterate and what it proves"
-
-    @property
-    def has_certificate(self) -> bool:
-        """Whether there is a dual that proves anything."""
-        return self is not Status.NOT_SOLVED
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,5 +166,5 @@ class SolverResult(Displayed):
         return {"status": self.status.name.lower(), **found}
 
     def _headline(self) -> str:
-        found = f"{len(self.locations)} locations, {self.status.name.lower()}, objective {self.objective:.6g}"
-        return f"{found}, gap {self.gap:.1e}" if self.status.has_certificate else found
+        found = f"{len(self.locations)} locations, {self.status.name.lower()}"
+        return f"{found}, objective {self.objective:.6g}, gap {self.gap:.1e}"

@@ -24,9 +24,9 @@ class SceneOptions(Settings):
 
     shape: Shape = option(
         "ring",
-        '"ring": cameras around an object; "facade": a grid of cameras before a wall; "drive": '
-        'forward along a street; "cloud": random cameras around random points; "courtyard": around '
-        "the inside of four facades.",
+        'Shape of the scene: "ring": cameras around an object; "facade": a grid of cameras before a '
+        'wall; "drive": forward along a street; "cloud": random cameras around random points; '
+        '"courtyard": around the inside of four facades.',
     )
     num_images: int = option(25, "Number of images, all by cameras of the same lens.")
     rig: RigKind = option(

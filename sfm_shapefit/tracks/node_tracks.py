@@ -10,7 +10,6 @@ random share of the keypoints are kept, and with them whole stars of matches aro
 covering set is chosen: so many that every camera, if it can, sees a given number of them.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +20,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
 
@@ -66,47 +65,54 @@ class Tracks:
         return Tracks(offsets=offsets, cameras=self.cameras[rows], rays=self.rays[rows])
 
 
-def build_tracks(
-    batches: Iterable[MatchBatch],
-    directions: PairDirections,
-    threshold_px: float,
-    num_keypoints: IntArray,
-    max_matches: int = _MAX_MATCHES,
-) -> Tracks:
-    """Return the tracks of at least three views that the matches of usable pairs form.
+class TrackJoiner:
+    """Joins the matches of pairs, batch after batch, to tracks of at least three views.
 
     The tracks and their order do not depend on the order of pairs.
-
-    Args:
-        batches: the matches of all pairs; they pass by once, none is held.
-        directions: what was measured of the same pairs.
-        threshold_px: largest Sampson error of a match that is kept.
-        num_keypoints: (n,) of each image.
-        max_matches: whose keypoints are held in memory; beyond, a share of the keypoints is drawn.
     """
-    usable = directions.usable()
-    share = min(1.0, max_matches / max(float(directions.num_inliers[usable].sum()), 1.0))
-    pairs = map(tuple, directions.pairs[usable].tolist())
-    rows = dict(zip(pairs, usable.tolist(), strict=True))
-    begins = np.append(0, np.cumsum(num_keypoints))
-    places = np.full(int(begins[-1]), -1, dtype=np.int32)
-    parents, rays, count = np.empty(0, dtype=np.int64), [], 0
-    for batch in batches:
-        row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
+
+    def __init__(
+        self,
+        threshold_px: float,
+        num_keypoints: IntArray,
+        num_matches: int = 0,
+        max_matches: int = _MAX_MATCHES,
+    ) -> None:
+        """Begin with no match.
+
+        Args:
+            threshold_px: largest Sampson error of a match that is joined.
+            num_keypoints: (n,) of each image.
+            num_matches: of all pairs, at most; 0 if not known.
+            max_matches: whose keypoints are held in memory; of more, a share of the keypoints is drawn.
+        """
+        self._threshold_px, self._share = threshold_px, min(1.0, max_matches / max(num_matches, 1))
+        self._begins = np.append(0, np.cumsum(num_keypoints))
+        self._places = np.full(int(self._begins[-1]), -1, dtype=np.int32)
+        self._parents, self._rays, self._count = np.empty(0, dtype=np.int64), [np.zeros((0, 3))], 0
+
+    def add(self, batch: MatchBatch, directions: PairDirections) -> None:
+        """Join the matches that agree with the directions of their pairs, which are those of the batch."""
+        row = np.where(is_usable(directions.status), np.arange(len(batch.pairs)), -1)
         counts = np.diff(batch.offsets)
-        drawn = _draw_matches(batch, counts, share)
-        keypoints = begins[np.repeat(batch.pairs, counts, axis=0)] + batch.keypoints
-        new_rays = np.empty((min(2 * len(keypoints), len(places) - count), 3))
-        if count + len(new_rays) > len(parents):
-            parents = np.concatenate([parents, np.arange(len(parents), 2 * (count + len(new_rays)))])
+        drawn = _draw_matches(batch, counts, self._share)
+        keypoints = self._begins[np.repeat(batch.pairs, counts, axis=0)] + batch.keypoints
+        new_rays = np.empty((min(2 * len(keypoints), len(self._places) - self._count), 3))
+        largest = self._count + len(new_rays)
+        if largest > len(self._parents):
+            self._parents = np.concatenate([self._parents, np.arange(len(self._parents), 2 * largest)])
         number = _join_batch(
             row, batch.offsets, keypoints, drawn, np.ascontiguousarray(batch.rays_i),
-            np.ascontiguousarray(batch.rays_j), directions.directions, batch.pixel_angles, threshold_px,
-            places, parents, count, new_rays,
+            np.ascontiguousarray(batch.rays_j), directions.directions, batch.pixel_angles,
+            self._threshold_px, self._places, self._parents, self._count, new_rays,
         )  # fmt: skip
-        rays.append(new_rays[: number - count].copy())
-        count = number
-    return _collect(places, begins, parents[:count], np.concatenate([np.zeros((0, 3)), *rays]))
+        self._rays.append(new_rays[: number - self._count].copy())
+        self._count = number
+
+    def tracks(self) -> Tracks:
+        """Return the tracks of all matches that were added."""
+        rays = np.concatenate(self._rays)
+        return _collect(self._places, self._begins, self._parents[: self._count], rays)
 
 
 @kernel

@@ -1,12 +1,8 @@
 """What a 3D point must satisfy. Pure data, and cheap to import."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
-
-Adjuster = Literal["own", "ceres"]
-"""What adjusts bundles: our own, or pycolmap's Ceres."""
 
 
 @explained
@@ -29,7 +25,7 @@ class StructureOptions(Settings):
     ignore_two_view_tracks: bool = option(
         True,
         "Make no points of matches that only two images share: a wrong one is not noticed, since one "
-        "epipolar constraint is all that checks it. Our own adjustment moves cameras by them all the same, "
+        "epipolar constraint is all that checks it. The adjustment moves cameras by them all the same, "
         "through a robust loss. Concerns matches of a database, not a model's own tracks, "
         "and only models of three images or more: two have no other matches.",
     )

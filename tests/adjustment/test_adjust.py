@@ -450,11 +450,11 @@ def test_wrong_priors_lenses_and_options_are_refused():
     with pytest.raises(InputError, match="lens prior must have 1 x 8"):
         replace(start, lens_prior=LensPrior(values=np.ones((1, 8)), information=np.full((1, 8), -1.0)))
     with pytest.raises(InputError, match="undistort it"):
-        Lens("THIN_PRISM_FISHEYE", (1.0,))
+        replace(start, lenses=[Lens("THIN_PRISM_FISHEYE", (1.0,))])
     with pytest.raises(InputError, match="4 finite"):
-        Lens("PINHOLE", (1.0, 2.0, np.nan, 0.0))
+        replace(start, lenses=[Lens("PINHOLE", (1.0, 2.0, np.nan, 0.0))])
     with pytest.raises(InputError, match="not positive"):
-        Lens("PINHOLE", (1.0, -2.0, 0.0, 0.0))
+        replace(start, lenses=[Lens("PINHOLE", (1.0, -2.0, 0.0, 0.0))])
     for wrong in (
         {"loss_scale_px": 0.0},
         {"noise_px": np.inf},

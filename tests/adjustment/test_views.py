@@ -1,7 +1,6 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -9,19 +8,26 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.adjustment import adjust, free_lenses, reprojection_errors_px
+from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
-from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement, adjust_thinly, bundle_adjust
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.adjustment.sources import collect_matches, collect_tracks, read_bundle
-from sfm_shapefit.adjustment.views import read_frames, with_points, with_poses
+from sfm_shapefit.adjustment.views import Bounds, observations, views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.scene import lens
 from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.scenes import BUNDLED
+from tests.structures import (
+    adjusted_placement,
+    adjusted_thinly,
+    bundle_adjusted,
+    links_of,
+    matches_between,
+    posed_images,
+)
 
 DISTORTIONS = {
     "SIMPLE_PINHOLE": [],
@@ -91,38 +97,22 @@ def disturbed(model, size=0.02, seed=1):
 @pytest.mark.parametrize("rigs", [False, True])
 def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
     given = scene(model, rigs=rigs)
-    ids, problem = read_bundle(given, read_frames(given))
-    assert ids.tolist() == sorted(given.point3D_ids())
+    images, tracks = posed_images(given), links_of(given, given)
+    points = points_of(given, images)
+    assert points.ids.tolist() == sorted(given.point3D_ids())
+    none = np.zeros(len(images.frames.ids), dtype=bool)
+    seen = observations(tracks, points.points_seen())
+    problem = views_of(images).problem(images, Bounds(none), points.xyz, seen)
     assert problem.num_observations == given.compute_num_observations()
     errors = reprojection_errors_px(problem)
     sums = np.bincount(problem.points_seen, errors)
     ours = sums / np.bincount(problem.points_seen)
-    theirs = np.array([given.point3D(i).error for i in ids.tolist()])
+    theirs = np.array([given.point3D(i).error for i in points.ids.tolist()])
     if model in EXACT:
         np.testing.assert_allclose(ours, theirs, rtol=1e-9)
     else:  # an ideal camera's error is up to 1 / cos(28 deg)^2 times the fisheye's; distortion does its part
         assert (ours / theirs).min() > 0.7
         assert (ours / theirs).max() < 1.6
-
-
-@pytest.mark.parametrize("model", DISTORTIONS)
-def test_the_round_trip_changes_no_bit_and_moves_are_written_back(model):
-    given = scene(model)
-    frames = read_frames(given)
-    ids, problem = read_bundle(given, frames)
-    same = with_points(with_poses(given, frames, frames), ids, problem.points)
-    for image_id in given.reg_image_ids():
-        ours, theirs = (m.image(image_id).cam_from_world() for m in (same, given))
-        np.testing.assert_array_equal(ours.matrix(), theirs.matrix())
-        assert same.image(image_id).name == given.image(image_id).name
-    for point_id, point in given.points3D.items():
-        np.testing.assert_array_equal(same.point3D(point_id).xyz, point.xyz)
-        assert same.point3D(point_id).track.length() == point.track.length()
-    moved = with_poses(given, frames, replace(frames, centers=frames.centers + 1.0))
-    np.testing.assert_allclose(centers_of(moved), centers_of(given) + 1.0, atol=1e-12)
-    for image_id in given.reg_image_ids():  # rotations that did not change keep their bits
-        ours, theirs = (m.image(image_id).cam_from_world().rotation.quat for m in (moved, given))
-        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("model", DISTORTIONS)
@@ -221,15 +211,14 @@ def matches_of(model, images_of=None):
             parts.append(np.array([[seen[a][p], seen[b][p]] for p in common]))
     offsets = np.append(0, np.cumsum([len(part) for part in parts]))
     batch = KeypointMatches(pairs=np.array(pairs), offsets=offsets, keypoints=np.concatenate(parts))
-    return collect_matches(model, np.array(images), [batch], len(batch.keypoints))
+    return matches_between(model, np.array(images), [batch])
 
 
 def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
     model = scene()
-    frames = read_frames(model)
-    own = collect_tracks(frames, model, model)
-    matched = matches_of(model)
-    joined = matched.observed(matched.join(frames.poses(), 4.0))
+    images = posed_images(model)
+    own, matched = links_of(model, model), matches_of(model)
+    joined = matched.observed(matched.join(views_of(images).poses(images), 4.0))
 
     def tracks(found):
         ends = zip(found.offsets[:-1], found.offsets[1:], strict=True)
@@ -248,7 +237,8 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
         if frame_id not in fixed:
             start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
     tracks = truth if source == "tracks" else matches_of(truth)
-    found = adjust_thinly(start, lambda: tracks, fixed_frames=fixed).reconstruction
+    is_fixed = np.isin(posed_images(start).frames.ids, fixed)
+    found = adjusted_thinly(start, tracks, fixed=is_fixed).reconstruction
     assert found.num_points3D() == 0
     true, before, after = centers_of(truth), centers_of(start), centers_of(found)
     errors = [np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean() for x in (before, after)]
@@ -266,7 +256,7 @@ def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch
 
     monkeypatch.setattr(adjustment_run, "adjust", noting)
     truth = scene()
-    adjust_thinly(disturbed(truth), lambda: matches_of(truth))
+    adjusted_thinly(disturbed(truth), matches_of(truth))
     assert dampings == [1e-4, 1e-8]
 
 
@@ -277,23 +267,23 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    found = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
+    found = adjusted_thinly(start, tracks, lenses=free)
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
-    assert found.lenses.undetermined == ()
-    assert 0.0 < found.lenses.sigmas[1] < 0.01
-    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
-    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
-    assert held.lenses.undetermined == (1,)
-    assert 1 not in held.lenses.sigmas
+    assert found.estimate.lenses.undetermined == ()
+    assert 0.0 < found.estimate.lenses.sigmas[1] < 0.01
+    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
+    held = adjusted_thinly(start, tracks, lenses=free)
+    assert held.estimate.lenses.undetermined == (1,)
+    assert 1 not in held.estimate.lenses.sigmas
     given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
     assert kept[:3] == given[:3]
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
-    again = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=held.lenses.free))
+    again = adjusted_thinly(start, tracks, lenses=held.estimate.lenses.free)
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
-    monkeypatch.setattr(free_lenses, "_MOST_DISTORTION", 0.0)
-    held = adjust_thinly(start, lambda: tracks, given=GivenPoses(lenses=free))
-    assert held.lenses.undetermined == (1,)
+    monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
+    held = adjusted_thinly(start, tracks, lenses=free)
+    assert held.estimate.lenses.undetermined == (1,)
     assert held.reconstruction.camera(1).params.tolist() == given
 
 
@@ -301,11 +291,9 @@ def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monk
     truth = scene("PINHOLE")
     start = disturbed(truth)
     free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
-    found = adjust_placement(
-        start, matches_of(truth), StructureOptions(), None, given=GivenPoses(lenses=free)
-    )
-    assert found.lenses.undetermined == (1,)
+    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
+    found = adjusted_placement(start, matches_of(truth), lenses=free)
+    assert found.estimate.lenses.undetermined == (1,)
     given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))
     assert kept == given
 
@@ -320,12 +308,12 @@ def test_points_of_two_images_hold_cameras_but_are_not_in_the_model():
     errors = []
     for least in (2, 3):
         options = StructureOptions(min_track_length=least)
-        found = bundle_adjust(start, graph, options).reconstruction
+        found = bundle_adjusted(start, graph, options).reconstruction
         assert 0 < found.num_points3D() <= 6
         assert all(point.track.length() >= 3 for point in found.points3D.values())
         x = centers_of(found)
         errors.append(np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean())
     # 7 images leave 11 residuals of each of 6 points, and 2 images one of each of 74: twice as much in all.
     assert errors[0] < 0.8 * errors[1]
-    with_all = bundle_adjust(start, graph, StructureOptions(ignore_two_view_tracks=False)).reconstruction
+    with_all = bundle_adjusted(start, graph, StructureOptions(ignore_two_view_tracks=False)).reconstruction
     assert with_all.num_points3D() > 40

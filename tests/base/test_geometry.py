@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 from sfm_shapefit.base.geometry import (
     Similarity,
     angle_between_deg,
+    compose,
     fit_similarity,
     fit_similarity_l1,
+    invert,
     mean_rotation_l1,
     median_spread,
     normalized,
@@ -262,3 +264,17 @@ def test_the_mean_rotation_turns_with_its_inputs_and_that_of_one_is_itself():
     turned = left @ mean_rotation_l1(rotations) @ right
     np.testing.assert_allclose(mean_rotation_l1(left @ rotations @ right), turned, atol=1e-6)
     np.testing.assert_allclose(mean_rotation_l1(left[None]), left, atol=4 * EPS)
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=seeds, d=st.integers(2, 5))
+def test_similarities_compose_like_maps_and_their_inverses_undo_them(seed, d):
+    rng = np.random.default_rng(seed)
+    first, second, third = (random_similarity(rng, d) for _ in range(3))
+    points = rng.standard_normal((7, d))
+    both = compose(second, first)
+    np.testing.assert_allclose(both.apply(points), second.apply(first.apply(points)), rtol=1e-9, atol=1e-9)
+    one, other = compose(third, both), compose(compose(third, second), first)
+    assert_same_map(one, other, rtol=1e-9)
+    np.testing.assert_allclose(compose(invert(first), first).apply(points), points, atol=1e-9)
+    assert_same_map(invert(invert(first)), first, rtol=1e-9)

@@ -72,7 +72,7 @@ REFUSED = [
         for settings in OUT_OF_RANGE
         for name, value in OUT_OF_RANGE[settings]
     ),
-    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (PlacementOptions, {"objective": "l2"}, "shapefit"),
     (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
     (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
     (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
@@ -81,13 +81,11 @@ REFUSED = [
     (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-    (LocateOptions, {"filter": "mfas"}, "triangles"),
-    (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
-    (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
-    (LocateOptions, {"rotations": "free", "adjust": False}, "matters only to an adjustment"),
-    (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
-    (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),
-    (MapOptions, {"rotations": "measured"}, "map finds the rotations itself"),
+    (LocateOptions, {"rotations": "free", "adjust": "none"}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": 0.1, "adjust": "none"}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),
+    (LocateOptions, {"rotations": "exact"}, "rotations must be one of auto, held, free or of type float"),
+    (MapOptions, {"rotations": "held"}, "map finds the rotations itself"),
     (MapOptions, {"fix": "names.txt"}, "a database has no positions that cameras could stay at"),
     (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
     (LocateOptions, {"scale": "distance"}, "needs known_distance"),
@@ -98,7 +96,6 @@ REFUSED = [
     (LocateOptions, {"known_distance": 3.0}, "known_distance must be of type tuple"),
     (MapOptions, {"min_matches": 5}, "min_matches must be at least 15"),
     (MapOptions, {"directions": "tracks"}, "a database has no tracks"),
-    (MapOptions, {"relative_rotations": "guessed"}, "relative_rotations must be one of"),
     (WorkspaceOptions, {"model": "rotations", "database": False}, "model = 'rotations' needs database"),
 ]
 
@@ -111,7 +108,6 @@ def test_a_wrong_value_is_refused_by_name(settings, wrong, message):
 
 def test_integers_serve_as_floats_and_numpy_numbers_as_their_kind():
     assert LocateOptions(tol=np.float64(1e-6), min_inliers=np.int64(20), min_trust=1).min_inliers == 20
-    assert LocateOptions(directions="relative-poses", max_rotation_error_deg=5.0).max_rotation_error_deg == 5
 
 
 def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
@@ -166,7 +162,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert repr(solved).startswith("<SolverResult: 12 locations, converged")
     placed = sfm_shapefit.place(problem.view_graph, refine=False)
     assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
-    assert repr(placed).startswith("<Placement: 12 of 12 nodes placed, 0 of")
+    assert repr(placed).startswith("<Judged: 12 of 12 nodes placed, 0 of")
     located.timings_s["<script>"] = 1.0
     table = located._repr_html_()
     del located.timings_s["<script>"]

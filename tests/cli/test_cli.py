@@ -74,7 +74,7 @@ def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(t
     said = run("locate", RING_MODEL, tmp_path / "out", "--images", tmp_path, code=0).stdout
     assert "has none of the images" in " ".join(said.replace("│", " ").split())
     assert "--images" in run("locate", "--help").stdout
-    assert "--images" not in run("place", "--help").stdout
+    assert "--images" not in run("place", "--help-all").stdout
     graph = BUNDLED / "graph40.txt"
     assert "No such option" in run("place", graph, tmp_path / "out", "--images", tmp_path, code=2).output
 
@@ -84,6 +84,12 @@ def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_
     names = ("--input_path", RING_MODEL, "--output_path", out, "--database_path", RING / "database.db")
     result = run("locate", *names, "--json", code=0)
     assert json.loads(result.stdout) == json.loads((out / "locate.json").read_text())
+
+
+def test_other_commands_take_colmaps_names_of_paths_too(tmp_path):
+    run("convert", "--input_path", RING_MODEL, "--output_path", tmp_path / "copy", code=0)
+    names = ("--database_path", tmp_path / "missing.db", "--output_path", tmp_path / "out")
+    assert "missing.db does not exist" in run_refused("map", *names)
 
 
 def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
@@ -101,7 +107,7 @@ def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
     assert "solve" not in listed
-    assert run("view", "-h").stdout.startswith("Usage:")
+    assert run("report", "-h").stdout.startswith("Usage:")
 
 
 def test_help_lists_commands_in_groups_the_most_used_first():
@@ -146,14 +152,14 @@ def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
     options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
-    text = run("place", "--help").stdout
+    text = run("place", "--help-all").stdout
     assert "--method" not in text
     assert "--factor-memory " not in text
-    assert run("solve", "--help").stdout == text.replace(" place ", " solve ", 1)
+    assert run("solve", "--help-all").stdout == text.replace(" place ", " solve ", 1)
 
 
 def test_help_lists_every_option_as_a_flag_with_its_sentence_in_the_groups_of_the_stages():
-    text = run("locate", "--help").stdout
+    text = run("locate", "--help-all").stdout
     titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert titles[:2] == ["Arguments:", "Options:"]
     assert titles[-1] == "What is written and shown:"
@@ -161,6 +167,17 @@ def test_help_lists_every_option_as_a_flag_with_its_sentence_in_the_groups_of_th
     for field in dataclasses.fields(LocateOptions):
         assert f"--{field.name.replace('_', '-')}" in text
     assert not re.search(r"\[default:\s*(None)?\]", text)
+
+
+@pytest.mark.parametrize("name", sorted(get_command(app).commands))
+def test_help_fits_a_screen_and_help_all_has_the_rest(name):
+    first, every = (run(name, flag).stdout for flag in ("--help", "--help-all"))
+    listed = [
+        set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", text, flags=re.MULTILINE)) for text in (first, every)
+    ]
+    assert len(listed[0]) <= 16
+    assert listed[0] - {"--help-all"} <= listed[1]
+    assert ("--help-all" in listed[0]) == (len(listed[1]) > len(listed[0]))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +191,7 @@ def plain(tmp_path_factory):
     ("flags", "changed"),
     [
         (
-            "--min-inlier-ratio 0.95 --bundle-adjust --scale unit",
+            "--min-inlier-ratio 0.95 --adjust full --scale unit",
             "num_pairs_rejected bundle_adjustment scale",
         ),
         ("--inlier-threshold-px 0.3", "num_pairs_rejected"),
@@ -183,6 +200,7 @@ def plain(tmp_path_factory):
         ("--solver conic", "solve"),
         ("--tol 1e-3", "solve"),
         ("--directions tracks", "inputs"),
+        ("--rotations 0.05", "adjustment"),
     ],
 )
 def test_each_flag_matters(tmp_path, plain, flags, changed):
@@ -306,7 +324,7 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
     assert "the output" not in said  # what stands there is the earlier one
 
 
-@pytest.mark.parametrize("extra", [(), ("--bundle-adjust", "--no-adjust")])
+@pytest.mark.parametrize("extra", [(), ("--adjust", "full")])
 def test_an_interrupt_in_an_adjustment_leaves_nothing(tmp_path, monkeypatch, extra):
     calls = []
 
@@ -453,7 +471,7 @@ def test_options_and_names_may_begin_with_the_mark_of_a_windows_editor(tmp_path)
     for name, flag in (("names.txt", "--fix"), ("options.toml", "--config")):
         file = tmp_path / name
         file.write_bytes(b"\xef\xbb\xbf" + (BUNDLED / name).read_bytes().replace(b"\n", b"\r\n"))
-        done = run("locate", RING_MODEL, tmp_path / flag, flag, file, "--no-report", "--no-adjust")
+        done = run("locate", RING_MODEL, tmp_path / flag, flag, file, "--no-report", "--adjust", "none")
         assert done.exit_code == 0, done.stderr
 
 
@@ -475,13 +493,20 @@ def test_map_takes_a_folder_by_its_database_and_refuses_one_without(tmp_path):
     assert "without a database.db" in run_refused("map", RING_MODEL, tmp_path / "out")
 
 
-def test_what_is_not_installed_has_an_exit_code_of_its_own(ring_run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert "the viewer needs viser: pip install" in run_refused("view", ring_run[1], code=5)
+def test_what_is_not_installed_has_an_exit_code_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--executor", "dask", "-q", code=5)
+    assert "the executor dask needs dask.distributed: pip install" in said
+
+
+@pytest.mark.parametrize("name", ["threads", "dask:", "serial:1", "processes:2"])
+def test_an_executor_that_does_not_exist_is_refused_as_a_value(name, tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--executor", name, code=2).output
+    assert "serial, processes, dask, dask:ADDRESS" in said
 
 
 def test_the_values_that_flags_take_are_named_in_words():
-    text = run("locate", "-h").stdout
+    text = run("locate", "--help-all").stdout
     assert "--known-distance NAME NAME DISTANCE" in text
     assert "--fix FILE|solved" in text
     for word in ("<str>", "<int>", "<float>", "str,str"):

@@ -10,7 +10,7 @@ import sfm_shapefit
 from sfm_shapefit import synthetic
 from sfm_shapefit.facts.grade import Grade, judge_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from tests.program import run
 from tests.scenes import BUNDLED, RING
 

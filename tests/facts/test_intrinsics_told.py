@@ -3,7 +3,7 @@
 import pytest
 
 from sfm_shapefit.adjustment import Lens
-from sfm_shapefit.adjustment.adjusted import RefinedLenses
+from sfm_shapefit.adjustment.estimate import RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.facts.intrinsics import Intrinsics, describe_intrinsics, intrinsics_warnings
 from sfm_shapefit.files.colmap.intrinsics import Origin

@@ -19,7 +19,7 @@ from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.database import find_database, relative_poses
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.model import PosedModel, camera_rays, read_model
-from sfm_shapefit.files.colmap.own_tracks import TrackMatches
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
 from tests.scenes import edit_database, fingerprint, real_scene, view_of

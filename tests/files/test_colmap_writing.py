@@ -13,12 +13,8 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import LocateOptions, locate
-from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
-from sfm_shapefit.adjustment.filter import filter_in_place, filter_points
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.run import GivenPoses
-from sfm_shapefit.adjustment.sources import collect_matches
-from sfm_shapefit.adjustment.structure import triangulate, triangulate_in_place
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
@@ -32,6 +28,7 @@ from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.problems import all_pairs
 from tests.scenes import real_scene
+from tests.structures import bundle_adjusted, filtered, matches_between, triangulated
 
 NUM_IMAGES = 8
 RADIUS = 6.0
@@ -97,9 +94,11 @@ def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=No
     model = read_model(reconstruction)
     placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
     centers = model.centers if centers is None else centers
-    seed = build_seed(model, placed, centers, None if keypoints is None else keypoints.get)
+    rows = np.flatnonzero(placed)
+    images = model.images.placed(rows, centers[rows])
+    seed = build_seed(model, images, None if keypoints is None else keypoints.get)
     batches = all_matches() if batches is None else batches
-    return seed, collect_matches(seed, model.image_ids, batches, sum(len(b.keypoints) for b in batches))
+    return seed, matches_between(seed, model.image_ids, batches)
 
 
 SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])
@@ -155,12 +154,12 @@ def test_the_input_of_every_stage_stays_as_it_was():
     seed, matches = seeded(original, ring_centers() + 0.01)
     seed_before = dump(seed)
     for tracks in (matches, original):
-        structure = triangulate(seed, tracks)
+        structure = triangulated(seed, tracks)
         structure_before = dump(structure)
         color_points(structure, read_colors(original))
-        filter_points(structure, StructureOptions(max_reprojection_error_px=0.1))
+        filtered(structure, StructureOptions(max_reprojection_error_px=0.1))
         assert dump(structure) == structure_before
-        bundle_adjust(seed, tracks)
+        bundle_adjusted(seed, tracks)
     assert dump(seed) == seed_before
     assert dump(original) == before
 
@@ -170,22 +169,17 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
     placed = np.arange(NUM_IMAGES) != 2
     centers = np.where(placed[:, None], ring_centers(), np.nan)
     seed, matches = seeded(original, centers, placed)
-    structure = triangulate(seed, matches)
+    structure = triangulated(seed, matches)
     write_model(structure, tmp_path)
     written = read_model(tmp_path)
     assert written.names == tuple(f"view{k}.jpg" for k in range(NUM_IMAGES) if k != 2)
     assert structure.num_points3D() == 120
     assert all(p.track.length() == NUM_IMAGES - 1 for p in structure.points3D.values())
-    assert triangulate(seed, original).num_points3D() == 120
+    assert triangulated(seed, original).num_points3D() == 120
 
 
-def test_images_without_a_pose_stay_so_and_a_placed_one_without_a_center_is_refused_by_name(tmp_path):
+def test_images_without_a_pose_stay_so(tmp_path):
     original, _ = ring_model()
-    model = read_model(original)
-    centers = model.centers.copy()
-    centers[4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
-        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
     original.deregister_frame(original.image(25).frame_id)
     seed, _ = seeded(original, batches=[])
     write_model(seed, tmp_path)
@@ -210,7 +204,7 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
 @SOURCES
 def test_exact_data_give_every_point_back_with_its_color(source):
     original, points = ring_model()
-    structure = color_points(triangulate(*seeded_with(source, original)), read_colors(original))
+    structure = color_points(triangulated(*seeded_with(source, original)), read_colors(original))
     assert structure.num_points3D() == len(points)
     for point in structure.points3D.values():
         truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
@@ -227,7 +221,7 @@ def test_points_follow_the_new_positions_and_those_of_the_models_own_tracks_keep
         original.delete_point3D(point_id)
     seed, matches = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
     for tracks in (matches, original):
-        structure = triangulate(seed, tracks)
+        structure = triangulated(seed, tracks)
         assert structure.num_points3D() == 120 if tracks is matches else 118
         for point_id, point in structure.points3D.items():
             (keypoint,) = {element.point2D_idx for element in point.track.elements}
@@ -245,12 +239,12 @@ class Copying(ThreadPoolExecutor):
 
 
 def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_TASK", 7)
+    monkeypatch.setattr("sfm_shapefit.files.colmap.own_tracks._TRACKS_A_TASK", 7)
     original, points = ring_model(noise_px=3.0)
     seed, seen = seeded(original, ring_centers() + 0.01)[0], []
     with Copying(2) as executor:
-        shared = triangulate(seed, original, None, lambda *done: seen.append(done), executor)
-    assert dump(shared) == dump(triangulate(seed, original))
+        shared = triangulated(seed, original, None, lambda *done: seen.append(done), executor)
+    assert dump(shared) == dump(triangulated(seed, original))
     assert seen[0] == (7, len(points))
     assert seen[-1] == (len(points), len(points))
 
@@ -260,33 +254,27 @@ def test_tracks_of_matches_shared_out_to_workers_give_the_same_bits(monkeypatch)
     original, points = ring_model(noise_px=3.0)
     (seed, matches), seen = seeded(original, ring_centers() + 0.01), []
     with Copying(2) as executor:
-        shared = triangulate(seed, matches, None, lambda *done: seen.append(done), executor)
+        shared = triangulated(seed, matches, None, lambda *done: seen.append(done), executor)
     assert shared.num_points3D() > 0.9 * len(points)
     (num_tracks,) = {total for _, total in seen}
     assert [done for done, _ in seen] == [*range(7, num_tracks, 7), num_tracks]
     monkeypatch.undo()
-    assert dump(shared) == dump(triangulate(seed, matches))
+    assert dump(shared) == dump(triangulated(seed, matches))
 
 
 @SOURCES
-def test_the_same_gives_the_same_bits_again_and_in_place(source):
-    options = StructureOptions()
+def test_the_same_gives_the_same_bits_again(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)
 
-    def run(in_place=False):
+    def run():
         seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
-        adjusted = dump(bundle_adjust(seed, tracks).reconstruction)
-        if in_place:
-            triangulate_in_place(seed, tracks, options, lambda *_done: None)
-            filter_in_place(seed, options)
-        structure = seed if in_place else triangulate(seed, tracks, options)
-        assert in_place == (seed.num_points3D() > 0)
-        return dump(color_points(structure, read_colors(original))), adjusted
+        adjusted = dump(bundle_adjusted(seed, tracks).reconstruction)
+        return dump(color_points(triangulated(seed, tracks), read_colors(original))), adjusted
 
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
-    assert run() == first == run(in_place=True)
+    assert run() == first
 
 
 def wrong_in_part(share):
@@ -306,7 +294,7 @@ def test_points_of_matches_are_the_same_bits_whatever_the_blocks(monkeypatch):
         monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", tracks)
         monkeypatch.setattr("sfm_shapefit.adjustment.sources._MATCHES_A_SLICE", matches)
         monkeypatch.setattr("sfm_shapefit.tracks.links._MATCHES_A_SLICE", matches)
-        found.append(dump(triangulate(*seeded(original, batches=wrong_in_part(0.3)))))
+        found.append(dump(triangulated(*seeded(original, batches=wrong_in_part(0.3)))))
     assert found[0] == found[1] == found[2]
 
 
@@ -339,7 +327,7 @@ def by_colmap(original, batches):
 def test_points_of_matches_are_those_of_colmaps_triangulator():
     original, points = ring_model(noise_px=0.3)
     seen = []
-    ours = triangulate(*seeded(original), None, lambda *done: seen.append(done))
+    ours = triangulated(*seeded(original), None, lambda *done: seen.append(done))
     theirs = by_colmap(original, all_matches())
     assert seen[-1] == (len(points), len(points))
     assert ours.num_points3D() == theirs.num_points3D() == len(points)
@@ -364,7 +352,7 @@ def test_a_match_of_two_images_is_kept_if_one_has_another_partner_as_by_colmaps_
             if e.image_id == first
         }
 
-    assert seeing(triangulate(*seeded(original, batches=batches))) == set(range(60))
+    assert seeing(triangulated(*seeded(original, batches=batches))) == set(range(60))
     assert seeing(by_colmap(original, batches)) == set(range(60))
 
 
@@ -373,9 +361,9 @@ def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
     original, _ = ring_model(centers=0.01 * ring_centers() + [60.0, 0.0, 0.0])
     seed, matches = seeded(original)
     for tracks in (matches, original):
-        assert triangulate(seed, tracks).num_points3D() == 0
+        assert triangulated(seed, tracks).num_points3D() == 0
         options = StructureOptions(min_triangulation_angle_deg=0.05)
-        assert triangulate(seed, tracks, options).num_points3D() == 120
+        assert triangulated(seed, tracks, options).num_points3D() == 120
 
 
 def reprojection_errors_px(structure):
@@ -388,20 +376,20 @@ def reprojection_errors_px(structure):
 
 
 def test_wrong_matches_make_no_point_that_misses_its_observations():
-    structure = triangulate(*seeded(ring_model(noise_px=0.3)[0], batches=wrong_in_part(0.3)))
+    structure = triangulated(*seeded(ring_model(noise_px=0.3)[0], batches=wrong_in_part(0.3)))
     assert structure.num_points3D() >= 120
     assert max(reprojection_errors_px(structure)) <= 4.0
 
 
 def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_more_are_placed():
     seed, matches = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
-    assert triangulate(seed, matches).num_points3D() == 0
-    both = triangulate(seed, matches, StructureOptions(ignore_two_view_tracks=False))
+    assert triangulated(seed, matches).num_points3D() == 0
+    both = triangulated(seed, matches, StructureOptions(ignore_two_view_tracks=False))
     assert both.num_points3D() == 120
     seed, matches = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
-    assert triangulate(seed, matches).num_points3D() == 120
-    assert bundle_adjust(seed, matches).reconstruction.num_points3D() == 120
-    assert triangulate(*seeded(ring_model()[0], batches=[])).num_points3D() == 0
+    assert triangulated(seed, matches).num_points3D() == 120
+    assert bundle_adjusted(seed, matches).reconstruction.num_points3D() == 120
+    assert triangulated(*seeded(ring_model()[0], batches=[])).num_points3D() == 0
 
 
 def test_matches_and_tracks_of_other_keypoints_are_refused():
@@ -410,7 +398,7 @@ def test_matches_and_tracks_of_other_keypoints_are_refused():
         seeded(original, batches=[batch_of(np.array([[0, 3]]), 121)])
     seed, _ = seeded(original, keypoints={0: np.ones((5, 2))}, batches=[])
     with pytest.raises(ValueError, match="image 5 has other points2D"):
-        triangulate(seed, original)
+        triangulated(seed, original)
 
 
 def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
@@ -423,7 +411,7 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         original.point3D(point_id).color = np.array([10, 20, 30], dtype=np.uint8)
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
     seed, matches = seeded(original)
-    black = triangulate(seed, matches)
+    black = triangulated(seed, matches)
     structure = color_points(black, read_colors(original))
     assert not any(point.color.any() for point in black.points3D.values())
     assert color_points(black, read_colors(original), in_place=True) is black
@@ -439,7 +427,7 @@ def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_the
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
         seed_and_matches = seeded(original, keypoints={k: moved[k] for k in changed})
-        structure = color_points(triangulate(*seed_and_matches), read_colors(original))
+        structure = color_points(triangulated(*seed_and_matches), read_colors(original))
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
     for point in original.points3D.values():
@@ -479,7 +467,7 @@ def with_one_more_point(xyz, image_ids, offset_px=0.0):
 )
 def test_a_point_is_removed_that_is(xyz, image_ids, why):
     seed, point_id = with_one_more_point(xyz, image_ids)
-    kept = filter_points(seed)
+    kept = filtered(seed)
     assert not kept.exists_point3D(point_id), why
     assert kept.num_points3D() == 120
 
@@ -487,17 +475,17 @@ def test_a_point_is_removed_that_is(xyz, image_ids, why):
 @pytest.mark.parametrize(("offset_px", "length"), [(3.9, 4), (4.1, 3)])
 def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offset_px, length):
     seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45, 65], offset_px)
-    point = filter_points(seed).points3D[point_id]
+    point = filtered(seed).points3D[point_id]
     assert point.track.length() == length
     assert point.error == pytest.approx(offset_px / 4 if length == 4 else 0.0, abs=1e-6)
 
 
 def test_point_errors_are_those_of_the_observations_that_are_left():
     original, _ = ring_model(noise_px=2.0)
-    loose = triangulate(*seeded(original), StructureOptions(max_reprojection_error_px=8.0))
+    loose = triangulated(*seeded(original), StructureOptions(max_reprojection_error_px=8.0))
     for point in loose.points3D.values():
         point.xyz, point.error = point.xyz + 0.003, 77.0
-    kept = filter_points(loose, StructureOptions(max_reprojection_error_px=3.0))
+    kept = filtered(loose, StructureOptions(max_reprojection_error_px=3.0))
     assert 0 < kept.compute_num_observations() < loose.compute_num_observations()
     lengths = [point.track.length() for point in kept.points3D.values()]
     errors_px = np.split(reprojection_errors_px(kept), np.cumsum(lengths)[:-1])
@@ -517,23 +505,22 @@ def test_point_errors_are_those_of_the_observations_that_are_left():
 def test_a_point_stays_if_what_is_asked_for_is_less_than_it_has(xyz, image_ids, option, loose, strict):
     seed, point_id = with_one_more_point(xyz, image_ids)
     for value in (loose, strict):
-        kept = filter_points(seed, StructureOptions(**{option: value}))
+        kept = filtered(seed, StructureOptions(**{option: value}))
         assert kept.exists_point3D(point_id) == (value == loose)
         assert kept.num_points3D() == 120 + (value == loose)
 
 
-@pytest.mark.parametrize("adjuster", ["own", "ceres"])
 @SOURCES
-def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source, adjuster):
+def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source):
     original, points = ring_model()
     disturbed = ring_centers() + np.random.default_rng(3).normal(scale=0.03 * RADIUS, size=(NUM_IMAGES, 3))
-    adjusted = bundle_adjust(*seeded_with(source, original, disturbed), adjuster=adjuster)
-    centers = centers_of(adjusted.reconstruction)
+    adjusted = bundle_adjusted(*seeded_with(source, original, disturbed))
+    centers, estimate = centers_of(adjusted.reconstruction), adjusted.estimate
     aligned = fit_similarity_l1(centers, ring_centers()).apply(centers)
     # the solver stops when the cost falls by less than 1e-6 of itself; 0.18 units of disturbance before
     assert np.linalg.norm(aligned - ring_centers(), axis=1).max() < 1e-4
-    assert adjusted.converged
-    assert adjusted.final_error_px < 0.01 < adjusted.initial_error_px
+    assert estimate.converged
+    assert adjusted.reconstruction.compute_mean_reprojection_error() < 0.01 < estimate.initial_error_px
     assert adjusted.reconstruction.num_points3D() == len(points)
     assert adjusted.reconstruction.compute_num_observations() == len(points) * NUM_IMAGES
     for i, camera in original.cameras.items():
@@ -545,53 +532,37 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     camera = original.camera(3)
     camera.params = np.array(camera.params) * [1.01, 1.0, 1.0, 1.0]
     seed, matches = seeded(original)
-    fixed = bundle_adjust(seed, matches)
+    fixed = bundle_adjusted(seed, matches)
     assert fixed.reconstruction.camera(3).params[0] == 808.0
     doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
-    for adjuster in ("own", "ceres"):
-        given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
-        found = bundle_adjust(seed, matches, adjuster=adjuster, given=given)
-        for camera_id, camera in found.reconstruction.cameras.items():
-            if camera_id == 3:
-                assert camera.params[0] == pytest.approx(800.0, rel=5e-4)
-            else:
-                assert camera.params.tolist() == original.camera(camera_id).params.tolist()
-        assert set(found.lenses.sigmas) == {3}
-        assert (found.lenses.sigmas[3] < 0.01) == (adjuster == "own")  # Ceres does not say
+    given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
+    found = bundle_adjusted(seed, matches, given=given)
+    for camera_id, camera in found.reconstruction.cameras.items():
+        if camera_id == 3:
+            assert camera.params[0] == pytest.approx(800.0, rel=5e-4)
+        else:
+            assert camera.params.tolist() == original.camera(camera_id).params.tolist()
+    assert set(found.estimate.lenses.sigmas) == {3}
+    assert found.estimate.lenses.sigmas[3] < 0.01
 
 
 def test_adjusted_points_satisfy_the_same_filters():
     original, _ = ring_model(noise_px=1.0)
     seed, matches = seeded(original)
-    adjusted = bundle_adjust(seed, matches, StructureOptions(max_reprojection_error_px=1.5))
+    adjusted = bundle_adjusted(seed, matches, StructureOptions(max_reprojection_error_px=1.5))
     assert 1.0 < max(reprojection_errors_px(adjusted.reconstruction)) <= 1.5
 
 
-def test_too_few_iterations_and_no_points_are_told(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.adjustment.ceres_adjustment._MAX_STEPS", 1)
-    original, _ = ring_model(noise_px=0.5)
-    seed, matches = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
-    adjusted = bundle_adjust(seed, matches, adjuster="ceres")
-    assert not adjusted.converged
-    assert adjusted.iterations == 3
-    seed, matches = seeded(original, np.zeros((NUM_IMAGES, 3)))
-    for adjuster in ("own", "ceres"):
-        with pytest.raises(UnsolvableError, match="run with --no-adjust and without --bundle-adjust"):
-            bundle_adjust(seed, matches, adjuster=adjuster)
+def test_that_no_point_can_be_adjusted_is_told():
+    seed, matches = seeded(ring_model(noise_px=0.5)[0], np.zeros((NUM_IMAGES, 3)))
+    with pytest.raises(UnsolvableError, match="run with --adjust none"):
+        bundle_adjusted(seed, matches)
 
 
 @pytest.mark.parametrize("quiet", [True, False])
-def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wanted(capfd, monkeypatch, quiet):
-    make_adjuster = pycolmap.create_default_ceres_bundle_adjuster
-
-    def talkative(*arguments):
+def test_what_pycolmap_says_reaches_the_terminal_only_if_wanted(capfd, quiet):
+    with hear_pycolmap(not quiet), quiet_stderr():
         os.write(2, b"W20260101 cholmod: matrix not positive definite")
-        return make_adjuster(*arguments)
-
-    monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
-    seed, matches = seeded(ring_model(noise_px=0.5)[0])
-    with hear_pycolmap(not quiet):
-        bundle_adjust(seed, matches, adjuster="ceres")
     said = capfd.readouterr()
     assert said.out == ""
     assert ("not positive definite" in said.err) != quiet
@@ -606,7 +577,7 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
 @pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
 def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
     folder = real_scene(name)
-    found = locate(folder / "sparse" / "0", options=LocateOptions(bundle_adjust=True)).reconstruction
+    found = locate(folder / "sparse" / "0", options=LocateOptions(adjust="full")).reconstruction
     truth = pycolmap.Reconstruction(folder / "gt")
     names = [found.image(i).name for i in sorted(found.images)]
     centers = centers_of(found)
@@ -637,7 +608,7 @@ def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
     placed = np.arange(NUM_IMAGES) != unplaced
     seed, matches = seeded(original, ring_centers() + 0.01, placed)
     with atomic_folder(tmp_path / "out") as partial:
-        write_model(color_points(triangulate(seed, matches), read_colors(original)), partial)
+        write_model(color_points(triangulated(seed, matches), read_colors(original)), partial)
     (tmp_path / "adjusted").mkdir()
 
     analysis = colmap("model_analyzer", "--path", tmp_path / "out")
@@ -671,6 +642,6 @@ def test_a_long_track_is_one_point_though_its_ends_are_not_matched():
         [[k, k + 1] for k in range(NUM_IMAGES - 1)] + [[k, k + 2] for k in range(NUM_IMAGES - 2)]
     )
     seed, matches = seeded(original, batches=[batch_of(neighbors, 120)])
-    structure = triangulate(seed, matches)
+    structure = triangulated(seed, matches)
     assert structure.num_points3D() == 120
     assert structure.compute_mean_track_length() > NUM_IMAGES - 0.5

@@ -1,6 +1,6 @@
 """Models of other programs: the axes, signs and units of each, checked on a camera worked out by hand.
 
-The scene of all readers: two cameras look along the world's +x axis with the world's +z up, so in COLMAP's
+The scene: two cameras look along the world's +x axis with the world's +z up, so in COLMAP's
 camera axes (x right, y down, z forward) right is -y and down is -z:
 
     cam_from_world = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
@@ -24,8 +24,8 @@ from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.files.glomap_text import read_relative_poses
-from sfm_shapefit.files.models import read_model_file
 from sfm_shapefit.files.nerf import nerf_text
+from sfm_shapefit.files.opensfm import read_opensfm
 from sfm_shapefit.files.tum import poses_csv, tum_text
 from sfm_shapefit.pipeline.place import place_graph_file
 from tests.program import run
@@ -38,52 +38,7 @@ PIXELS = np.array([[60.0, 20.0], [40.0, 20.0]])
 NAMES = ("a.jpg", "b.jpg")
 TURN = [1.2091995761561452, -1.2091995761561452, 1.2091995761561452]  # R: 120 deg about (1, -1, 1) / sqrt(3)
 
-BUNDLER = """# Bundle file v0.3
-2 1
-100 0 0
-0 -1 0
-0 0 1
--1 0 0
-2 -3 1
-100 0 0
-0 -1 0
-0 0 1
--1 0 0
-0 -3 1
-11 1 5
-10 20 30
-2 0 7 10 20 1 8 -10 20
-"""
-
-
-def listed(values, first=0):
-    """Values with their keys from a first one on, as OpenMVG writes its tables."""
-    return [{"key": key, "value": value} for key, value in enumerate(values, start=first)]
-
-
-def wrapped(**data):
-    return {"ptr_wrapper": {"data": data}}
-
-
 SIZE = {"width": 100, "height": 80}
-PINHOLE = {"value0": SIZE, "focal_length": 100.0, "principal_point": [50.0, 40.0]}
-OPENMVG = {
-    "sfm_data_version": "0.3",
-    "root_path": "/somewhere",
-    "views": listed(
-        wrapped(local_path="/", filename=name, id_intrinsic=0, id_view=k, id_pose=k, **SIZE)
-        for k, name in enumerate([*NAMES, "unposed.jpg"])
-    ),
-    "intrinsics": listed(
-        [{"polymorphic_name": "pinhole_radial_k3", **wrapped(value0=PINHOLE, disto_k3=[0.0, 0.0, 0.0])}]
-    ),
-    "extrinsics": listed({"rotation": R.tolist(), "center": center.tolist()} for center in CENTERS),
-    "structure": listed(
-        [{"X": POINT.tolist(), "observations": listed({"id_feat": 0, "x": xy.tolist()} for xy in PIXELS)}],
-        first=5,
-    ),
-}
-
 OPENSFM = [
     {
         "cameras": {"c": {"projection_type": "perspective", **SIZE, "focal": 1.0, "k1": 0, "k2": 0}},
@@ -101,134 +56,70 @@ TRACKS = (
 )
 
 
-def bundler_file(folder):
-    (folder / "list.txt").write_text("a.jpg\nb.jpg 0 100\n")
-    (folder / "bundle.out").write_text(BUNDLER)
-    return folder / "bundle.out"
-
-
-def openmvg_file(folder, content=OPENMVG):
-    (folder / "sfm_data.json").write_text(json.dumps(content))
-    return folder / "sfm_data.json"
-
-
 def opensfm_file(folder, content=OPENSFM, tracks=TRACKS):
     (folder / "tracks.csv").write_text(tracks)
     (folder / "reconstruction.json").write_text(json.dumps(content))
     return folder / "reconstruction.json"
 
 
-WRITERS = {"bundler": bundler_file, "openmvg": openmvg_file, "opensfm": opensfm_file}
+def read_foreign(file):
+    return read_model(reconstruction_of(read_opensfm(file), file))
 
 
-@pytest.mark.parametrize("kind", WRITERS)
-def test_a_hand_made_scene_is_read_with_the_right_axes_and_units(tmp_path, kind):
-    model = read_model(WRITERS[kind](tmp_path))
+def test_a_hand_made_scene_is_read_with_the_right_axes_and_units(tmp_path):
+    model = read_foreign(opensfm_file(tmp_path))
     assert model.names == NAMES
     np.testing.assert_allclose(model.rotations, [R, R], atol=1e-15)
     np.testing.assert_allclose(model.centers, CENTERS, atol=1e-14)
     np.testing.assert_allclose(model.focal_lengths_px, 100.0)
     (point,) = model.reconstruction.points3D.values()
     np.testing.assert_array_equal(point.xyz, POINT)
-    # The point projects onto its observations: poses, intrinsics and pixels share one convention. Bundler
-    # states no sizes, so pixels are compared there as reprojection errors only.
+    # The point projects onto its observations: poses, intrinsics and pixels share one convention.
     assert point.error < 1e-9
-    if kind != "bundler":
-        for k, image_id in enumerate(model.image_ids.tolist()):
-            np.testing.assert_allclose(model.reconstruction.image(image_id).points2D[0].xy, PIXELS[k])
+    for k, image_id in enumerate(model.image_ids.tolist()):
+        np.testing.assert_allclose(model.reconstruction.image(image_id).points2D[0].xy, PIXELS[k])
 
 
 def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
-    content = json.loads(json.dumps(OPENMVG))
-    data = content["intrinsics"][0]["value"]["ptr_wrapper"]["data"]
-    data["disto_t2"] = [0.1, 0.2, 0.3, 0.04, 0.05]
-    del data["disto_k3"]
-    camera = read_model_file(openmvg_file(tmp_path, content)).cameras[0]
-    assert camera.model == "FULL_OPENCV"
-    assert camera.params == (100.0, 100.0, 50.0, 40.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     brown = {"projection_type": "brown", "width": 80, "height": 100, "focal_x": 1.0, "focal_y": 1.1}
     brown |= {"c_x": 0.01, "c_y": -0.02, "k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.04, "p2": 0.05}
-    camera = read_model_file(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).cameras[0]
+    camera = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).cameras[0]
     expected = (100.0, 110.0, 41.0, 48.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(camera.params, expected, rtol=1e-15)
 
 
-def bundler_text(model):
-    """Write a reconstruction as Bundler has it: y up, looking along -z, pixels from the center."""
-    flip = np.diag([1.0, -1.0, -1.0])
-    lines = ["# Bundle file v0.3", f"{model.num_images} {model.reconstruction.num_points3D()}"]
-    index = {image_id: k for k, image_id in enumerate(model.image_ids.tolist())}
-    for rotation, center, focal in zip(model.rotations, model.centers, model.focal_lengths_px, strict=True):
-        matrix = np.vstack([flip @ rotation, -flip @ rotation @ center])
-        lines += [f"{float(focal)!r} 0 0", *(" ".join(map(repr, row.tolist())) for row in matrix)]
-    for point in model.reconstruction.points3D.values():
-        views = []
-        for element in point.track.elements:
-            image = model.reconstruction.image(element.image_id)
-            camera = model.reconstruction.camera(image.camera_id)
-            x, y = image.points2D[element.point2D_idx].xy
-            offset = (float(x) - camera.width / 2, camera.height / 2 - float(y))
-            views.append(f"{index[element.image_id]} {element.point2D_idx} {offset[0]!r} {offset[1]!r}")
-        lines += [" ".join(map(repr, point.xyz.tolist())), "1 2 3", " ".join([str(len(views)), *views])]
-    return "\n".join(lines) + "\n"
-
-
-def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tmp_path):
-    truth = read_model(RING / "sparse" / "0")
-    (tmp_path / "list.txt").write_text("".join(f"{name}\n" for name in truth.names))
-    (tmp_path / "ring.out").write_text(bundler_text(truth))
-    model = read_model(tmp_path / "ring.out")
-    assert model.names == truth.names
-    np.testing.assert_allclose(model.rotations, truth.rotations, atol=1e-14)
-    np.testing.assert_allclose(model.centers, truth.centers, atol=1e-13)
-    assert model.reconstruction.num_points3D() == truth.reconstruction.num_points3D()
-    options = sfm_shapefit.LocateOptions(points="never")
-    found = sfm_shapefit.locate(tmp_path / "ring.out", options=options)
-    assert "own tracks" in found.inputs.statement
-    tracks = sfm_shapefit.LocateOptions(points="never", directions="tracks")
-    direct = sfm_shapefit.locate(RING / "sparse" / "0", options=tracks)
-    np.testing.assert_allclose(found.placement.locations, direct.placement.locations, atol=1e-6)
-
-
 @pytest.mark.parametrize(
-    ("kind", "old", "new", "message"),
+    ("old", "new", "message"),
     [
-        ("bundler", "100 0 0\n0 -1 0", "100 0 nil\n0 -1 0", r"line 3: 'nil' is no finite number"),
-        ("bundler", "v0.3", "v0.9", r"line 1: expected '# Bundle file v0\.3'"),
-        ("bundler", "0 0 1\n-1 0 0\n2", "0 0 2\n-1 0 0\n2", r"camera 0 has no rotation"),
-        ("bundler", "1 8 -10 20", "9 8 -10 20", r"point 0 is seen by camera 9 of 2"),
-        ("bundler", "1 8 -10 20", "1 8 -10", r"ends early, in line 15"),
-        (
-            "openmvg",
-            '"center": [1.0, 2.0, 3.0]',
-            '"centroid": 0',
-            r"extrinsics\[0\]/value has no key 'center'",
-        ),
-        ("openmvg", '"focal_length": 100.0', '"focal_length": NaN', r"value0/focal_length is not finite"),
-        ("openmvg", '"id_intrinsic": 0', '"id_intrinsic": 3', r"has the intrinsic 3, which is not among"),
-        ("openmvg", "[[0.0, -1.0", "[[0.5, -1.0", r"extrinsics\[0\]/value/rotation is no rotation"),
-        ("openmvg", '"root_path"', "root_path", r"line 1, column \d+: no JSON"),
-        ("opensfm", '"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
-        ("opensfm", '"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
-        ("opensfm", '"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
-        ("opensfm", '"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
+        ('"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
+        ('"focal": 1.0', '"focal": NaN', r"\[0\]/cameras/c/focal is not finite"),
+        ('"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
+        ('"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
+        ('"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
+        ('"shots"', "shots", r"line 1, column \d+: no JSON"),
     ],
 )
-def test_a_malformed_file_is_refused_by_its_line_or_key(tmp_path, kind, old, new, message):
-    file = WRITERS[kind](tmp_path)
+def test_a_malformed_file_is_refused_by_its_line_or_key(tmp_path, old, new, message):
+    file = opensfm_file(tmp_path)
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
-        read_model_file(file)
+        read_opensfm(file)
 
 
 def test_a_malformed_line_of_tracks_and_a_file_that_is_no_model_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"tracks\.csv, line 2: expected image, track"):
-        read_model_file(opensfm_file(tmp_path, tracks=TRACKS.replace("0.1\t-0.2", "left", 1)))
+        read_opensfm(opensfm_file(tmp_path, tracks=TRACKS.replace("0.1\t-0.2", "left", 1)))
     (tmp_path / "other.json").write_text('{"frames": []}')
-    with pytest.raises(InputError, match="is no model: give a COLMAP folder"):
-        read_model(tmp_path / "other.json")
+    with pytest.raises(InputError, match=r"is no model: give OpenSfM's reconstruction\.json"):
+        read_opensfm(tmp_path / "other.json")
+
+
+def test_commands_other_than_convert_say_how_a_foreign_model_is_read(tmp_path):
+    file = opensfm_file(tmp_path)
+    for command in (("locate", file, tmp_path / "out"), ("evaluate", file, RING / "truth")):
+        assert "`convert` makes one of OpenSfM's reconstruction.json" in run(*command, code=3).stderr
 
 
 @pytest.fixture(scope="module")
@@ -237,10 +128,10 @@ def courtyard():
 
 
 def test_transforms_json_has_opengl_axes_and_poses_come_back(tmp_path, courtyard):
-    frames = json.loads(nerf_text(read_model_file(openmvg_file(tmp_path))))
+    frames = json.loads(nerf_text(read_opensfm(opensfm_file(tmp_path))))
     # Columns: right is -y, up is +z, backwards is -x; then the center.
     expected = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
-    np.testing.assert_array_equal(frames["frames"][0]["transform_matrix"], expected)
+    np.testing.assert_allclose(frames["frames"][0]["transform_matrix"], expected, atol=1e-15)
     assert frames["frames"][0]["file_path"] == "images/a.jpg"
     assert (frames["fl_x"], frames["cx"], frames["cy"], frames["w"]) == (100.0, 50.0, 40.0, 100)
     assert frames["camera_angle_x"] == pytest.approx(2 * np.arctan(0.5))
@@ -254,7 +145,7 @@ def test_transforms_json_has_opengl_axes_and_poses_come_back(tmp_path, courtyard
 
 
 def test_a_trajectory_has_world_from_camera_and_the_names_as_times(tmp_path):
-    scene = replace(read_model_file(openmvg_file(tmp_path)), names=("2.5.png", "1.25.png"))
+    scene = replace(read_opensfm(opensfm_file(tmp_path)), names=("2.5.png", "1.25.png"))
     lines = tum_text(scene).splitlines()
     # R^T is a turn by -120 degrees about (1, -1, 1) / sqrt(3): qw = cos 60, q = -sin 60 / sqrt(3) (1, -1, 1).
     assert lines[1].split()[0] == "1.25"
@@ -354,7 +245,7 @@ def test_a_malformed_relative_pose_is_refused_by_its_line(tmp_path, line, messag
 
 def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
     source = RING / "sparse" / "0"
-    for name in ("bin", "text", "t.json", "t.tum", "t.csv"):
+    for name in ("bin", "text", "t.json", "t.tum", "t.csv", "t.glb", "t.ply"):
         extra = ["--format", "colmap-txt"] if name == "text" else []
         run("convert", source, tmp_path / name, *extra, code=0)
         again = run("convert", source, tmp_path / name, *extra, code=3)

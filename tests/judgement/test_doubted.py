@@ -74,7 +74,7 @@ def test_turned_cameras_are_put_right_or_left_out_and_no_others(chosen, angle_de
         "its rotation is wrong" in reason and f"{angle_deg:.0f} degrees" in reason
         for reason in reasons.values()
     )
-    unadjusted = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust=False)
+    unadjusted = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
     assert {row.name for row in unadjusted.cameras if not row.placed} == wrong
 
 
@@ -90,7 +90,7 @@ def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, 
     monkeypatch.setattr(doubts_stage, "_MOST_ASKED", 6 * 25)
     monkeypatch.setattr(doubts_stage, "estimate_relative_rotations", estimate)
     model, wrong = turned(COURTYARD, chosen, angle_deg)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust=False)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
     assert 0 < len(asked) <= 6 * 25
     assert {row.name for row in found.cameras if not row.placed} == wrong
     kinds = dict(zip(found.model.names, found.placement.assessment.doubts.kinds, strict=True))
@@ -109,7 +109,7 @@ def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch
     monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
     chosen = (9, 10, 11, 12, 13)
     model, wrong = turned(COURTYARD, chosen, angle_deg)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust=False)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
     assert {row.name for row in found.cameras if not row.placed} == wrong
     touching = [any(found.model.names[k] in wrong for k in pair) for pair in tried]
     assert np.mean(touching) > 0.9
@@ -135,11 +135,11 @@ def test_a_camera_that_is_turned_a_little_is_put_right():
 
 def test_measured_rotations_are_not_doubted():
     model, _ = turned(COURTYARD, (7,), 2.0)
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="measured")
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="held")
     assert found.placement.assessment.doubts is None
     assert "rotation" not in "".join(row.reason for row in found.cameras)
     with pytest.raises(ValueError, match="map finds the rotations itself"):
-        sfm_shapefit.MapOptions(rotations="measured")
+        sfm_shapefit.MapOptions(rotations="held")
 
 
 @pytest.mark.slow

@@ -56,9 +56,11 @@ def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(fou
 
 def test_a_weight_follows_its_frames_when_some_are_left_out():
     weight = RotationWeight(sigma_rad=0.1, frame_sigmas_rad=np.array([0.1, 0.7, 0.2]))
-    given = GivenPoses(weight=weight, weight_frames=(4, 5, 9))
-    assert given.weight_of((5, 8, 9)).frame_sigmas_rad.tolist() == [0.7, 0.1, 0.2]
-    assert GivenPoses(weight=RotationWeight(hold=True)).weight_of((5, 9)) == RotationWeight(hold=True)
+    of_all = weight.among(np.array([4, 5, 9]), 10)
+    given = GivenPoses(weight=of_all).of(np.array([5, 8, 9]))
+    assert given.weight.frame_sigmas_rad.tolist() == [0.7, 0.1, 0.2]
+    held = RotationWeight(hold=True)
+    assert GivenPoses(weight=held.among(np.array([4, 5]), 10)).of(np.array([5, 9])).weight == held
 
 
 def counts_of(structure, checked, agreeing):

@@ -7,11 +7,11 @@ import pytest
 
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pairs.estimate import estimate_directions, from_relative_poses
+from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.scene.matches import RayMatches, RelativePoses
+from sfm_shapefit.scene.matches import RayMatches
 from sfm_shapefit.solver.solve import solve
 from tests.problems import all_pairs, random_rotations
 from tests.scenes import COURTYARD
@@ -287,7 +287,7 @@ def test_weights_fall_with_uncertainty_and_contradicting_matches_and_without_a_d
     # Relative to the median, 1 / sqrt(1 + 3^2) = 0.316: 1, 1, 1/4, 0.316, and 5e-4 raised to the floor.
     expected = [np.sqrt(10.0), np.sqrt(10.0), np.sqrt(10.0) / 4.0, 1.0, 0.02]
     np.testing.assert_allclose(weights, expected, rtol=1e-12)
-    found = directions_with([0.0, np.nan, 0.1], [1.0, 1.0, 1.0])  # an unknown uncertainty counts as none
+    found = directions_with([0.0, 0.0, 0.1], [1.0, 1.0, 1.0])
     found = replace(found, status=[*found.status[:2], DirectionStatus.FEW_INLIERS])
     np.testing.assert_array_equal(found.weights(), [1.0, 1.0, np.nan])
     assert np.isnan(replace(found, status=[DirectionStatus.NO_PARALLAX] * 3).weights()).all()
@@ -328,29 +328,3 @@ def test_more_hypotheses_survive_more_wrong_matches():
         return np.sum(~(errors_deg(found, pairs) < 5.0))
 
     assert failures(400) < failures(5)
-
-
-def test_relative_poses_become_directions_with_the_papers_sign():
-    rng = np.random.default_rng(11)
-    rotations = np.linalg.qr(rng.standard_normal((2, 3, 3)))[0]
-    rotations *= np.linalg.det(rotations)[:, None, None]
-    centers = rng.standard_normal((2, 3))
-    translations = -np.einsum("nab,nb->na", rotations, centers)
-    relative_rotation = rotations[1] @ rotations[0].T
-    relative_translation = translations[1] - relative_rotation @ translations[0]
-    poses = RelativePoses(
-        pairs=np.array([[0, 1]]),
-        rotations=relative_rotation[None],
-        translations=0.17 * relative_translation[None],  # COLMAP's planar poses are not unit
-        configs=np.array([2]),
-        num_inliers=np.array([50]),
-    )
-    found = from_relative_poses(poses, rotations)
-    assert found.status == [DirectionStatus.USABLE]
-    np.testing.assert_allclose(found.directions[0], normalized(centers[0] - centers[1]), atol=1e-14)
-
-    turned = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), -np.sin(0.3)], [0.0, np.sin(0.3), np.cos(0.3)]])
-    contradicting = replace(poses, rotations=turned @ poses.rotations)
-    assert from_relative_poses(contradicting, rotations).status == [DirectionStatus.ROTATION_MISMATCH]
-    unsupported = replace(poses, num_inliers=np.array([5]))
-    assert from_relative_poses(unsupported, rotations).status == [DirectionStatus.TOO_FEW_MATCHES]

@@ -6,7 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit.files.colmap.model import read_model, with_frame_rotations
+from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.model import read_model, turned_model
 from tests.scenes import COURTYARD, RING, copied, edit_database, real_scene
 
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
@@ -33,7 +34,7 @@ def rotations_of(found):
 
 @pytest.fixture(scope="module")
 def placed():
-    return sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust=False)
+    return sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust="none")
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_exact_rotations_are_held_to_the_bit_and_centers_gain(placed):
 
 
 def test_rotations_that_are_off_are_weighted_by_about_how_much_and_end_nearer_to_the_truth(off, adjusted):
-    plain = sfm_shapefit.locate(off, DATABASE, adjust=False)
+    plain = sfm_shapefit.locate(off, DATABASE, adjust="none")
     told = adjusted.summary()["adjustment"]
     assert told["rotations"] == "weighted"
     # The root mean square of 24 x 3 normal numbers is within 4 / sqrt(144) = 33 % of sigma.
@@ -79,13 +80,13 @@ def test_rotations_that_are_off_are_weighted_by_about_how_much_and_end_nearer_to
 
 
 def test_measured_rotations_are_held_without_a_question_and_a_given_sigma_is_used(off):
-    held = sfm_shapefit.locate(off, DATABASE, rotations="measured", min_trust=0.0)
+    held = sfm_shapefit.locate(off, DATABASE, rotations="held", min_trust=0.0)
     assert held.adjustment.errors is None
     given = pycolmap.Reconstruction(off)
     for image_id, quat in rotations_of(held).items():
         np.testing.assert_array_equal(quat, given.image(image_id).cam_from_world().rotation.quat)
     tight, loose = (
-        sfm_shapefit.locate(off, DATABASE, rotation_sigma_deg=sigma, min_trust=0.0) for sigma in (1e-3, 0.2)
+        sfm_shapefit.locate(off, DATABASE, rotations=sigma, min_trust=0.0) for sigma in (1e-3, 0.2)
     )
     free = sfm_shapefit.locate(off, DATABASE, rotations="free", min_trust=0.0)
     turns = [np.median(one.turned_deg) for one in (tight, loose, free)]
@@ -99,15 +100,15 @@ def test_measured_rotations_are_held_without_a_question_and_a_given_sigma_is_use
 def test_bundle_adjustment_obeys_the_same_choice(placed):
     """With exact rotations free, bundle adjustment takes the courtyard's centers away from the truth."""
     model = COURTYARD / "sparse" / "0"
-    auto = sfm_shapefit.locate(model, bundle_adjust=True)
-    free = sfm_shapefit.locate(model, bundle_adjust=True, rotations="free")
+    auto = sfm_shapefit.locate(model, adjust="full")
+    free = sfm_shapefit.locate(model, adjust="full", rotations="free")
     assert error(auto).position.mean < error(placed).position.mean < error(free).position.mean
     assert error(auto).rotation_deg.max < 1e-5 < error(free).rotation_deg.max
 
 
 def test_the_models_own_tracks_serve_as_well():
     off = turned(pycolmap.Reconstruction(RING / "sparse" / "0"), 0.2, seed=1)
-    plain = sfm_shapefit.locate(off, directions="tracks", adjust=False)
+    plain = sfm_shapefit.locate(off, directions="tracks", adjust="none")
     found = sfm_shapefit.locate(off, directions="tracks")
     before, after = (
         sfm_shapefit.evaluate(one.reconstruction, RING / "sparse" / "0") for one in (plain, found)
@@ -116,14 +117,14 @@ def test_the_models_own_tracks_serve_as_well():
 
 
 def test_an_optimum_that_was_asked_for_is_delivered_as_it_is():
-    for option in ({"objective": "shapefit"}, {"refine": False}, {"objective": "least-squares"}):
+    for option in ({"objective": "shapefit"}, {"refine": False}):
         assert sfm_shapefit.locate(RING / "sparse" / "0", **option).adjustment is None
 
 
 def test_frames_turn_about_their_centers_and_the_input_stays_as_it_is():
     model = read_model(RING / "sparse" / "0")
     other = turned(model.reconstruction, 1.0)
-    found = with_frame_rotations(model, other)
+    found = turned_model(model, images_of(other))
     theirs = [other.image(i).cam_from_world().rotation.matrix() for i in model.image_ids.tolist()]
     np.testing.assert_allclose(found.rotations, theirs, atol=1e-14)
     np.testing.assert_allclose(found.centers, model.centers, atol=1e-13)

@@ -48,7 +48,7 @@ def centers_of(model):
     return {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
 
 
-@pytest.mark.parametrize("options", [{}, {"bundle_adjust": True}], ids=["placed", "adjusted"])
+@pytest.mark.parametrize("options", [{}, {"adjust": "full"}], ids=["placed", "adjusted"])
 def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp_path, options):
     lines = marks_of(ring, CORNERS)
     for k, line in enumerate(lines):  # P6 checks only; P4 is a meter too high

@@ -170,6 +170,15 @@ def test_a_second_cluster_on_a_machine_opens_without_a_word(recwarn):
     assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
 
 
-def test_a_scheduler_without_dask_is_refused():
-    with pytest.raises(InputError, match="belongs to the executor dask"), open_executor("serial", 1, "a:1"):
+@pytest.mark.slow
+def test_a_cluster_that_runs_already_is_found_by_its_address():
+    distributed = pytest.importorskip("distributed")
+    local = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0")
+    with local, open_executor(f"dask:{local.scheduler_address}", 1) as pool:
+        assert pool.submit(abs, -2).result() == 2
+
+
+def test_no_scheduler_at_an_address_is_reported():
+    pytest.importorskip("distributed")
+    with pytest.raises(WorkerError, match="cannot be reached"), open_executor("dask:nonsense://1", 1):
         pass

@@ -15,8 +15,7 @@ from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.model import points2d_xy
 from sfm_shapefit.pipeline.write import write_result
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
-from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.synthetic import make_scene
 from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint, real_scene
 
 
@@ -91,7 +90,7 @@ def test_exact_data_give_the_exact_answer_in_the_inputs_scale_and_no_file_is_cha
 
 def test_tracks_serve_where_there_is_no_database_and_points_keep_their_colors():
     found = sfm_shapefit.locate(FACADE / "sparse" / "0")
-    assert found.inputs.source == "tracks"
+    assert found.inputs.database is None
     errors = sfm_shapefit.evaluate(found.reconstruction, FACADE / "sparse" / "0")
     assert errors.position.max < 0.05  # meters, on a grid of 9 cameras before a wall
     assert found.reconstruction.num_points3D() > 300
@@ -113,18 +112,6 @@ def test_points_of_a_databases_matches_have_the_colors_of_the_inputs_points():
         elements = [(e.image_id, e.point2D_idx) for e in point.track.elements]
         (seen,) = {truth.image(i).point2D(k).point3D_id for i, k in elements}  # matches have no errors
         np.testing.assert_array_equal(point.color, truth.point3D(seen).color)
-
-
-def test_relative_poses_serve_when_asked_for(tmp_path):
-    scene = make_scene(SceneOptions(shape="ring", num_images=8, num_points=1500, seed=3))
-    write_workspace(scene, tmp_path / "ring", WorkspaceOptions(relative_poses=True))
-    options = LocateOptions(directions="relative-poses")
-    found = sfm_shapefit.locate(tmp_path / "ring" / "sparse" / "0", options=options)
-    assert found.inputs.source == "relative-poses"
-    errors = sfm_shapefit.evaluate(found.reconstruction, tmp_path / "ring" / "sparse" / "0")
-    assert errors.position.median < 0.05
-    with pytest.raises(UnsolvableError, match="no stored relative pose"):
-        sfm_shapefit.locate(RING / "sparse" / "0", options=options)
 
 
 def test_the_same_input_gives_the_same_bits(courtyard):
@@ -237,7 +224,7 @@ def ring_with_pairs(folder, wanted):
 
 
 def test_bundle_adjustment_from_the_seed_converges_and_stays_there(courtyard):
-    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", bundle_adjust=True)
+    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", adjust="full")
     assert adjusted.adjusted is not None
     assert adjusted.adjusted.converged
     assert adjusted.adjusted.final_error_px < adjusted.adjusted.initial_error_px

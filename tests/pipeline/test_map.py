@@ -10,10 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from abuse import determinism
-from abuse.verdicts import read_cameras
 from sfm_shapefit.adjustment import structure as triangulation
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene_words import describe_line, describe_loops
@@ -28,9 +26,11 @@ from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.rotations.trusted import average_consistently
+from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.abuse import determinism
+from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.pipeline.test_execution import die_once
 from tests.program import run, run_python
@@ -127,7 +127,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
 
 def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
     database = RING / "database.db"
-    arguments = ["map", database, tmp_path / "out", "--bundle-adjust", "--points", "never", "--json"]
+    arguments = ["map", database, tmp_path / "out", "--adjust", "full", "--points", "never", "--json"]
     facts = json.loads(run(*arguments, code=0).stdout)
     assert facts["models"][0]["located"]["bundle_adjustment"]["final_error_px"] < 1.0
     errors = sfm_shapefit.evaluate(tmp_path / "out" / "0", RING / "sparse" / "0")
@@ -158,7 +158,7 @@ def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, 
         assert len(compared.names) == 10
         return compared.position.rms, compared.rotation_deg.rms
 
-    coarse, adjusted, likeliest = errors(adjust=False), errors(), errors(bundle_adjust=True)
+    coarse, adjusted, likeliest = errors(adjust="none"), errors(), errors(adjust="full")
     for k in range(2):
         assert adjusted[k] < 1.1 * likeliest[k]
         assert adjusted[k] < coarse[k] / 1.5
@@ -185,7 +185,7 @@ def test_images_that_see_few_points_are_left_out_with_the_reason(tmp_path):
 
 
 def test_threads_repetition_and_hashes_change_no_byte(tmp_path):
-    flags = ("--bundle-adjust",)
+    flags = ("--adjust", "full")
     assert list(determinism.differing_files(RING, tmp_path, command="map", always=flags)) == []
 
 
@@ -233,11 +233,9 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--averaging", "ceres"], "'ceres' is not one of 'own', 'pycolmap'"),
-        (["--rotations", "measured"], "map finds the rotations itself"),
-        (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
-        (["--rotations", "exact"], "'exact' is not one of"),
-        (["--adjuster", "ceres"], "adjuster has no effect without bundle_adjust"),
+        (["--rotations", "held"], "map finds the rotations itself"),
+        (["--rotations", "0.1"], "map finds the rotations itself"),
+        (["--rotations", "exact"], "rotations must be one of auto, held, free or of type float, got 'exact'"),
         (["--min-points-per-image", "-1"], "min_points_per_image must be"),
     ],
 )
@@ -431,8 +429,7 @@ def test_inlier_matches_are_enough(tmp_path):
     assert found.names == unposed.names
     # Half a pixel of noise at f = 1000 px, over hundreds of matches.
     assert np.median(rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ true)) < 0.2
-    with pytest.raises(UnsolvableError, match="has 15 inlier matches and a relative rotation"):
-        sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(relative_rotations="stored"))
+    assert len(sfm_shapefit.relative_rotations(path, source="stored").pairs) == 0
 
 
 def wrong_focal_length(factor):
@@ -462,7 +459,7 @@ def test_a_guessed_focal_length_is_found_and_told(tmp_path):
 
 def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
     path = changed(RING, tmp_path, wrong_focal_length(1.01))
-    found = sfm_shapefit.map_database(path, refine_intrinsics="none", **FAST)
+    found = sfm_shapefit.map_database(path, intrinsics="held", **FAST)
     located = found.models[0].located
     assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
     assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)
@@ -531,23 +528,20 @@ def worst_error_deg(answer, truth):
 
 def test_the_most_consistent_of_several_averagings_is_kept():
     truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    misled = average_consistently(14, relative, min_matches=15, averaging="pycolmap")
-    assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
     weights = np.sqrt(relative.num_matches)
     right = relative.num_matches == 100
-    for averaging, certified in (("pycolmap", None), ("own", True)):
-        answer = average_consistently(14, relative, averaging=averaging)
-        assert (answer.averaging, answer.certified) == (averaging, certified)
-        assert answer.registered.all()
-        assert answer.num_tried > 1
-        assert answer.num_pairs == right.sum()
-        assert worst_error_deg(answer, truth) < 0.5
-        assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
+    answer = average_relative_rotations(14, relative)
+    assert answer.certified
+    assert answer.registered.all()
+    assert answer.num_tried > 1
+    assert answer.num_pairs == right.sum()
+    assert worst_error_deg(answer, truth) < 0.5
+    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
 
 
 def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
     truth, relative = problem()
-    assert not average_consistently(14, relative).unsettled.any()
+    assert not average_relative_rotations(14, relative).unsettled.any()
     bad = (relative.pairs == 3).any(axis=1)
     unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
     answers = []
@@ -556,7 +550,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_
         rng = np.random.default_rng(1)
         rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
         part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
-        answers.append(average_consistently(14, part))
+        answers.append(average_relative_rotations(14, part))
     assert answers[0].agreements[3] < 0.25
     assert np.delete(answers[0].agreements, 3).min() > 0.8
     assert list(np.flatnonzero(answers[0].unsettled)) == [3]

@@ -11,7 +11,7 @@ from sfm_shapefit import InputError, LocateOptions
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pipeline.measure import sample_errors
+from sfm_shapefit.pipeline.measure import add_evidence
 from sfm_shapefit.pipeline.memory import (
     ECONOMIES,
     Workload,
@@ -133,11 +133,13 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
     last = [economy for economy in ECONOMIES if economy.adjustment][-1]
     needed = forecast(describe_work(crowded, measured, LocateOptions()), last).peak_mb
     options = LocateOptions(max_memory_mb=int(needed) - 1)
-    economy, _, changed = keep_within_memory(crowded, measured, options, ECONOMIES[0])
+    economy = keep_within_memory(crowded, measured, options, ECONOMIES[0])[0]
     assert "not adjusted" in economy.statement
-    assert not changed.adjust
+    assert not economy.adjustment
+    free = replace(options, rotations="free")  # which without an adjustment would have no effect
+    assert keep_within_memory(crowded, measured, free, ECONOMIES[0])[2] == free
     plenty = replace(options, max_memory_mb=10**6)
-    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[2].adjust
+    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[0].adjustment
 
 
 @pytest.fixture(scope="module")
@@ -170,11 +172,11 @@ def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_
 def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch):
     sampled = []
 
-    def listen(*given):
-        sampled.append(sample_errors(*given))
-        return sampled[-1]
+    def listen(graph, measured):
+        sampled.append(measured.errors)
+        return add_evidence(graph, measured)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.measure.sample_errors", listen)
+    monkeypatch.setattr("sfm_shapefit.pipeline.settle.add_evidence", listen)
     full = sfm_shapefit.inspect(workspaces[kind]).expected
     for limit in range(int(full.peak_mb) - 1, 200, -5):
         try:

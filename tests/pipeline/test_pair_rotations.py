@@ -152,7 +152,7 @@ def test_other_bad_arguments_are_refused(tmp_path):
         sfm_shapefit.relative_rotations(tmp_path / "none.db")
     with pytest.raises(ValueError, match="min_matches must be at least 1"):
         sfm_shapefit.relative_rotations(DATABASE, min_matches=0)
-    with pytest.raises(ValueError, match="relative_rotations must be one of"):
+    with pytest.raises(ValueError, match="source must be one of"):
         sfm_shapefit.relative_rotations(DATABASE, source="guessed")
     with pytest.raises(ValueError, match="threads must"):
         sfm_shapefit.relative_rotations(DATABASE, threads=-1)

@@ -32,8 +32,8 @@ def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
     ready, totals = zip(*told, strict=True)
     assert list(ready) == sorted(ready)
     assert 3 <= ready[-1] < totals[0] == len(module._kernels(only_needed=False))
-    assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "commands")
-    assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "commands")
+    assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "pipeline")
+    assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "pipeline")
 
 
 def test_processes_that_die_are_told_of(monkeypatch):

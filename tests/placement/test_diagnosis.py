@@ -10,9 +10,9 @@ from sfm_shapefit import UnsolvableError, synthetic
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.conditioning import direction_spread
-from sfm_shapefit.placement.diagnosis import diagnose, theory_of
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.refinement.options import PlacementOptions
 from tests.problems import all_pairs, exact_graph
 from tests.program import run
@@ -124,20 +124,6 @@ def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(m
     assert "no second start" in diagnose(pair).plan.finish
 
 
-def test_theory_is_given_in_words_or_left_out_with_the_reason():
-    problem = synthetic.random_graph_problem(12, 1.0, seed=7)
-    graph = problem.view_graph
-    found = theory_of(graph, problem.locations)
-    assert "less than one pair of 12 cameras" in found.statement
-    assert found.conditions.granted_in_space > 0.0
-    assert "coincide" in theory_of(graph, np.zeros((12, 3))).statement
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sfm_shapefit.placement.diagnosis.MAX_THEORY_CAMERAS", 11)
-        assert theory_of(graph, problem.locations).conditions is None
-    chain = exact_graph(problem.locations, [(k, k + 1) for k in range(11)])
-    assert "p-typical for no p" in theory_of(chain, problem.locations).statement
-
-
 def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
     scene = copied(COURTYARD, tmp_path)
     before = fingerprint(tmp_path)
@@ -160,25 +146,21 @@ def test_inspect_sees_as_many_wrong_pairs_as_locate_rejects():
     assert seen.corruption.share == pytest.approx(44 / 176, abs=0.05)  # self-consistent in part: too low
 
 
-def test_json_has_the_same_content_and_theory():
+def test_json_has_the_same_content():
     names = ("--input_path", RING / "sparse" / "0", "--database_path", RING / "database.db")
-    facts = json.loads(run("inspect", *names, "--json", "--theory").stdout)
+    facts = json.loads(run("inspect", *names, "--json").stdout)
     assert facts["num_images"] == facts["diagnosis"]["num_cameras"] == 8
     assert facts["diagnosis"]["plan"]["solver"] == "newton"
-    assert facts["theory"]["conditions"]["granted_in_space"] >= 0.0
-    assert facts["theory"]["statement"]
     never = json.loads(run("inspect", *names, "--json", "--points", "never").stdout)
     assert never["points"] == "no, as asked"
     assert never["diagnosis"]["num_points"] == 0 < facts["diagnosis"]["num_points"]
-    assert never["theory"] is None
 
 
 def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_path):
     t, graph = np.random.default_rng(8).standard_normal((6, 3)), tmp_path / "graph.txt"
     graph.write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
-    result = run("inspect", graph, "--theory", code=0)
+    result = run("inspect", graph, code=0)
     assert "5: pendant" in result.stdout
-    assert "no centers" in result.stdout
     run("inspect", graph, "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)

@@ -11,8 +11,10 @@ from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.gauge import prior_gauge
-from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -62,12 +64,10 @@ OPTIONS = {
         "lud",
         lambda found, _: found.refined.start == "LUD" and "as asked" in found.refined.reason,
     ),
-    "filter": ("triangles", lambda found, _: len(found.dropped) > 0),
     "refine": (False, lambda found, usual: usual.refined.is_refined and not found.refined.is_refined),
 }
 REFUSED_BY_GROUPS = {
     "solver": "no solver admm",
-    "filter": "without a filter",
     "factor_memory_mb": "factor over .* groups takes",
 }
 
@@ -94,9 +94,7 @@ def test_every_option_is_obeyed_or_refused_in_one_sentence(usual, name):
     assert holds(place(measured, options), placement)
 
 
-def test_baselines_are_refused_with_groups_and_the_conic_solver_knows_them():
-    with pytest.raises(InputError, match="rigs and fixed cameras go with the objectives"):
-        place(measure("rigs"), PlacementOptions(objective="linf"))
+def test_the_conic_solver_knows_groups():
     assert place(measure("rigs"), PlacementOptions(solver="conic")).certified.method == "conic"
 
 
@@ -164,7 +162,8 @@ def reset() -> tuple[Placement, np.ndarray]:
 
 def pull(placement, priors, **options):
     gauge = prior_gauge(placement.locations, priors)
-    return pull_to_priors(placement, gauge, priors, PlacementOptions(**options))
+    pulled = pull_to_priors(placement, gauge, priors, PlacementOptions(**options))
+    return pulled._replace(placement=judge(pulled.placement, PlacementOptions(**options)))
 
 
 def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):

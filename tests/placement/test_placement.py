@@ -11,7 +11,10 @@ from sfm_shapefit.facts.rows import camera_rows, pair_rows
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.place import place, place_further
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.pipeline.place import place
+from sfm_shapefit.placement.place import Placement, place_pieces
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.problems import all_pairs
@@ -73,12 +76,15 @@ def test_rows_speak_of_the_whole_graph():
         np.testing.assert_allclose(row.direction, normalized(t[i] - t[j]), atol=1e-12)
 
 
+def pieces_of(graph: ViewGraph) -> list[Placement]:
+    return list(place_pieces(MeasuredGraph(graph), PlacementOptions()))
+
+
 def test_further_pieces_are_solved_each_by_its_own_edges():
     t, edges, v = two_pieces()
     bent = 5  # in the large piece: the small one knows nothing of it
     v[bent] = normalized(v[bent] + 0.3 * np.cross(v[bent], v[bent + 1]))
-    placement = place(ViewGraph(7, edges, v))
-    (further,) = place_further(placement)
+    placement, further = (judge(piece, PlacementOptions()) for piece in pieces_of(ViewGraph(7, edges, v)))
     assert (further.piece, further.cameras.tolist(), further.edges.tolist()) == (1, [4, 5, 6], [0, 1, 2])
     found, true = further.locations, t[4:] - t[4:].mean(axis=0)
     scale = np.sum(found * true) / np.sum(true * true)
@@ -93,8 +99,7 @@ def test_further_pieces_are_solved_each_by_its_own_edges():
 def test_a_piece_that_no_scale_fits_is_left_out_and_a_graph_without_a_triangle_is_refused():
     _, edges, v = two_pieces()
     v[:3] = [[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]]  # (4, 5), (4, 6), (5, 6): they cancel at every camera
-    placement = place(ViewGraph(7, edges, v))
-    assert list(place_further(placement)) == []
+    (placement,) = pieces_of(ViewGraph(7, edges, v))
     assert placement.cameras.tolist() == [0, 1, 2, 3, 4]
     with pytest.raises(UnsolvableError, match="no three cameras"):
         place(ViewGraph(4, [(0, 1), (1, 2), (2, 3)], np.eye(3)))
@@ -105,8 +110,8 @@ def test_directions_that_do_not_fit_together_and_mostly_contradicting_pairs_rais
     assert any("deg off the solution" in warning for warning in quality_warnings(place(noise)))
     placement = place(clean)
     assert list(quality_warnings(placement)) == []
-    judged = dataclasses.replace(placement.assessment, inliers=np.arange(clean.num_edges) % 3 == 0)
-    warnings = list(quality_warnings(dataclasses.replace(placement, assessment=judged)))
+    few = dataclasses.replace(placement.agreement, agrees=np.arange(clean.num_edges) % 3 == 0)
+    warnings = list(quality_warnings(dataclasses.replace(placement, agreement=few)))
     assert any("66% of the pairs contradict the solution" in warning for warning in warnings)
 
 

@@ -8,7 +8,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -86,8 +86,12 @@ def test_lud_is_taken_if_asked_and_without_refinement_the_better_start_as_it_is(
         assert (unrefined.start, unrefined.is_refined, unrefined.moved) == ("LUD", False, (0.0, 0.0))
 
 
-def start(name: str) -> Start:
-    return Start(name=name, locations=np.eye(3), refined=None, reset_nodes=np.empty(0, dtype=np.int64))
+TRIANGLE = ViewGraph(3, [(0, 1), (1, 2), (2, 0)], normalized(np.eye(3) - np.roll(np.eye(3), -1, axis=0)))
+
+
+def start(name: str, locations=None) -> Start:
+    there = np.eye(3) if locations is None else locations
+    return Start(name=name, locations=there, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
 
 
 @pytest.mark.parametrize(
@@ -104,9 +108,22 @@ def start(name: str) -> Start:
 def test_the_lower_cost_is_kept_and_a_tie_of_disagreeing_starts_goes_to_lud(costs, apart, kept, word):
     starts = [start("ShapeFit"), start("LUD")]
     by_name = dict(zip(("ShapeFit", "LUD"), costs, strict=True))
-    chosen, reason = finishing._choose(starts, by_name, apart, PlacementOptions())
+    chosen, reason = finishing._choose(TRIANGLE, starts, by_name, apart, PlacementOptions())
     assert chosen.name == kept
     assert word in reason
+
+
+def test_a_start_whose_cameras_stand_in_one_point_is_not_kept_whatever_it_costs():
+    graph = ViewGraph(5, [(0, 1), (1, 2), (2, 3), (3, 4), (4, 0)], normalized(np.eye(5)[:, :3] + 0.1))
+    spread = np.random.default_rng(0).standard_normal((5, 3))
+    point = 1e-9 * spread
+    point[0] = spread[0]
+    for lengths, kept in ((point, "LUD"), (spread, "ShapeFit")):
+        starts = [start("ShapeFit", lengths), start("LUD", spread)]
+        chosen, _ = finishing._choose(
+            graph, starts, {"ShapeFit": 90.0, "LUD": 100.0}, 5.0, PlacementOptions()
+        )
+        assert chosen.name == kept
 
 
 def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypatch, expander):

@@ -1,4 +1,4 @@
-"""scene.glb and scene.ply: what other viewers read of them."""
+"""Meshes of `convert`: what other viewers read of them."""
 
 import json
 import struct
@@ -7,16 +7,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from sfm_shapefit.report.drawing import PairClass
-from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors, write_meshes
+from sfm_shapefit import convert
+from sfm_shapefit.facts.tables import CameraRow, read_rows
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.report.mesh import mesh_bytes, trust_colors
 from tests.drawings import make_drawing
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("meshes")
-    write_meshes(make_drawing()[0], folder)
-    return folder
+from tests.program import run, run_refused
+from tests.scenes import BUNDLED, FACADE
 
 
 def glb_tree(path):
@@ -27,46 +24,22 @@ def glb_tree(path):
     return json.loads(raw[20 : 20 + json_length])
 
 
-def test_the_glb_holds_cameras_points_and_a_kind_of_line_per_verdict(folder):
+def test_the_glb_holds_cameras_and_points_upright_around_the_origin(tmp_path):
     drawing, _ = make_drawing()
-    modes = {mesh["name"]: mesh["primitives"][0]["mode"] for mesh in glb_tree(folder / "scene.glb")["meshes"]}
-    points, lines, triangles = 0, {1, 3}, 4  # of the specification
-    assert modes["cameras"] == triangles
-    assert modes["points"] == points
-    assert {modes[f"pairs: {kind}"] for kind in ("agrees", "contradicts", "undetermined")} <= lines
-    loaded = trimesh.load(folder / "scene.glb").geometry
+    (tmp_path / "scene.glb").write_bytes(mesh_bytes(drawing, "glb"))
+    modes = {
+        mesh["name"]: mesh["primitives"][0]["mode"] for mesh in glb_tree(tmp_path / "scene.glb")["meshes"]
+    }
+    points, triangles = 0, 4  # of the specification
+    assert modes == {"cameras": triangles, "points": points}
+    loaded = trimesh.load(tmp_path / "scene.glb").geometry
     assert len(loaded["cameras"].faces) == 6 * 24
     assert len(loaded["points"].vertices) == len(drawing.points.positions)
-
-
-def test_in_the_glb_y_is_up_and_the_cameras_are_around_the_origin(folder):
-    drawing, _ = make_drawing()
-    cameras = trimesh.load(folder / "scene.glb").geometry["cameras"]
-    apexes = np.asarray(cameras.vertices)[: 5 * 24 : 5]
+    apexes = np.asarray(loaded["cameras"].vertices)[: 5 * 24 : 5]
     placed = drawing.cameras.centers[drawing.cameras.placed]
     height = (placed - np.median(placed, axis=0)) @ drawing.axes[2]
     np.testing.assert_allclose(apexes[:, 1], height, atol=1e-5)  # float32 of 10
     np.testing.assert_allclose(np.median(apexes, axis=0), 0.0, atol=1e-5)
-
-
-def test_the_ply_is_in_the_axes_of_the_model_colored_by_trust_with_a_ribbon_for_each_drawn_pair(folder):
-    drawing, _ = make_drawing()
-    mesh = trimesh.load(folder / "scene.ply", process=False)
-    placed, num_points = drawing.cameras.placed, len(drawing.points.positions)
-    colors, vertices = mesh.visual.vertex_colors[:, :3], np.asarray(mesh.vertices)
-    np.testing.assert_allclose(vertices[: 5 * 24 : 5], drawing.cameras.centers[placed], atol=1e-5)
-    np.testing.assert_array_equal(colors[: 5 * 24 : 5], trust_colors(drawing.cameras.trust[placed]))
-    np.testing.assert_allclose(vertices[-num_points:], drawing.points.positions, atol=1e-5)  # float32 of 10
-    ends, classes = drawing.pairs.cameras, drawing.pairs.classes
-    drawn = placed[ends].all(axis=1) & (classes != PairClass.NO_DIRECTION)
-    assert len(mesh.faces) == 6 * 24 + 2 * int(drawn.sum())
-    wrong = drawn & (classes == PairClass.CONTRADICTS)
-    reds = (colors[5 * 24 :] == PAIR_COLORS[PairClass.CONTRADICTS]).all(axis=1)
-    assert int(reds.sum()) == 4 * int(wrong.sum())
-    ribbons = vertices[5 * 24 : -num_points].reshape(-1, 4, 3).mean(axis=1)
-    middles = drawing.cameras.centers[ends[wrong]].mean(axis=1)
-    found = ribbons[reds[:-num_points:4]]
-    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 
 def test_trust_is_red_at_0_green_at_1_and_gray_where_unknown():
@@ -78,5 +51,32 @@ def test_trust_is_red_at_0_green_at_1_and_gray_where_unknown():
 
 def test_nothing_placed_gives_empty_scenes_that_still_open(tmp_path):
     drawing, _ = make_drawing(num_cameras=1, num_pairs=0, num_points=3)  # the last camera is never placed
-    write_meshes(drawing, tmp_path)
+    for kind in ("glb", "ply"):
+        (tmp_path / f"scene.{kind}").write_bytes(mesh_bytes(drawing, kind))
     assert len(trimesh.load(tmp_path / "scene.ply", process=False).vertices) == 3
+    assert list(trimesh.load(tmp_path / "scene.glb").geometry) == ["points"]
+
+
+@pytest.mark.parametrize("is_output", [True, False])
+def test_convert_writes_a_model_in_its_own_axes_and_an_output_with_its_trust(tmp_path, is_output):
+    source = FACADE / "sparse" / "0"
+    if is_output:
+        run("locate", source, tmp_path / "out", "--no-report", "-q", code=0)
+        source = tmp_path / "out"
+    assert convert(source, tmp_path / "scene.ply") == "ply"
+    model = read_model(source)
+    mesh = trimesh.load(tmp_path / "scene.ply", process=False)
+    assert len(mesh.faces) == 6 * model.num_images
+    apexes, colors = mesh.vertices[: 5 * model.num_images : 5], mesh.visual.vertex_colors
+    order = np.lexsort(model.centers.round(4).T), np.lexsort(np.asarray(apexes).round(4).T)
+    np.testing.assert_allclose(apexes[order[1]], model.centers[order[0]], atol=1e-4)
+    trust = [np.nan] * model.num_images
+    if is_output:
+        trust = [row.trust for row in read_rows(CameraRow, 3, source / "cameras.csv") if row.placed]
+    expected = trust_colors(np.array(trust))
+    np.testing.assert_array_equal(colors[: 5 * model.num_images : 5, :3], expected)
+
+
+def test_a_bare_graph_has_no_mesh(tmp_path):
+    run("place", BUNDLED / "graph40.txt", tmp_path / "out", "--no-report", "-q", code=0)
+    assert "its report.html has the scene" in run_refused("convert", tmp_path / "out", tmp_path / "scene.glb")

@@ -13,7 +13,7 @@ import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database import DatabaseMatches, open_database
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.own_tracks import TrackMatches
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.scene import matches as scene_matches
 from sfm_shapefit.scene.matches import PLENTY, KeypointMatches, Matches, Reading
 from sfm_shapefit.synthetic import SceneOptions, make_scene

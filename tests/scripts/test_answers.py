@@ -7,55 +7,163 @@ import pytest
 
 from benchmarks import answers
 from benchmarks.answer_cases import all_cases
+from benchmarks.answer_spellings import Spelling, read_help
 from tests.scenes import ROOT
 
-CASE = "solve/graph40/no-refine"
+CASE = "place/graph40/unrefined"
 
 
 def changed(recorded, path, value):
     """Return a copy of a recording with one entry of the case's answer replaced."""
     found = copy.deepcopy(recorded)
     *parents, last = path
-    place = found["answers"][CASE]
+    place = found[CASE]
     for key in parents:
         place = place[key]
     place[last] = value
     return found
 
 
+def recorded_once(folder):
+    folders = answers._folders(folder)
+    chosen = answers.choose(folders, only=CASE, quick=True)
+    return {name: one for found in answers.record(ROOT, folders, chosen) for name, one in found.items()}
+
+
 @pytest.mark.slow
 def test_equal_code_gives_equal_answers_and_what_differs_is_reported(tmp_path):
-    first, second = (answers.record(ROOT, tmp_path, only=CASE, quick=True) for _ in range(2))
-    assert list(first["answers"]) == [CASE]
-    assert first["answers"][CASE]["exit"] == 0
-    answers._write(tmp_path / "a.json.gz", first)
-    assert answers._read(tmp_path / "a.json.gz") == first
-    text, is_equal = answers.compare_recordings(first, second)
-    assert is_equal
-    assert "worst of positions: 0.0e+00" in text
-    assert "1 of 1 cases equal" in text
+    first, second = recorded_once(tmp_path), recorded_once(tmp_path)
+    assert list(first) == [CASE]
+    assert first[CASE]["exit"] == 0
+    assert 50.0 < first[CASE]["memory_mb"] < 1000.0
+    assert 0.1 < first[CASE]["cpu_s"] < 100.0
+    for exact in (False, True):
+        text, is_equal = answers.compare_recordings(first, second, exact=exact)
+        assert is_equal
+        assert "worst of positions: 0.0e+00" in text
+        assert "1 of 1 cases equal" in text
 
-    x = first["answers"][CASE]["tables"]["cameras.csv"]["x"][4]
+    def compared(path, value, **how):
+        return answers.compare_recordings(first, changed(first, path, value), **how)
+
+    x = float(first[CASE]["tables"]["cameras.csv"]["x"][4])
     place = ("tables", "cameras.csv", "x", 4)
-    text, is_equal = answers.compare_recordings(first, changed(first, place, repr(float(x) + 1e-6)))
+    text, is_equal = compared(place, repr(x + 1e-3))
     assert not is_equal
     assert "tables cameras.csv positions 4 " in text
     assert "0 of 1 cases equal" in text
-    assert answers.compare_recordings(first, changed(first, place, repr(math.nextafter(float(x), 9))))[1]
+    assert compared(place, repr(math.nextafter(x, 9)))[1]
+    assert not compared(place, repr(math.nextafter(x, 9)), exact=True)[1]
 
-    verdicts = ("tables", "pairs.csv", "verdict", 0)
-    assert "-> 'doubtful'" in answers.compare_recordings(first, changed(first, verdicts, "doubtful"))[0]
-    assert "exit 0 -> 3" in answers.compare_recordings(first, changed(first, ("exit",), 3))[0]
-    reworded = changed(first, ("json", "locate.json", "inputs", "directions"), "the directions are given")
-    text, is_equal = answers.compare_recordings(first, reworded)
+    gap = ("json", "locate.json", "solve", "objective")
+    objective = first[CASE]["json"]["locate.json"]["solve"]["objective"]
+    assert compared(gap, objective * (1.0 + 1e-6))[1]
+    assert not compared(gap, objective * (1.0 + 1e-4))[1]
+    assert not compared(gap, math.nextafter(objective, 9), exact=True)[1]
+
+    assert "-> 'doubtful'" in compared(("tables", "pairs.csv", "verdict", 0), "doubtful")[0]
+    assert "exit 0 -> 3" in compared(("exit",), 3)[0]
+    grade = ("json", "locate.json", "verdict", "grade")
+    assert "-> 'do not use'" in compared(grade, "do not use")[0]
+    assert not compared(grade, "do not use")[1]
+    assert compared(("json", "locate.json", "options"), {})[1]
+    text, is_equal = compared(("json", "locate.json", "inputs", "directions"), "the directions are given")
     assert is_equal
-    assert "words (1):" in text
+    assert "words (1), which do not count:" in text
 
 
-def test_names_of_cases_are_unique_and_missing_sets_are_skipped(tmp_path, capsys):
-    cases = all_cases(answers._folders(tmp_path))
-    names = [c.name for case in cases for c in (case, *case.followers)]
+def recording(**changes):
+    """Return a recording of one case that answers nothing."""
+    parts = {part: {} for part in ("models", "tables", "json", "texts", "pages", "digests")}
+    used = {"memory_mb": 200.0, "cpu_s": 2.0}
+    return {
+        CASE: {"exit": 0, "verdict": "good", "said": "", "printed": "", "files": [], **parts, **used}
+        | changes
+    }
+
+
+def test_a_peak_that_grows_is_told_and_counts_where_memory_is_asked_for():
+    for peak, is_told in ((204.9, False), (206.0, True), (190.0, True)):
+        text, is_equal = answers.compare_recordings(recording(), recording(memory_mb=peak), memory=True)
+        assert ("peak 200 ->" in text) is is_told
+        assert is_equal is (peak != 206.0)
+        assert answers.compare_recordings(recording(), recording(memory_mb=peak))[1]
+    assert "CPU time: median ratio 1.500" in answers.compare_recordings(recording(), recording(cpu_s=3.0))[0]
+
+
+def test_bytes_of_models_count_only_to_the_bit_and_cases_without_an_answer_are_told():
+    other = recording(digests={"images.bin": "0"})
+    assert answers.compare_recordings(recording(), other)[1]
+    assert not answers.compare_recordings(recording(), other, exact=True)[1]
+    assert not answers.compare_recordings(recording(), recording(verdict="look"))[1]
+    for unanswered in (recording(exit="timeout"), {CASE: {"skipped": "no words"}}):
+        text, is_equal = answers.compare_recordings(recording(), unanswered)
+        assert not is_equal
+        assert f"skipped or without an answer in time, not compared: 1 cases, ['{CASE}']" in text
+
+
+def test_an_interrupted_recording_is_read_and_continued(tmp_path):
+    path, one = tmp_path / "a.json.gz", recording()
+    answers.write(path, {"first": one[CASE]})
+    whole = path.read_bytes()
+    answers.write(path, one, mode="at")
+    assert answers.read(path) == {"first": one[CASE], **one}
+    path.write_bytes(path.read_bytes()[:-20])
+    assert answers.read(path) == {"first": one[CASE]}
+    assert path.read_bytes().startswith(whole)
+    folders = answers._folders(tmp_path)
+    assert [case.name for case in answers.choose(folders, only=CASE)] == [CASE]
+    assert answers.choose(folders, only=CASE, done=[CASE]) == []
+
+
+HELPS = {
+    "locate": """
+  --rotations <auto|held|free>  What turns; see --no-refine.
+  --adjust <none|seed|full>
+                                What is adjusted.
+  --config FILE                 Options.
+  -q, --quiet                   Nothing.
+""",
+    "check": "  --report FILE  The page.\n  --threads / --no-threads  Threads.\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("line", "spelled", "keys"),
+    [
+        ("locate A B -q --quiet", "locate A B -q --quiet", {}),
+        ("locate A B --bundle-adjust", "locate A B --adjust full", {}),
+        ("locate A B --rotations measured", "locate A B --rotations held", {}),
+        ("locate A B --rotations free", "locate A B --rotations free", {}),
+        ("locate A B --rotation-sigma-deg 0.5", "locate A B --rotations 0.5", {}),
+        ("locate A B --refine-with-priors", "locate A B", {}),
+        ("locate A B --no-refine --tol 1e-5", "locate A B", {"refine": "false", "tol": "1e-5"}),
+        ("report A --write-to B", "check A --report B", {}),
+        ("check A --tol 1", None, {}),
+        ("view A", None, {}),
+    ],
+)
+def test_a_command_line_is_spelled_as_the_checkout_knows_it(line, spelled, keys):
+    spelling = Spelling(lambda words: HELPS.get(words[0], "") if words[1] == "--help" else "")
+    expected = None if spelled is None else (spelled.split(), keys)
+    assert spelling.spell(line.split()) == expected
+
+
+def test_flags_and_choices_are_read_from_the_lines_that_define_them():
+    found = read_help(HELPS["locate"])
+    assert found.flags == {"--rotations", "--adjust", "--config", "--quiet"}
+    assert found.choices == {
+        "--rotations": frozenset({"auto", "held", "free"}),
+        "--adjust": frozenset({"none", "seed", "full"}),
+    }
+
+
+def test_names_of_cases_are_unique_and_missing_sets_are_skipped(tmp_path):
+    folders = answers._folders(tmp_path)
+    names = [c.name for case in all_cases(folders) for c in (case, *case.followers)]
     assert len(set(names)) == len(names)
+    chosen = answers.choose(folders, only="locate/castle-P30/default")
+    found = answers.record(tmp_path, folders, chosen)
+    assert next(found)["locate/castle-P30/default"] == {"skipped": "castle-P30 is not at hand"}
     with pytest.raises(SystemExit, match="has no package sfm_shapefit"):
-        answers.record(tmp_path, tmp_path, only="locate/castle-P30/default")
-    assert "castle-P30 is not at hand" in capsys.readouterr().err
+        next(found)

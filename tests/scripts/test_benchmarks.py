@@ -8,17 +8,18 @@ import pytest
 
 import benchmark
 import sfm_shapefit
-from benchmarks import INDEX, endtoend
-from harness import driver
+from benchmarks import INDEX
+from harness import driver, process
 from harness.driver import RESULTS
-from peers import on_graphs, on_scenes
+from paper import peers_on_graphs as on_graphs
+from paper import peers_on_scenes as on_scenes
 from tests.program import run
 from tests.scenes import RING, ROOT, fingerprint
 
 SCRIPTS = ROOT / "scripts"
-PARTS = {"answer_cases", "answer_differences", "answer_inputs"}
+PARTS = {"answer_cases", "answer_differences", "answer_inputs", "answer_spellings"}
 """Modules that belong to another one."""
-SECTIONS = sorted(set(INDEX) - {"answers", "reliability"})
+SECTIONS = sorted(set(INDEX) - {"answers"})
 
 
 def test_the_index_names_every_module_and_every_section_the_command_that_writes_it():
@@ -68,9 +69,9 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
 
 
 def test_a_command_of_a_benchmark_is_run_and_one_that_fails_says_why():
-    assert endtoend.run_command("--version") == f"sfm-shapefit {sfm_shapefit.__version__}\n"
+    assert process.run_command("--version") == f"sfm-shapefit {sfm_shapefit.__version__}\n"
     with pytest.raises(RuntimeError, match=r"inspect ended with code 3: .*nowhere"):
-        endtoend.run_command("inspect", "nowhere")
+        process.run_command("inspect", "nowhere")
 
 
 def test_missing_data_is_a_sentence_per_case_and_no_failure(tmp_path, capsys):

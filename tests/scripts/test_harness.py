@@ -13,7 +13,7 @@ import pytest
 from harness import driver, process, record
 from harness.driver import Benchmark, Kept
 from harness.graphs import relative_error
-from harness.metrics import Check, Quantity, number, ratio, times, verdict
+from harness.record import Check, Row, at_least, at_most, exponent, number, ratio, text_of, times, verdict
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_a_limit_is_met_by_the_unrounded_finite_value_only(value, better, met):
     assert Check(name="median", value=value, limit=0.025, better=better).met is met
 
 
-def test_a_verdict_names_every_limit_that_is_missed_and_no_other_and_a_check_needs_a_direction():
+def test_a_verdict_names_every_limit_that_is_missed_and_no_other():
     checks = [
         Check(name="median", value=0.03, limit=0.025),
         Check(name="mean", value=0.02, limit=0.026),
@@ -41,9 +41,13 @@ def test_a_verdict_names_every_limit_that_is_missed_and_no_other_and_a_check_nee
     ]
     assert verdict(checks) == "**missed**: median 0.0300 > 0.0250, max - > 1.00"
     assert verdict(checks[1:2]) == "met"
-    assert verdict([]) == "no target"
-    with pytest.raises(ValueError, match="pairs needs a direction"):
-        Check(name="pairs", value=1.0, limit=2.0, better="neither")
+    assert verdict([]) == "-"
+    assert Check("median", 1.0, 2.0).goal == "median up to 2.00"
+
+
+def test_limits_that_are_none_are_no_limits():
+    assert [check.name for check in at_most(CPU_s=(1.0, 2.0), MB=(1.0, None))] == ["CPU s"]
+    assert at_least(placed=(9, 11)) == [Check("placed", 9, 11, "higher")]
 
 
 @pytest.mark.parametrize("bad", [(1.0, 0.0), (1.0, -2.0), (math.nan, 1.0), (1.0, math.nan), (math.inf, 1.0)])
@@ -58,11 +62,22 @@ def test_numbers_have_three_significant_digits():
     values = (0.0, 0.00226, 0.03, 7.28, 447.2, 12345.6, 3e-11, 2e7, -0.5, math.inf)
     expected = "0 0.00226 0.0300 7.28 447 12346 3.0e-11 2.0e+07 -0.500 -"
     assert " ".join(map(number, values)) == expected
+    assert [text_of(one) for one in (None, "a", True, 3, 0.5, [0.5, 2])] == [
+        *"-a",
+        "yes",
+        "3",
+        "0.500",
+        "0.500 / 2",
+    ]
+    sizes = [1e3, 1e4, 1e5]
+    assert exponent(sizes, [2e-4 * n**1.3 for n in sizes]) == pytest.approx(1.3)
+    assert math.isnan(exponent([1e3], [1.0]))
+    assert math.isnan(exponent([1e3, 1e4], [1.0, math.nan]))
 
 
 def test_a_table_has_a_line_per_row_and_the_processor_is_named_by_its_model(tmp_path):
     assert record.table(["a", "b"], [["1", "2|3"]]) == "| a | b |\n| --- | --- |\n| 1 | 2/3 |\n"
-    with pytest.raises(ValueError, match="row '1' has 1 cells, the header has 2"):
+    with pytest.raises(ValueError, match="another number of cells than the header: a, b"):
         record.table(["a", "b"], [["1"]])
     (tmp_path / "cpuinfo").write_text("processor : 0\nmodel name\t: Some CPU @ 2 GHz\nmodel name\t: other\n")
     assert record.cpu_model(tmp_path / "cpuinfo") == "Some CPU @ 2 GHz"
@@ -99,17 +114,20 @@ def fail():
     raise ValueError("no luck")
 
 
+def measure(value):
+    return Row({"value": float(value), "name": "n"}, at_most(value=(value, 2.0)), "Values")
+
+
 BENCHMARK = Benchmark(
     name="made",
     title="Made",
     cases=lambda args: {
-        "one": partial(float, args.repeats),
+        "one": partial(measure, args.repeats),
         "two": fail,
         "three": "it is not there",
     },
-    checks=lambda value: [Check(name="value", value=value, limit=2.0)],
-    tables=lambda measured, _args: [record.table_of(measured.values(), {"value": str})],
-    quantities=(Quantity("value", "1", "lower", 0.0, "what it is"),),
+    columns={"value": "1; what it is"},
+    notes={"Values": "Before the table."},
     packages=("numpy",),
     quick={"repeats": 2},
 )
@@ -127,9 +145,10 @@ def test_a_section_says_what_was_measured_by_which_command_and_what_was_not_and_
     text = out.read_text()
     assert text.startswith("# Made\n\n- Command: `python scripts/benchmark.py made --repeats 3`\n")
     assert "**0 of 1 limits met.**" in text
-    assert "| value |\n| --- |\n| 3.0 |" in text
+    assert "## Values\n\nBefore the table.\n\n| value | name | to reach | verdict |" in text
+    assert "| 3.00 | n | value up to 2.00 | **missed**: value 3.00 > 2.00 |" in text
     assert "Not measured: two: failed: ValueError: no luck; three: it is not there." in text
-    assert "| value | 1 | lower | 0% | what it is |" in text
+    assert "| value | 1; what it is |" in text
     assert str(tmp_path) not in text
     assert "two: failed: ValueError: no luck" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["made.md"]

@@ -10,11 +10,13 @@ import pytest
 import sfm_shapefit
 from benchmarks import solver
 from benchmarks.real import SCENES, Errors
-from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from peers import colmap, on_graphs, on_scenes
-from peers.clarabel_direct import solve_direct
-from peers.on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
-from sfm_shapefit import certify
+from harness.graphs import GraphSpec, draw, relative_error
+from paper import colmap_peer as colmap
+from paper import peers_on_graphs as on_graphs
+from paper import peers_on_scenes as on_scenes
+from paper.cone_solvers import solve_cvxpy, solve_direct
+from paper.peers_on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
+from sfm_shapefit import ViewGraph, certify
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
 
@@ -61,9 +63,9 @@ def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie(tmp_path):
 
 
 def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it():
-    graph = view_graph(draw(SMALL))
+    graph = draw(SMALL).view_graph
     ours = solver.solve_ours(graph, 1e-11)
-    by_cvxpy, _, _ = solver.solve_cvxpy(graph, 1e-10)
+    by_cvxpy, _, _ = solve_cvxpy(graph, 1e-10)
     direct, dual, _ = solve_direct(graph, 1e-10)
     # A gap of 1e-10 leaves about its square root in locations along the flattest direction.
     assert relative_error(by_cvxpy, ours.locations) < 1e-5
@@ -73,8 +75,7 @@ def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it(
 
 
 def answers(*rows):
-    found = tuple(on_graphs.Answer(name, error, seconds) for name, error, seconds in rows)
-    return on_graphs.Compared(name="geo-1000", num_edges=9, answers=found)
+    return [on_graphs.Answer(name, error, seconds) for name, error, seconds in rows]
 
 
 def test_a_peer_is_beaten_by_error_or_by_time():
@@ -103,7 +104,7 @@ def test_a_peer_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
 def test_our_contenders_place_a_bare_graph():
     for contender in on_graphs.CONTENDERS[:2]:
         problem = draw(SMALL)
-        locations, _ = contender.prepare(view_graph(problem))()
+        locations, _ = contender.prepare(problem.view_graph)()
         assert relative_error(locations, problem.locations) < 0.2  # noise 0.02, a tenth random
 
 
@@ -114,7 +115,7 @@ def test_peers_that_are_installed_point_the_right_way(package):
     problem = draw(clean)
     for contender in on_graphs.CONTENDERS:
         if contender.package == package:
-            locations, _ = contender.prepare(view_graph(problem))()
+            locations, _ = contender.prepare(problem.view_graph)()
             assert relative_error(locations, problem.locations) < 0.1  # a wrong sign gives 2
 
 
@@ -142,8 +143,8 @@ def test_ours_must_not_be_worse_than_the_best_peer_beyond_what_the_truth_can_tel
 
 def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):
     folder = real_scene("fountain-P11")
-    edges = np.array([[0, 1], [1, 2], [2, 0]])
-    directions = on_scenes.Directions(np.array([4, 2, 7]), edges, np.eye(3), np.ones(3))
+    graph = ViewGraph(3, np.array([[0, 1], [1, 2], [2, 0]]), np.eye(3))
+    directions = on_scenes.Directions(("0004.jpg", "0002.jpg", "0007.jpg"), graph)
     contender = on_graphs.Contender(
         name="fixed", prepare=lambda _: lambda: (np.arange(9.0).reshape(3, 3), "done"), package="x"
     )

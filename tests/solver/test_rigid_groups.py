@@ -10,7 +10,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status

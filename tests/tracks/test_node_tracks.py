@@ -9,10 +9,10 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.placement.place import place
+from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
 from sfm_shapefit.scene.matches import MatchBatch
-from sfm_shapefit.tracks.node_tracks import Tracks, build_tracks, covering_set, join_points
+from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 
 PIXEL = 1e-3  # rad
 NUM_POINTS = 60
@@ -42,8 +42,15 @@ def scene(cameras=6, seed=0, noise=0.0, wrong=0.0):
     return centers, points, batch
 
 
+def build_tracks(batches, **options):
+    joiner = TrackJoiner(2.0, KEYPOINTS, sum(len(batch.keypoints) for batch in batches), **options)
+    for batch in batches:
+        joiner.add(batch, estimate_directions(batch))
+    return joiner.tracks()
+
+
 def tracks_of(batch, **options):
-    return build_tracks([batch], estimate_directions(batch), 2.0, KEYPOINTS, **options)
+    return build_tracks([batch], **options)
 
 
 def reordered(batch, order):
@@ -76,7 +83,7 @@ def test_tracks_do_not_depend_on_the_order_of_pairs_or_on_batches():
     shuffled = reordered(batch, order)
     one, other = tracks_of(batch), tracks_of(shuffled)
     halves = [reordered(shuffled, half) for half in np.array_split(np.arange(len(order)), 2)]
-    split = build_tracks(halves, estimate_directions(batch), 2.0, KEYPOINTS)
+    split = build_tracks(halves)
     for again in (other, split):
         np.testing.assert_array_equal(again.offsets, one.offsets)
         np.testing.assert_array_equal(again.cameras, one.cameras)
@@ -115,9 +122,8 @@ def test_matches_that_contradict_their_direction_join_no_track():
 
 def test_two_views_and_no_matches_are_no_track():
     _, _, batch = scene(cameras=2)
-    directions = estimate_directions(batch)
-    none = build_tracks([], directions, 2.0, KEYPOINTS)
-    assert build_tracks([batch], directions, 2.0, KEYPOINTS).num_tracks == none.num_tracks == 0
+    none = build_tracks([])
+    assert tracks_of(batch).num_tracks == none.num_tracks == 0
     assert len(covering_set(none, 6)) == 0
 
 

@@ -98,7 +98,10 @@ def model_suffix(folder: Path) -> str:
     try:
         if folder.exists() and not folder.is_dir():
             refuse_database(folder)
-            raise InputError(f"{folder} is a file; give the folder that holds cameras, images and points3D")
+            raise InputError(
+                f"{folder} is a file; give the folder that holds cameras, images and points3D "
+                "(`convert` makes one of OpenSfM's reconstruction.json)"
+            )
         present = {entry.name for entry in folder.iterdir()}
     except FileNotFoundError:
         raise InputError(f"the model folder {folder} does not exist") from None

@@ -19,8 +19,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
-from sfm_shapefit.files.colmap.model import sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
+from sfm_shapefit.scene.images import Images
 
 _CAMERA = 0
 _POSE_BYTES = 7 * 8
@@ -57,13 +57,16 @@ class DatabaseRigs:
             copy.add_sensor(sensor, pose)
         return copy
 
-    def with_sensors_of(self, model: pycolmap.Reconstruction) -> "DatabaseRigs":
-        """Return the same with the poses that sensors have in a model, where it has them."""
-        poses = sensors_of(model)
+    def with_sensors_of(self, images: Images) -> "DatabaseRigs":
+        """Return the same with the poses that the sensors of images have, all others as they are."""
+        own, row_of = images.sensors, {lens.id: k for k, lens in enumerate(images.lenses)}
         rigs = {rig_id: self.renumbered(rig_id, rig_id) for rig_id in self.rigs}
         for rig in rigs.values():
             for sensor in rig.non_ref_sensors:
-                rig.set_sensor_from_rig(sensor, poses.get(sensor.id, rig.sensor_from_rig(sensor)))
+                if sensor.id in row_of:
+                    k = row_of[sensor.id]
+                    turn = pycolmap.Rotation3d(own.rotations[k])
+                    rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(turn, own.translations[k]))
         return replace(self, rigs=rigs)
 
     def sensor_from_rig(self, image: pycolmap.Image) -> pycolmap.Rigid3d:

@@ -24,7 +24,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.lenses import is_adjusted, lens_of
+from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -109,7 +109,7 @@ def doubt_lenses(
     return {
         camera_id: LensDoubt(lens_of(cameras[camera_id]), _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
         for camera_id, origin in sorted(origins.items())
-        if is_adjusted(cameras[camera_id])
+        if lens_of(cameras[camera_id]).is_adjustable
     }
 
 

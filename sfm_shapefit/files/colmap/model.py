@@ -24,10 +24,11 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
-from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera, reconstruction_of
+from sfm_shapefit.files.colmap.images import images_of, put_images
+from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.files.models import is_model_file, read_model_file
 from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.posed_model import PosedModelFile
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -54,6 +55,8 @@ class PosedModel:
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
+    images: Images
+    """The same n images as arrays, in the same order."""
     image_ids: IntArray
     """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
@@ -142,6 +145,7 @@ def from_posed_cameras(scene: PosedModelFile) -> PosedModel:
         reconstruction.add_image_with_trivial_frame(image)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_of(reconstruction),
         image_ids=image_ids,
         names=scene.names,
         rotations=scene.rotations,
@@ -157,8 +161,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified; or a model file of Bundler,
-            openMVG or OpenSfM.
+            3.12 on, rigs and frames; or a reconstruction, which is not modified.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
@@ -168,8 +171,6 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     is_checked = False
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
-    elif is_model_file(source):
-        label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
     else:
         label, reconstruction = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"
@@ -181,30 +182,16 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
-    """Return the model with the frames' rotations, the rigs and the intrinsics of another; no input changes.
+def turned_model(model: PosedModel, turned: Images) -> PosedModel:
+    """Return the model with the frames' rotations, the sensors and the lenses of images; no input changes.
 
     Args:
         model: the posed images.
-        turned: with the cameras and some of the frames of it. Frames turn about their own centers; where a
-            rotation is the same, the pose keeps its bits.
+        turned: some of them. Frames turn about their own centers; what is the same keeps its bits.
     """
-    copy = pycolmap.Reconstruction(model.reconstruction)
-    for camera_id, camera in turned.cameras.items():
-        if camera.params.tolist() != copy.camera(camera_id).params.tolist():
-            copy.camera(camera_id).params = camera.params
-    for rig_id, rig in turned.rigs.items():
-        for sensor, sensor_from_rig in rig.non_ref_sensors.items():
-            copy.rig(rig_id).set_sensor_from_rig(sensor, sensor_from_rig)
-    for frame_id in sorted(turned.reg_frame_ids()):
-        frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
-        pose = frame.rig_from_world
-        assert pose is not None  # posed frames of one model are posed in the other
-        assert other is not None
-        rotation = other.rotation
-        if (rotation.quat != pose.rotation.quat).any():
-            center = -(pose.rotation.matrix().T @ pose.translation)
-            frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    own, copy = model.images.frames, pycolmap.Reconstruction(model.reconstruction)
+    rows = np.searchsorted(own.ids, turned.frames.ids)
+    put_images(copy, turned.posed(turned.frames.rotations, own.centers[rows]))
     return read_model(copy)
 
 
@@ -299,8 +286,10 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
+    images_as_arrays = images_of(reconstruction)
     return PosedModel(
         reconstruction=reconstruction,
+        images=images_as_arrays.part(np.flatnonzero(np.isin(images_as_arrays.ids, image_ids))),
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
         names=names,
         rotations=frozen(rotations),

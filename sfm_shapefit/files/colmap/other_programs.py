@@ -1,4 +1,4 @@
-"""Models of other programs as reconstructions, and reconstructions as plain scenes and relative poses."""
+"""Models of OpenSfM as reconstructions, and reconstructions as plain scenes and relative poses."""
 
 from pathlib import Path
 

@@ -1,112 +1,115 @@
-"""Matches by a model's own 3D points: images that see the same one have a match there.
+"""The points of a model's own tracks, each triangulated afresh at other poses by pycolmap.
 
-The keypoints of a match are `points2D` of its images. An image that observes the same point with several
-keypoints gives no match for that point: it is unknown which one is right.
+LO-RANSAC over the observations of each track, which keeps its point's id and color. No sample is random: the
+same input gives the same bits. Tracks know nothing of one another, so an executor's workers may share them,
+with the same bits again.
 """
 
+import math
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
 import numpy as np
+import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
-from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel, observed_points, points2d_xy
-from sfm_shapefit.scene.matches import (
-    PLENTY,
-    KeypointNumbers,
-    Matches,
-    PairNames,
-    Reading,
-    Seeing,
-    View,
-    batch_ranges,
-)
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.executors import Advance, answers
+from sfm_shapefit.files.colmap.filter import PointRules
+from sfm_shapefit.files.colmap.model import points2d_xy
+from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.points import Points
+
+# Of another model, so many tracks are about half a second of work.
+_TRACKS_A_TASK = 1000
+# It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
+_RANDOM_SEED = 0
 
 
-class TrackMatches(Matches):
-    """The matches between the posed images of a model by its own points."""
+def triangulate_own_tracks(
+    placed: pycolmap.Reconstruction,
+    images: Images,
+    source: pycolmap.Reconstruction,
+    rules: PointRules,
+    advance: Advance,
+    executor: Executor | None = None,
+) -> Points:
+    """Return the points of another model, each triangulated from its own track.
 
-    file = None
-    """There is no database."""
+    Args:
+        placed: the model with the poses, and with the points2D of `source`.
+        images: those of it that have a pose.
+        source: the model whose tracks serve; points keep its ids.
+        rules: what points must satisfy.
+        advance: called with the tracks that are done and their number.
+        executor: shares out the tracks among its workers, with the same answer to the bit.
 
-    def __init__(self, model: PosedModel) -> None:
-        """Collect what the images observe, and count the matches of each pair."""
-        super().__init__()
-        self.names = model.names
-        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
-        self._images = dict(zip(model.names, images, strict=True))
-        self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
-        self.total_keypoints = int(self.num_keypoints.sum())
-        seen = [observed_points(image) for image in images]
-        self._matched = {name: keypoints for name, (keypoints, _) in zip(self.names, seen, strict=True)}
-        points = np.concatenate([ids for _, ids in seen])
-        image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
-        order = np.argsort(points, kind="stable")
-        points, image_of = points[order], image_of[order]
-        again = (points[1:] == points[:-1]) & (image_of[1:] == image_of[:-1])
-        once = np.ones(len(points), dtype=np.bool_)
-        once[1:] &= ~again
-        once[:-1] &= ~again
-        # Unambiguous observations by point, then by image: whose, by what, and how many of the point follow.
-        self._image_of = image_of[once]
-        self._keypoints = np.concatenate([keypoints for keypoints, _ in seen])[order[once]].astype(np.uint32)
-        _, sizes = np.unique(points[once], return_counts=True)
-        self._following = np.repeat(np.cumsum(sizes), sizes) - np.arange(len(self._image_of)) - 1
-        self._by_image = np.argsort(self._image_of, kind="stable")
-        self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(images))))
-        self.pairs, self.num_matches = self._count()
+    Raises:
+        ValueError: if the points2D are others.
+        WorkerError: if a worker died and the executor does not replace it.
+    """
+    own = [placed.image(i) for i in images.ids.tolist()]
+    for image in own:
+        if image.num_points2D() != source.image(image.image_id).num_points2D():
+            raise ValueError(
+                f"image {image.image_id} has other points2D than the model whose tracks are used"
+            )
+    seen = points_of(source, images)
+    pixels = np.empty((len(seen.images), 2))
+    for k, image in enumerate(own):
+        rows = np.flatnonzero(seen.images == k)
+        pixels[rows] = points2d_xy(image)[seen.keypoints[rows]]
+    chosen = np.flatnonzero(seen.lengths() >= rules.min_length)
+    slices = [slice(*seen.offsets[[k, k + 1]].tolist()) for k in chosen.tolist()]
+    poses, cameras = [image.cam_from_world() for image in own], [placed.camera(i.camera_id) for i in own]
+    tasks = (
+        TrackTask(
+            poses=poses,
+            cameras=cameras,
+            tracks=[(seen.images[track], pixels[track]) for track in part],
+            rules=rules,
+        )
+        for part in (slices[k : k + _TRACKS_A_TASK] for k in range(0, len(slices), _TRACKS_A_TASK))
+    )
+    xyz, point_of, done = np.full((seen.num_points, 3), np.nan), np.full(len(pixels), -1), 0
+    for _, found in answers(executor, triangulate_task, tasks):
+        for k, answer in zip(chosen[done : done + len(found)].tolist(), found, strict=True):
+            if answer is not None:
+                xyz[k], inliers = answer
+                point_of[seen.offsets[k] : seen.offsets[k + 1]][inliers] = k
+        done += len(found)
+        advance(done, len(slices))
+    kept, rows = np.flatnonzero(np.isfinite(xyz[:, 0])), np.flatnonzero(point_of >= 0)
+    return Points(
+        xyz=xyz[kept],
+        offsets=np.append(0, np.cumsum(np.bincount(point_of[rows], minlength=len(xyz))[kept])),
+        images=seen.images[rows],
+        keypoints=seen.keypoints[rows],
+        ids=seen.ids[kept],
+    )
 
-    def at(
-        self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
-    ) -> View[Seeing]:
-        """Return the matches as other images see them; none is kept, for they are made anew in no time."""
-        return super().at(images, left_out, reading._replace(keeps=False))
 
-    def keypoints(self, name: str) -> FloatArray:
-        """Return the pixels (k, 2) of the points of an image."""
-        xy = points2d_xy(self._images[name])
-        if not np.isfinite(xy).all():
-            raise InputError(f"image {name} has a point whose coordinates are not finite")
-        return xy
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackTask:
+    """Some tracks, and all that is needed to triangulate them elsewhere."""
 
-    def matched(self, name: str) -> FloatArray:
-        """Return the pixels (m, 2) of those points of an image that observe a 3D point."""
-        return self.keypoints(name)[self._matched[name]]
+    poses: list[pycolmap.Rigid3d]
+    cameras: list[pycolmap.Camera]
+    tracks: list[tuple[IntArray, FloatArray]]
+    """Images (k,), as positions in the two lists, and pixels (k, 2) of each."""
+    rules: PointRules
 
-    def places(self, name: str, keypoints: KeypointNumbers) -> IntArray:
-        """Return the places (k,) of some of these points (k,) among them."""
-        return np.searchsorted(self._matched[name], keypoints)
 
-    def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:  # noqa: ARG002
-        """Return the matches of pairs; they are made anew each time."""
-        left, right = self._pair_up(np.unique(self.pairs[pairs, 0]))
-        wanted = self._codes(*self.pairs[pairs].T)
-        codes = self._codes(self._image_of[left], self._image_of[right])
-        row = np.minimum(np.searchsorted(wanted, codes), len(wanted) - 1)
-        kept = wanted[row] == codes
-        left, right, row = left[kept], right[kept], row[kept]
-        order = np.lexsort((self._keypoints[left], row))
-        matches = np.stack([self._keypoints[left], self._keypoints[right]], axis=1)[order]
-        return np.bincount(row, minlength=len(pairs)), matches
-
-    def _count(self) -> tuple[IntArray, IntArray]:
-        """Return all pairs of images, and how many matches each has."""
-        sizes = np.bincount(self._image_of, self._following, len(self.names)).astype(np.int64)
-        codes, counts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-        for first, last in batch_ranges(sizes, PLENTY.batch):
-            left, right = self._pair_up(np.arange(first, last))
-            of_pair = self._codes(self._image_of[left], self._image_of[right])
-            for found, parts in zip(np.unique(of_pair, return_counts=True), (codes, counts), strict=True):
-                parts.append(found)
-        pairs = np.stack(np.divmod(np.concatenate(codes), len(self.names)), axis=1)
-        return pairs, np.concatenate(counts)
-
-    def _codes(self, i: IntArray, j: IntArray) -> IntArray:
-        """Return numbers that ascend as pairs do."""
-        return i * len(self.names) + j
-
-    def _pair_up(self, images: IntArray) -> tuple[IntArray, IntArray]:
-        """Return the observations of the images, and with each in turn those of its point that follow."""
-        bounds = zip(self._starts[images].tolist(), self._starts[images + 1].tolist(), strict=True)
-        own = np.concatenate([self._by_image[:0], *(self._by_image[a:b] for a, b in bounds)])
-        follows = self._following[own]
-        left = np.repeat(own, follows)
-        return left, left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)
+def triangulate_task(task: TrackTask) -> list[tuple[FloatArray, BoolArray] | None]:
+    """Return position (3,) and inliers (k,) of each track, None where it has no point; for a worker."""
+    settings = pycolmap.EstimateTriangulationOptions()
+    settings.min_tri_angle = math.radians(task.rules.min_angle_deg)
+    settings.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    settings.ransac.max_error = task.rules.max_error_px
+    settings.ransac.random_seed = _RANDOM_SEED
+    found = []
+    for images, xy in task.tracks:
+        poses, cameras = ([every[i] for i in images.tolist()] for every in (task.poses, task.cameras))
+        answer = pycolmap.estimate_triangulation(xy, poses, cameras, settings)
+        found.append(None if answer is None else (answer["xyz"], answer["inliers"]))
+    return found

@@ -1,17 +1,15 @@
 """Where pycolmap's own messages go: nowhere, unless the caller wants to hear them.
 
-pycolmap logs through glog, resets its level in every bundle adjustment, and links Ceres and CHOLMOD, which
-have no level at all. So three things are silenced, each only as long as a call that needs it:
+pycolmap logs through glog, resets its level in some calls, and links Ceres and CHOLMOD, which have no level
+at all. So two things are silenced, each only as long as a call that needs it:
 
-    quiet_log       glog's level                     calls that read
-    quiet_stderr    file descriptor 2                bundle adjustment, estimation
-    quiet_output    file descriptors 1 and 2         rotation averaging: CHOLMOD writes to stdout
+    quiet_log       glog's level             calls that read
+    quiet_stderr    file descriptor 2        view graph calibration
 
 The one switch for all is `hear_pycolmap`; it holds for the code that runs inside it, and not for other
 threads. Errors arrive as exceptions either way.
 """
 
-import ctypes
 import os
 import sys
 from collections.abc import Iterator
@@ -37,11 +35,6 @@ def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
         yield
     finally:
         _heard.reset(token)
-
-
-def is_heard() -> bool:
-    """Return whether pycolmap's messages are let through."""
-    return _heard.get()
 
 
 @contextmanager
@@ -76,24 +69,6 @@ def quiet_stderr() -> Iterator[None]:
         finally:
             if sys.stderr is not None:
                 sys.stderr.flush()
-
-
-@contextmanager
-def quiet_output() -> Iterator[None]:
-    """Send file descriptors 1 and 2 to nowhere; the C library's buffer of stdout is emptied around it."""
-    flush = getattr(ctypes.CDLL(None), "fflush", None) if os.name == "posix" else None
-    with quiet_stderr():
-        if flush is None or _heard.get():
-            yield
-            return
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        flush(None)
-        with _to_nowhere(1):
-            try:
-                yield
-            finally:
-                flush(None)
 
 
 @contextmanager

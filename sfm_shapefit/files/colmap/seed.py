@@ -1,78 +1,44 @@
-"""A seeded model: the input's rotations and intrinsics, our camera centers, and no 3D points yet.
+"""A seeded model: the input's rotations and intrinsics, our camera centers, and no 3D points yet."""
 
-COLMAP keeps poses in frames, x_rig = R x_world + t with t = -R C. Moving a frame replaces t and hands on
-the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in
-their rigs are not touched: all images of a frame move with it.
-"""
-
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.check import check_model_files
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel
-
-Keypoints = Callable[[int], FloatArray | None]
-"""Returns the pixels (k, 2) of the keypoints of an image, by its index into `PosedModel.image_ids`."""
+from sfm_shapefit.files.colmap.points import Keypoints
+from sfm_shapefit.scene.images import Images
 
 
 def build_seed(
-    model: PosedModel,
-    placed: BoolArray,
-    centers: FloatArray,
-    keypoints: Keypoints | None = None,
-    fixed: BoolArray | None = None,
+    model: PosedModel, images: Images, keypoints: Keypoints | None = None
 ) -> pycolmap.Reconstruction:
-    """Return a new reconstruction with the cameras at `centers`; the input is not touched.
+    """Return a new reconstruction with images where they are placed; the input is not touched.
 
-    Cameras, rigs, frames and images keep their ids and names, rotations and intrinsics their bits.
+    Cameras, rigs, frames and images keep their ids and names, rotations and intrinsics their bits. Images
+    whose frame is not placed, and images that had no pose, are unregistered.
 
     Args:
         model: the input.
-        placed: (n,) which images have a center; the others, and images that had no pose, are unregistered
-            unless another image of their frame is placed.
-        centers: (n, 3) camera centers in world axes; rows of images that are not placed are ignored.
+        images: those of the model where they are placed; frames that are not are NaN.
         keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
             it has none (None, or no rows), and all images if None, keep those of the model.
-        fixed: (n,) images whose frame keeps its pose to the last bit; none if None.
-
-    Raises:
-        ValueError: if the shapes do not fit the model, or the center of a placed image is not finite.
     """
-    n = model.num_images
-    if placed.shape != (n,) or centers.shape != (n, 3):
-        raise ValueError(f"expected placed ({n},) and centers ({n}, 3), got {placed.shape}, {centers.shape}")
-    if not np.isfinite(centers[placed]).all():
-        worst = int(np.flatnonzero(placed & ~np.isfinite(centers).all(axis=1))[0])
-        raise ValueError(f"the center of image {model.names[worst]} is not finite")
-
     seed = copy_without_points(model.reconstruction)
-    still = np.zeros(n, dtype=np.bool_) if fixed is None else fixed
-    settled = set(model.frame_ids[still].tolist())
-    for index, image_id in enumerate(model.image_ids.tolist()):
-        image = seed.image(image_id)
-        if placed[index] and image.frame_id not in settled:
-            frame = seed.frame(image.frame_id)
-            old = frame.rig_from_world
-            assert old is not None  # a posed image's frame has a pose
-            rotation = old.rotation
-            is_reference = not model.frame_offsets[index].any() and image.is_ref_in_frame()
-            turn = model.rotations[index] if is_reference else rotation.matrix()
-            translation = -(turn @ (centers[index] - model.frame_offsets[index]))
-            frame.rig_from_world = pycolmap.Rigid3d(rotation, translation)
-            settled.add(image.frame_id)
-        xy = None if keypoints is None else keypoints(index)
+    put_images(seed, images)
+    if keypoints is None:
+        return seed
+    for index, image_id in enumerate(images.ids.tolist()):
+        xy, image = keypoints(index), seed.image(image_id)
         if xy is not None and len(xy):
             image.points2D.clear()  # the setter insists on it
             image.points2D = pycolmap.Image(keypoints=np.ascontiguousarray(xy, dtype=np.float64)).points2D
-    registered = set(model.frame_ids[placed | still].tolist())
-    for frame_id in sorted(set(seed.reg_frame_ids()) - registered):
-        seed.deregister_frame(frame_id)
     return seed
 
 

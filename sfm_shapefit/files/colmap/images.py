@@ -1,0 +1,113 @@
+"""The door between reconstructions and `Images`: read once, and written so that only what changed does.
+
+A reconstruction knows more than arrays hold: quaternions, sensors that are no cameras, points2D, colors. So
+images are not written into a new one but into what they were read from, and what is the same by value there
+keeps its bits.
+"""
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.files.colmap.lenses import lens_of
+from sfm_shapefit.scene.images import Frames, Images, Sensors
+
+
+def images_of(reconstruction: pycolmap.Reconstruction) -> Images:
+    """Return all images of a reconstruction, in the order of their names, those of one name by their ids."""
+    images = sorted(reconstruction.images.values(), key=lambda image: (image.name, image.image_id))
+    frame_ids, frame_of = np.unique([image.frame_id for image in images], return_inverse=True)
+    camera_ids, camera_of = np.unique([image.camera_id for image in images], return_inverse=True)
+    rotations, centers = _poses(reconstruction, frame_ids.tolist())
+    return Images(
+        names=tuple(image.name for image in images),
+        ids=np.array([image.image_id for image in images], dtype=np.int64),
+        frame_of=frame_of.ravel(),
+        lens_of=camera_of.ravel(),
+        frames=Frames(ids=frame_ids, rotations=rotations, centers=centers),
+        lenses=tuple(lens_of(reconstruction.camera(i)) for i in camera_ids.tolist()),
+        sensors=_sensors(reconstruction, camera_ids.tolist()),
+    )
+
+
+def put_images(reconstruction: pycolmap.Reconstruction, images: Images) -> None:
+    """Let frames, sensors and lenses of our own `reconstruction` be as in `images`; points stay.
+
+    Args:
+        reconstruction: changed in place; what has the same value there to the last bit keeps its bits.
+        images: some or all of it. Frames without a pose are deregistered, with what they observe.
+    """
+    own, posed = images.frames.ids.tolist(), images.frames.is_posed
+    rotations, centers = _poses(reconstruction, own)
+    for k, frame_id in enumerate(own):
+        rotation, center = images.frames.rotations[k], images.frames.centers[k]
+        if not posed[k]:
+            if np.isfinite(centers[k]).all():
+                reconstruction.deregister_frame(frame_id)
+            continue
+        turns = bool((rotation != rotations[k]).any())
+        if turns or (center != centers[k]).any():
+            frame = reconstruction.frame(frame_id)
+            old = frame.rig_from_world
+            turn = pycolmap.Rotation3d(rotation) if turns or old is None else old.rotation
+            frame.rig_from_world = pycolmap.Rigid3d(turn, -(rotation @ center))
+            if old is None:
+                reconstruction.register_frame(frame_id)
+    camera_ids = [lens.id for lens in images.lenses]
+    before, after = _sensors(reconstruction, camera_ids), images.sensors
+    for k, lens in enumerate(images.lenses):
+        camera, rotation, translation = (
+            reconstruction.camera(lens.id),
+            after.rotations[k],
+            after.translations[k],
+        )
+        changes = (rotation != before.rotations[k]).any() or (translation != before.translations[k]).any()
+        if changes and np.isfinite(translation).all():
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+            _rigs_by_camera(reconstruction)[lens.id].set_sensor_from_rig(camera.sensor_id, pose)
+        if lens.parameters != tuple(camera.params.tolist()):
+            camera.params = list(lens.parameters)
+
+
+def _poses(reconstruction: pycolmap.Reconstruction, frame_ids: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (f, 3, 3) and centers (f, 3) of frames; NaN of those without a pose."""
+    rotations, translations = np.full((len(frame_ids), 3, 3), np.nan), np.full((len(frame_ids), 3), np.nan)
+    for k, frame_id in enumerate(frame_ids):
+        pose = reconstruction.frame(frame_id).rig_from_world
+        if pose is not None:
+            rotations[k], translations[k] = _matrix(pose.rotation), pose.translation
+    return rotations, -np.einsum("nba,nb->na", rotations, translations)
+
+
+def _matrix(rotation: pycolmap.Rotation3d) -> FloatArray:
+    """Return the matrix of a rotation; the quaternion of a model in text need not be of length 1."""
+    return np.asarray(pycolmap.Rotation3d(normalized(rotation.quat)).matrix())
+
+
+def _sensors(reconstruction: pycolmap.Reconstruction, camera_ids: list[int]) -> Sensors:
+    """Return where cameras are in their rigs."""
+    rigs = _rigs_by_camera(reconstruction)
+    rotations, translations = np.tile(np.eye(3), (len(camera_ids), 1, 1)), np.zeros((len(camera_ids), 3))
+    is_reference = np.zeros(len(camera_ids), dtype=np.bool_)
+    for k, camera_id in enumerate(camera_ids):
+        rig, sensor = rigs[camera_id], reconstruction.camera(camera_id).sensor_id
+        is_reference[k] = rig.is_ref_sensor(sensor)
+        if not is_reference[k]:
+            pose = rig.sensor_from_rig(sensor) if rig.has_sensor_from_rig(sensor) else None
+            rotations[k] = np.nan if pose is None else _matrix(pose.rotation)
+            translations[k] = np.nan if pose is None else pose.translation
+    rig_ids = [rigs[camera_id].rig_id for camera_id in camera_ids]
+    return Sensors(
+        rotations=rotations,
+        translations=translations,
+        rig_of=np.unique(rig_ids, return_inverse=True)[1].ravel(),
+        is_reference=is_reference,
+    )
+
+
+def _rigs_by_camera(reconstruction: pycolmap.Reconstruction) -> dict[int, pycolmap.Rig]:
+    """Return the rig of each camera by its id."""
+    kind = pycolmap.SensorType.CAMERA
+    rigs = reconstruction.rigs.values()
+    return {sensor.id: rig for rig in rigs for sensor in rig.sensor_ids() if sensor.type == kind}

@@ -1,0 +1,112 @@
+"""Matches by a model's own 3D points: images that see the same one have a match there.
+
+The keypoints of a match are `points2D` of its images. An image that observes the same point with several
+keypoints gives no match for that point: it is unknown which one is right.
+"""
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.model import PosedModel, observed_points, points2d_xy
+from sfm_shapefit.scene.matches import (
+    PLENTY,
+    KeypointNumbers,
+    Matches,
+    PairNames,
+    Reading,
+    Seeing,
+    View,
+    batch_ranges,
+)
+
+
+class TrackMatches(Matches):
+    """The matches between the posed images of a model by its own points."""
+
+    file = None
+    """There is no database."""
+
+    def __init__(self, model: PosedModel) -> None:
+        """Collect what the images observe, and count the matches of each pair."""
+        super().__init__()
+        self.names = model.names
+        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        self._images = dict(zip(model.names, images, strict=True))
+        self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
+        self.total_keypoints = int(self.num_keypoints.sum())
+        seen = [observed_points(image) for image in images]
+        self._matched = {name: keypoints for name, (keypoints, _) in zip(self.names, seen, strict=True)}
+        points = np.concatenate([ids for _, ids in seen])
+        image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
+        order = np.argsort(points, kind="stable")
+        points, image_of = points[order], image_of[order]
+        again = (points[1:] == points[:-1]) & (image_of[1:] == image_of[:-1])
+        once = np.ones(len(points), dtype=np.bool_)
+        once[1:] &= ~again
+        once[:-1] &= ~again
+        # Unambiguous observations by point, then by image: whose, by what, and how many of the point follow.
+        self._image_of = image_of[once]
+        self._keypoints = np.concatenate([keypoints for keypoints, _ in seen])[order[once]].astype(np.uint32)
+        _, sizes = np.unique(points[once], return_counts=True)
+        self._following = np.repeat(np.cumsum(sizes), sizes) - np.arange(len(self._image_of)) - 1
+        self._by_image = np.argsort(self._image_of, kind="stable")
+        self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(images))))
+        self.pairs, self.num_matches = self._count()
+
+    def at(
+        self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
+    ) -> View[Seeing]:
+        """Return the matches as other images see them; none is kept, for they are made anew in no time."""
+        return super().at(images, left_out, reading._replace(keeps=False))
+
+    def keypoints(self, name: str) -> FloatArray:
+        """Return the pixels (k, 2) of the points of an image."""
+        xy = points2d_xy(self._images[name])
+        if not np.isfinite(xy).all():
+            raise InputError(f"image {name} has a point whose coordinates are not finite")
+        return xy
+
+    def matched(self, name: str) -> FloatArray:
+        """Return the pixels (m, 2) of those points of an image that observe a 3D point."""
+        return self.keypoints(name)[self._matched[name]]
+
+    def places(self, name: str, keypoints: KeypointNumbers) -> IntArray:
+        """Return the places (k,) of some of these points (k,) among them."""
+        return np.searchsorted(self._matched[name], keypoints)
+
+    def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:  # noqa: ARG002
+        """Return the matches of pairs; they are made anew each time."""
+        left, right = self._pair_up(np.unique(self.pairs[pairs, 0]))
+        wanted = self._codes(*self.pairs[pairs].T)
+        codes = self._codes(self._image_of[left], self._image_of[right])
+        row = np.minimum(np.searchsorted(wanted, codes), len(wanted) - 1)
+        kept = wanted[row] == codes
+        left, right, row = left[kept], right[kept], row[kept]
+        order = np.lexsort((self._keypoints[left], row))
+        matches = np.stack([self._keypoints[left], self._keypoints[right]], axis=1)[order]
+        return np.bincount(row, minlength=len(pairs)), matches
+
+    def _count(self) -> tuple[IntArray, IntArray]:
+        """Return all pairs of images, and how many matches each has."""
+        sizes = np.bincount(self._image_of, self._following, len(self.names)).astype(np.int64)
+        codes, counts = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for first, last in batch_ranges(sizes, PLENTY.batch):
+            left, right = self._pair_up(np.arange(first, last))
+            of_pair = self._codes(self._image_of[left], self._image_of[right])
+            for found, parts in zip(np.unique(of_pair, return_counts=True), (codes, counts), strict=True):
+                parts.append(found)
+        pairs = np.stack(np.divmod(np.concatenate(codes), len(self.names)), axis=1)
+        return pairs, np.concatenate(counts)
+
+    def _codes(self, i: IntArray, j: IntArray) -> IntArray:
+        """Return numbers that ascend as pairs do."""
+        return i * len(self.names) + j
+
+    def _pair_up(self, images: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the observations of the images, and with each in turn those of its point that follow."""
+        bounds = zip(self._starts[images].tolist(), self._starts[images + 1].tolist(), strict=True)
+        own = np.concatenate([self._by_image[:0], *(self._by_image[a:b] for a, b in bounds)])
+        follows = self._following[own]
+        left = np.repeat(own, follows)
+        return left, left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)

@@ -1,0 +1,59 @@
+"""A placement with the evidence for it: what is judged once, when cameras stand where they are to stay."""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
+from sfm_shapefit.judgement.verdicts import Assessment, assess
+from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
+from sfm_shapefit.refinement.options import PlacementOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Judged(Placement):
+    """A placement, and the evidence for its pairs and cameras."""
+
+    assessment: Assessment
+    """Evidence for the nodes and edges of the placement, in the solver's units."""
+    second_configuration: SecondConfiguration | None
+    """Another placement that many of the rejected pairs agree on; its cameras are nodes of the graph."""
+    adjusted_covariances: FloatArray | None = None
+    """(k, 3, 3) covariances of adjusted centers, squared solver's units; NaN where unknown, None without an
+    adjustment."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, where an adjustment knows it."""
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only."""
+        directions = self.assessment.covariances[: len(self.cameras)]
+        if self.adjusted_covariances is None:
+            return directions
+        known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
+        return np.where(known, self.adjusted_covariances, directions)
+
+
+@one_blas_thread()  # as `place`: bits must depend neither on the machine nor on what runs beside
+def judge(placement: Placement, options: PlacementOptions) -> Judged:
+    """Return a placement with what its directions say of its pairs and cameras.
+
+    Raises:
+        UnsolvableError: if the factor for standard deviations would take more memory than allowed.
+    """
+    hand_back_memory()  # of the solve, before the samples are propagated
+    part, agreement = placement.measured_part(), placement.agreement
+    assessment = assess(
+        part,
+        placement.refined.locations,
+        undetermined_nodes=placement.refined.reset_nodes,
+        max_bytes=options.factor_memory_mb * 1_000_000,
+        agreement=agreement,
+    )
+    second = find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)
+    if second is not None:
+        second = replace(second, cameras=placement.nodes[second.cameras])
+    as_placed = {item.name: getattr(placement, item.name) for item in fields(Placement)}
+    return Judged(**as_placed, assessment=assessment, second_configuration=second)

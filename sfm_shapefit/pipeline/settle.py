@@ -1,0 +1,367 @@
+"""From rotations to models: what `locate` and `map` have in common, stage after stage, piece by piece.
+
+    measure   directions of all pairs, and the view graph of the usable ones
+    place     rigid pieces: the convex starts, refined; or, after a first placement, the certificate near it
+    pull      position priors that pull, whose gauge then stays
+    adjust    centers, points and doubtful rotations, by the pixels; directions are measured again there
+    judge     pairs, cameras and lenses, once
+    seed      the COLMAP model: points triangulated, cameras without support left out
+    gauge     scale, origin and axes of what is left
+
+Each rigid piece goes through all that follows `place`. A further piece has a unit of its own: nothing that is
+told of positions says how large it is, and where.
+"""
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.given_rotations import RotationWeight
+from sfm_shapefit.adjustment.run import GivenPoses
+from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.facts.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.result import Inputs, LocateResult
+from sfm_shapefit.facts.rigs import refined_rigs
+from sfm_shapefit.facts.warnings import (
+    ambiguity_warnings,
+    focal_warnings,
+    match_warnings,
+    prior_warnings,
+    quality_warnings,
+    support_warnings,
+    trust_warnings,
+)
+from sfm_shapefit.files.colmap.model import PosedModel, sensors_of
+from sfm_shapefit.files.colmap.point_colors import PointColors
+from sfm_shapefit.judgement.judged import Judged, judge
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.pipeline.adjustment import (
+    adjust_placed,
+    pull_cameras,
+    turned_deg,
+    with_uncertainty,
+)
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.control_points import bring_to_control_points
+from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
+from sfm_shapefit.pipeline.first_placement import FirstPlacement
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.gravity import turn_model_upright
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.measure import (
+    Wanted,
+    add_evidence,
+    build_graph,
+    count_work,
+    measure,
+    wants_points,
+)
+from sfm_shapefit.pipeline.memory import keep_within_memory
+from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
+from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
+from sfm_shapefit.placement.gauge import Gauge, tell_scale
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_SMALLEST_ADJUSTED = 8
+"""Cameras of a further piece that is adjusted; smaller ones are placed and seeded only, for their seconds."""
+
+
+class Told(NamedTuple):
+    """What is known of the images beside their matches and the options."""
+
+    inputs: Inputs
+    rigid: Rigid
+    rotations: RotationWeight | None
+    """How an adjustment treats the rotations; None: as the matches say."""
+    priors: PositionPriors | None = None
+    control: ControlPoints | None = None
+    gravity: Gravity | None = None
+    """Turns the model upright."""
+    intrinsics: Intrinsics = NO_DOUBTS
+    """Which intrinsics are in doubt, and what became of them so far."""
+    rigs: Mapping[int, Any] | None = None
+    """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
+    colors: PointColors | None = None
+    """Colors of the points that the input had."""
+    near: FirstPlacement | None = None
+    """Where an adjustment has the images already; None if there was none."""
+
+    def of_further_piece(self) -> "Told":
+        """Return what is told of a further rigid piece: nothing of positions."""
+        free = self.rigid._replace(fixed=np.zeros_like(self.rigid.fixed), groups=None, fixed_group=None)
+        return self._replace(rigid=free, priors=None, control=None, gravity=None, near=None)
+
+
+class Stand(NamedTuple):
+    """Where the cameras of one rigid piece stand, and by what."""
+
+    source: MatchSource
+    """The matches, at the rotations that the piece has now."""
+    directions: PairDirections
+    located: Located
+    intrinsics: Intrinsics
+    estimate: Estimate | None = None
+    """Of the last adjustment; None if there was none."""
+    scale: float = 1.0
+    """From the solver's units to those of the estimate."""
+    adjustment: Estimate | None = None
+    """How this placement was adjusted; None if it was not."""
+
+
+def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock) -> LocateResult:
+    """Place the cameras of an open source, and make the seeded models of its rigid pieces, the largest first.
+
+    Args:
+        opened: the images, at their rotations, and their matches.
+        told: of the images.
+        options: settings.
+        clock: of the run.
+    """
+    with clock("directions"):
+        wanted = Wanted(tracks=wants_points(opened, options), errors=opened.economy.samples)
+        measured = measure(opened, options, clock, wanted)
+    directions = measured.directions
+    with clock("solve"):
+        graph = told.rigid.apply(build_graph(opened.model, measured))
+        work = count_work(opened, directions)
+        economy, graph, options = keep_within_memory(work, graph, options, opened.economy)
+        source = opened.at(opened.model, economy)
+        graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
+        del measured
+        near = None if told.near is None else told.near.stand
+        pieces = list(place_cameras(graph, options, clock, near))
+        del graph
+    models = []
+    while pieces:  # a piece is given up when it is finished: its samples of errors are large
+        piece = pieces.pop(0)
+        own = (told, options) if piece.piece == 0 else (told.of_further_piece(), of_further_piece(options))
+        models.append(finish_piece(source, directions, piece, *own, clock))
+    return replace(models[0], further=tuple(models[1:]))
+
+
+def of_further_piece(options: LocateOptions) -> LocateOptions:
+    """Return the options of a further rigid piece, which has a unit of its own."""
+    return replace(
+        options,
+        scale="unit",
+        known_distance=(),
+        control_points="",
+        fix="",
+        refine_with_priors=False,
+        rigs="held",
+    )
+
+
+def finish_piece(
+    source: MatchSource,
+    directions: PairDirections,
+    placement: Placement,
+    told: Told,
+    options: LocateOptions,
+    clock: Clock,
+) -> LocateResult:
+    """Take one rigid piece from its placement to its model.
+
+    Args:
+        source: the images and their matches, at the rotations that were placed with.
+        directions: of all pairs.
+        placement: of the piece.
+        told: of its images.
+        options: settings.
+        clock: of the run.
+    """
+    given = source.model
+    started = _start(source, directions, placement, told, options)
+    stand = _adjust(started, told, options, clock)
+    with clock("trust"):
+        # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
+        asked = stand if told.intrinsics.free.doubts else started
+        is_main = placement.piece == 0  # the lenses of a further piece are asked with those of all
+        focal_doubts = question_focal_lengths(asked.source, asked.directions, options) if is_main else ()
+        judged = _judge(stand, given, options)
+        located = _choose(stand.located, judged, options.min_trust)
+    del started, placement  # with their samples of errors
+    seeded = build_seeded_model(stand.source, located, options, clock, told.colors)
+    seeded, control_points, of_control = bring_to_control_points(seeded, given, told.control, options)
+    seeded, of_gravity = turn_model_upright(seeded, given, told.gravity)
+    intrinsics = stand.intrinsics
+    if seeded.adjusted is not None:
+        scale = located.gauge.similarity.scale
+        judged = with_uncertainty(judged, given, seeded.adjusted, scale)
+        intrinsics = intrinsics.after(seeded.adjusted.lenses)
+    sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
+    for done in (stand.adjustment, seeded.adjusted):
+        sensors |= {} if done is None else done.sensors
+    if options.rigs == "free" and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
+    focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
+    gauge = tell_scale(seeded.gauge, judged.scale_sigma)
+    model, directions = stand.source.model, stand.directions
+    prior_angles = _ask_priors(model, directions, told.priors, gauge, seeded.reconstruction)
+    return LocateResult(
+        reconstruction=seeded.reconstruction,
+        inputs=told.inputs,
+        options=options,
+        model=model,
+        directions=directions,
+        placement=judged,
+        kept=located.kept & ~np.isin(model.image_ids[judged.cameras], list(seeded.poor)),
+        poor=seeded.poor,
+        unsupported=seeded.unsupported,
+        agreeing_observations=seeded.observations.agreeing,
+        contradicting_observations=seeded.observations.contradicting,
+        gauge=gauge,
+        adjusted=seeded.adjusted,
+        adjustment=stand.adjustment,
+        turned_deg=None if stand.adjustment is None else turned_deg(given.rotations, model.rotations),
+        timings_s=clock.seconds,
+        warnings=(
+            *focal_warnings(model, focal_doubts, intrinsics.refined.undetermined),
+            *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
+            *_collect_warnings(stand.source, directions, judged, located),
+            *_structure_warnings(stand.source, seeded.reconstruction.num_points3D()),
+            *prior_warnings(prior_angles, directions.pairs, model.names),
+            *of_control,
+            *of_gravity,
+            *support_warnings(_names_of(model, seeded.unsupported), is_kept=options.min_trust == 0.0),
+        ),
+        fixed=told.rigid.fixed,
+        prior_angles=prior_angles,
+        focal_doubts=focal_doubts,
+        intrinsics=intrinsics,
+        rigs=refined_rigs(
+            told.rigs or sensors_of(given.reconstruction), sensors_of(seeded.reconstruction), sensors
+        ),
+        control_points=tuple(control_points),
+    )
+
+
+def _start(
+    source: MatchSource, directions: PairDirections, placement: Placement, told: Told, options: LocateOptions
+) -> Stand:
+    """Return where the cameras of a piece stand before they are adjusted, in the frame that is worked in.
+
+    That frame is the gauge of all placed cameras, or that of priors that pull, which then stays.
+    """
+    model = source.model
+    rule = GaugeRule(model, told.rigid, options, told.priors)
+    everyone = np.ones(len(placement.cameras), dtype=np.bool_)
+    gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
+    given = GivenPoses(lenses=told.intrinsics.free, free_rigs=options.rigs == "free")
+    located = Located(placement, everyone, gauge, told.rigid.fixed, rule, given)
+    if told.priors is not None and options.refine_with_priors:
+        located = pull_cameras(model, located, told.priors, options)
+    stand = Stand(source, directions, located, told.intrinsics)
+    if told.near is None:
+        return stand
+    centers = told.near.stand.locations[placement.cameras]
+    scale = median_spread(centers) / median_spread(placement.locations)
+    return stand._replace(estimate=told.near.adjusted, scale=scale)
+
+
+def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> Stand:
+    """Adjust the placed cameras, if that is wanted and was not done before."""
+    located = stand.located
+    num_cameras, is_pulled = len(located.placement.cameras), located.given.centers is not None
+    is_small = located.placement.piece > 0 and num_cameras < _SMALLEST_ADJUSTED
+    adjusts = stand.source.economy.adjustment and options.adjusts_cameras(num_cameras)
+    if is_small or (told.near is not None and not is_pulled) or not adjusts:
+        return stand
+    with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
+        after = adjust_placed(stand.source, stand.directions, located, options, clock, told.rotations)
+        intrinsics = stand.intrinsics.after(after.adjusted.lenses)
+        frames = stand.source.model.images.frames
+        given = located.given._replace(
+            weight=after.adjusted.weight.among(after.part.frames, len(frames.ids)),
+            rotations=frames.rotations,
+            lenses=intrinsics.free,
+        )
+        return Stand(
+            source=after.source,
+            directions=after.directions,
+            located=located._replace(placement=after.placement, given=given),
+            intrinsics=intrinsics,
+            estimate=after.adjusted,
+            scale=located.gauge.similarity.scale,
+            adjustment=after.adjusted,
+        )
+    return stand
+
+
+def _judge(stand: Stand, given: PosedModel, options: LocateOptions) -> Judged:
+    """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
+    placement = stand.located.placement
+    among = placement.cameras if placement.piece else None
+    relative = ask_pairs(stand.source, stand.directions, options, among)
+    judged = judge(placement, options)
+    if stand.estimate is not None:
+        judged = with_uncertainty(judged, given, stand.estimate, stand.scale)
+    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
+
+
+def _choose(located: Located, judged: Judged, min_trust: float) -> Located:
+    """Return which of the judged cameras are in the output, in a gauge that is found anew for them.
+
+    Where priors hold the gauge it stays.
+    """
+    kept = select_trusted(judged, min_trust)
+    if located.given.centers is None and located.rule is not None:
+        kept |= located.rule.rigid.fixed[judged.cameras]
+        gauge = located.rule.choose(judged.cameras[kept], judged.locations[kept], judged.unit)
+        located = located._replace(gauge=gauge)
+    return located._replace(placement=judged, kept=kept)
+
+
+def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:
+    """Return the names of some images, in the order of the model."""
+    return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(image_ids))).tolist()]
+
+
+def _ask_priors(
+    model: PosedModel,
+    directions: PairDirections,
+    priors: PositionPriors | None,
+    gauge: Gauge,
+    output: "pycolmap.Reconstruction",
+) -> PriorAngles | None:
+    """Return how far directions are off the baselines of priors that set the axes, if any do."""
+    if priors is None or gauge.scale != "prior" or gauge.axes is None:
+        return None
+    centers = np.full((model.num_images, 3), np.nan)
+    for image, image_id in enumerate(model.image_ids.tolist()):
+        if output.image(image_id).has_pose:
+            centers[image] = output.image(image_id).projection_center()
+    return compare_with_priors(directions.pairs, directions.directions, priors, gauge, centers)
+
+
+def _collect_warnings(
+    source: MatchSource, directions: PairDirections, judged: Judged, located: Located
+) -> Iterator[str]:
+    """Yield what the user should know of pairs and cameras beyond the tables."""
+    yield from match_warnings(directions)
+    yield from quality_warnings(judged)
+    yield from trust_warnings(judged, located.kept)
+    yield from ambiguity_warnings(judged)
+    if located.gauge.warning:
+        yield located.gauge.warning
+    if source.economy.statement:
+        yield f"to stay below max_memory_mb, {source.economy.statement}"
+
+
+def _structure_warnings(source: MatchSource, num_points: int) -> Iterator[str]:
+    """Yield what the user should know of points and of the database."""
+    if num_points == 0:
+        yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
+    if names := source.matches.missing_names:
+        yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

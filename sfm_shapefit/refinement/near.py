@@ -1,0 +1,68 @@
+"""Cameras that an adjustment has placed already: what is kept of a solve is its certificate."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.refinement.angular import Metric, residual_levels
+from sfm_shapefit.refinement.starts import OPENING_RAD, RefinedPlacement
+from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.program import normalize_locations
+
+# Distance between a camera as solved and as adjusted, in spreads of all, beyond which it does not count more.
+_CAP_OF_SIZE = 0.5
+# Smallest eigenvalue of the sum of projectors below which the rays of a point count as parallel.
+_LEAST_SPREAD = 1e-12
+# Rounds of "which residuals are inside?" and "how large are these?"; the level settles in about five.
+_ROUNDS = 10
+
+
+def stay_near(
+    measured: MeasuredGraph, solved: SolverResult, centers: FloatArray, first: RefinedPlacement
+) -> RefinedPlacement:
+    """Return the locations of cameras that an adjustment has placed, and points where their rays meet.
+
+    Args:
+        measured: a piece.
+        solved: its certified solution.
+        centers: (k, 3) of its cameras by the adjustment, in any scale and from any origin, in the same axes.
+        first: the placement that was adjusted.
+    """
+    graph, there = measured.graph, solved.locations[: len(centers)]
+    cap = _CAP_OF_SIZE * median_spread(there)
+    locations = solved.locations.copy()
+    locations[: len(centers)] = fit_similarity_l1(centers, there, rotate=False, cap=cap).apply(centers)
+    locations = normalize_locations(graph, follow_cameras(measured, locations))
+    metric = Metric(measured.covariance, measured.classes)
+    levels = np.full(int(metric.classes.max()) + 1, OPENING_RAD)
+    for _ in range(_ROUNDS):
+        levels = residual_levels(graph, locations, metric, levels)
+    return replace(
+        first,
+        locations=locations,
+        is_refined=True,
+        reason=f"{first.reason}; then adjusted to the pixels, rotations too",
+        levels_deg=tuple(np.degrees(levels).tolist()),
+        reset_nodes=np.empty(0, dtype=np.int64),
+    )
+
+
+def follow_cameras(part: MeasuredGraph, locations: FloatArray) -> FloatArray:
+    """Return the locations with each point where the rays of its cameras come closest to one another.
+
+    The point x minimizes sum |P_v (c - x)|^2 over its cameras c and directions v; P_v = I - v v^T.
+    """
+    rows = np.flatnonzero(~part.is_pair)
+    cameras, points = part.graph.edges[rows].T
+    v = part.graph.directions[rows]
+    projectors = np.eye(3) - v[:, :, None] * v[:, None, :]
+    sums, targets = np.zeros((part.graph.num_nodes, 3, 3)), np.zeros((part.graph.num_nodes, 3))
+    np.add.at(sums, points, projectors)
+    np.add.at(targets, points, np.einsum("kab,kb->ka", projectors, locations[cameras]))
+    held = np.linalg.eigvalsh(sums)[:, 0] > _LEAST_SPREAD
+    followed = locations.copy()
+    followed[held] = np.linalg.solve(sums[held], targets[held][:, :, None])[:, :, 0]
+    return followed

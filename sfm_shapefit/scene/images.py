@@ -1,0 +1,187 @@
+"""The images of a scene as arrays: through which lens each was taken, in which frame, and where that stands.
+
+Every array of the package is over one of these spaces, and its comment names it by a letter:
+
+    images i, frames f, lenses l, pairs p, edges e, nodes n, points x, observations o
+
+An entry of one space that refers to another is a row of that one. Ids of COLMAP stand in `Images.ids`,
+`Frames.ids`, `Lens.id` and `Points.ids`, nowhere else.
+
+A frame is what moves: an image alone, or the images that a rig took at once. A point X of the world has, in
+an image of frame f through lens l, the coordinates
+
+    x = R_l R_f (X - C_f) + t_l,        (R_l, t_l) = sensor_from_rig of the lens, the identity of a reference.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, frozen
+from sfm_shapefit.scene.lens import Lens
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frames:
+    """Poses that move by themselves; arrays are read-only."""
+
+    ids: IntArray
+    """(f,) ascending."""
+    rotations: FloatArray
+    """(f, 3, 3) rig_from_world; NaN where unknown."""
+    centers: FloatArray
+    """(f, 3) origins in the world; NaN where unknown."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ids", frozen(np.asarray(self.ids, dtype=np.int64)))
+        object.__setattr__(self, "rotations", frozen(np.reshape(self.rotations, (-1, 3, 3))))
+        object.__setattr__(self, "centers", frozen(np.reshape(self.centers, (-1, 3))))
+
+    @property
+    def is_posed(self) -> BoolArray:
+        """Frames whose rotation and center are known, (f,)."""
+        return np.asarray(
+            np.isfinite(self.centers).all(axis=1) & np.isfinite(self.rotations).all(axis=(1, 2))
+        )
+
+    def part(self, frames: IntArray) -> "Frames":
+        """Return some of the frames."""
+        return Frames(ids=self.ids[frames], rotations=self.rotations[frames], centers=self.centers[frames])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sensors:
+    """Where each lens is in its rig; arrays are read-only."""
+
+    rotations: FloatArray
+    """(l, 3, 3) of sensor_from_rig, exactly the identity for a reference; NaN where unknown."""
+    translations: FloatArray
+    """(l, 3) of sensor_from_rig, exactly 0 for a reference; NaN where unknown."""
+    rig_of: IntArray
+    """(l,) number of the rig."""
+    is_reference: BoolArray
+    """(l,) lenses that stand at the origin of their rig."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rotations", frozen(np.reshape(self.rotations, (-1, 3, 3))))
+        object.__setattr__(self, "translations", frozen(np.reshape(self.translations, (-1, 3))))
+        object.__setattr__(self, "rig_of", frozen(np.asarray(self.rig_of, dtype=np.int64)))
+        object.__setattr__(self, "is_reference", frozen(np.asarray(self.is_reference, dtype=np.bool_)))
+
+    def part(self, lenses: IntArray) -> "Sensors":
+        """Return those of some lenses, rigs renumbered."""
+        return Sensors(
+            rotations=self.rotations[lenses],
+            translations=self.translations[lenses],
+            rig_of=np.unique(self.rig_of[lenses], return_inverse=True)[1].ravel(),
+            is_reference=self.is_reference[lenses],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Images:
+    """All images of a scene, with a pose or without, in the order of their names; arrays are read-only."""
+
+    names: tuple[str, ...]
+    """(i,)"""
+    ids: IntArray
+    """(i,)"""
+    frame_of: IntArray
+    """(i,)"""
+    lens_of: IntArray
+    """(i,)"""
+    frames: Frames
+    """Those of the images: each has at least one."""
+    lenses: tuple[Lens, ...]
+    """(l,) those of the images, ascending by id."""
+    sensors: Sensors
+
+    def __post_init__(self) -> None:
+        for name in ("ids", "frame_of", "lens_of"):
+            object.__setattr__(self, name, frozen(np.asarray(getattr(self, name), dtype=np.int64)))
+
+    @property
+    def num_images(self) -> int:
+        """Number of images, i."""
+        return len(self.names)
+
+    @property
+    def rotations(self) -> FloatArray:
+        """Rotations cam_from_world, (i, 3, 3); NaN where unknown."""
+        return np.asarray(self.sensors.rotations[self.lens_of] @ self.frames.rotations[self.frame_of])
+
+    @property
+    def offsets(self) -> FloatArray:
+        """Centers of images minus those of their frames, world axes, (i, 3); exactly 0 for a reference."""
+        shifts = np.einsum("iba,ib->ia", self.rotations, self.sensors.translations[self.lens_of])
+        return np.asarray(0.0 - shifts)
+
+    @property
+    def centers(self) -> FloatArray:
+        """Centers of images in the world, (i, 3); NaN where unknown."""
+        return np.asarray(self.frames.centers[self.frame_of] + self.offsets)
+
+    @property
+    def focal_lengths_px(self) -> FloatArray:
+        """Mean focal lengths, (i,); of a lens without one, pixels per radian."""
+        return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
+
+    @property
+    def is_posed(self) -> BoolArray:
+        """Images whose frame has a pose, (i,)."""
+        return self.frames.is_posed[self.frame_of]
+
+    @property
+    def has_rigs(self) -> bool:
+        """Whether any frame has several images."""
+        return len(self.frames.ids) < self.num_images
+
+    def part(self, images: IntArray) -> "Images":
+        """Return some of the images, ascending, with the frames and lenses of these; all are renumbered."""
+        frames, frame_of = np.unique(self.frame_of[images], return_inverse=True)
+        lenses, lens_of = np.unique(self.lens_of[images], return_inverse=True)
+        return Images(
+            names=tuple(self.names[k] for k in images.tolist()),
+            ids=self.ids[images],
+            frame_of=frame_of.ravel(),
+            lens_of=lens_of.ravel(),
+            frames=self.frames.part(frames),
+            lenses=tuple(self.lenses[k] for k in lenses.tolist()),
+            sensors=self.sensors.part(lenses),
+        )
+
+    def posed(self, rotations: FloatArray, centers: FloatArray) -> "Images":
+        """Return the images with their frames at other rotations (f, 3, 3) and centers (f, 3)."""
+        return replace(self, frames=replace(self.frames, rotations=rotations, centers=centers))
+
+    def placed(self, rows: IntArray, centers: FloatArray) -> "Images":
+        """Return the images with some of them (k,) at centers (k, 3), rotations as they are.
+
+        Others of a frame move along with its first one; frames without any become NaN.
+        """
+        frames, first = np.unique(self.frame_of[rows], return_index=True)
+        moved = np.full_like(self.frames.centers, np.nan)
+        moved[frames] = (centers - self.offsets[rows])[first]
+        return self.posed(self.frames.rotations, moved)
+
+    def with_lenses(self, lenses: Sequence[Lens]) -> "Images":
+        """Return the images with other parameters of their lenses."""
+        return replace(self, lenses=tuple(lenses))
+
+    def with_sensors(self, rotations: FloatArray, translations: FloatArray) -> "Images":
+        """Return the images with other poses of their sensors, (l, 3, 3) and (l, 3)."""
+        return replace(self, sensors=replace(self.sensors, rotations=rotations, translations=translations))
+
+
+class Pictures(Protocol):
+    """The keypoints of images, by the images' rows."""
+
+    def count(self, image: int) -> int:
+        """Return how many keypoints an image has."""
+        ...
+
+    def look_up(self, image: int, keypoints: IntArray | Int32Array) -> tuple[FloatArray, FloatArray]:
+        """Return pixels (k, 2) and rays (k, 3), of any length, of keypoints; NaN for pixels without a ray."""
+        ...

@@ -1,0 +1,31 @@
+"""Lenses: distortions undone."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit.scene.lens import Lens
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_PINHOLE", (900.0, 600.0, 400.0)),
+        ("PINHOLE", (900.0, 910.0, 600.0, 400.0)),
+        ("SIMPLE_RADIAL", (900.0, 600.0, 400.0, -0.3)),
+        ("RADIAL", (900.0, 600.0, 400.0, -0.25, 0.1)),
+        ("OPENCV", (900.0, 910.0, 600.0, 400.0, -0.2, 0.05, 2e-3, -3e-3)),
+    ],
+)
+def test_distortion_is_undone_as_by_pycolmap_and_where_the_picture_is_folded_there_is_no_ray(
+    model, parameters
+):
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform([-100.0, -100.0], [1300.0, 900.0], (30_000, 2))
+    camera = pycolmap.Camera(model=model, width=1200, height=800, params=parameters)
+    found, theirs = Lens(model, parameters).undistort(pixels), np.asarray(camera.cam_from_img(pixels))
+    has_ray = np.isfinite(found).all(axis=1)
+    np.testing.assert_array_equal(has_ray, np.isfinite(theirs).all(axis=1))
+    assert has_ray.all() == (parameters[-1] != -0.3)
+    ahead = np.concatenate([found[has_ray], np.ones((has_ray.sum(), 1))], axis=1)
+    np.testing.assert_allclose(camera.img_from_cam(ahead), pixels[has_ray], atol=1e-9)
