@@ -1,6 +1,5 @@
 """`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, fields
@@ -8,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, get_args
 
+from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
@@ -43,7 +43,7 @@ class Sharing(NamedTuple):
     threads: int = 1
     executor: Executor | None = None
     """Its workers do the work instead of threads."""
-    advance: Callable[[int, int], None] = lambda _done, _total: None
+    advance: Advance = nobody
     """Called with the pairs that are done and their number."""
 
 

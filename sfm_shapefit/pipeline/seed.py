@@ -1,7 +1,6 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +12,7 @@ from sfm_shapefit.adjustment.run import GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
+from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.model import PosedModel
@@ -267,20 +267,18 @@ def pictures_of(source: MatchSource, posed: PosedPart) -> ModelPictures:
     return ModelPictures(source.model.reconstruction, posed.images, keypoints)
 
 
-def read_links(
-    source: MatchSource, located: Located, posed: PosedPart, advance: Callable[[int, int], None]
-) -> Links:
+def read_links(source: MatchSource, located: Located, posed: PosedPart, advance: Advance) -> Links:
     """Return what joins the keypoints of placed images; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
     model, placement, view = source.model, located.placement, source.view
     pictures = pictures_of(source, posed)
-    if not source.has_database:
-        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
+    if not source.has_database:  # the model has its tracks already
+        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
     place = np.full(model.num_images, -1)
     place[posed.rows] = np.arange(len(posed.rows))
     return collect_matches(posed.images, pictures, place, links, view.num_matches)

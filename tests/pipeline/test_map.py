@@ -21,7 +21,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline import execution, relative_rotations
-from sfm_shapefit.pipeline.execution import PairTask, open_executor
+from sfm_shapefit.pipeline.execution import open_executor
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
@@ -282,7 +282,7 @@ class Counting(ThreadPoolExecutor):
         self.tasks = {}
 
     def submit(self, work, /, task):
-        kind = task.work.estimate.func.__name__ if isinstance(task, PairTask) else work.__name__
+        kind = work.args[0].estimate.func.__name__ if isinstance(work, partial) else work.__name__
         self.tasks[kind] = self.tasks.get(kind, 0) + 1
         return super().submit(work, task)
 
@@ -317,7 +317,7 @@ def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_pa
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
     monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
-    monkeypatch.setattr(execution, "measure_task", partial(die_once, str(flag)))
+    monkeypatch.setattr(execution, "measure_part", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
         shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
     monkeypatch.undo()
