@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from sfm_shapefit.adjustment.options import AdjustmentOptions
     from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.facts.map_result import MapResult
-    from sfm_shapefit.facts.options import LocateOptions, MapOptions
+    from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
     from sfm_shapefit.facts.result import LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
     from sfm_shapefit.graph.viewgraph import ViewGraph
+    from sfm_shapefit.judgement.options import TrustOptions
+    from sfm_shapefit.pairs.options import DirectionOptions
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.evaluate import evaluate
@@ -38,13 +40,17 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
     from sfm_shapefit.pipeline.write import WriteOptions, write_map_result, write_result
+    from sfm_shapefit.placement.options import GaugeOptions
     from sfm_shapefit.placement.place import Placement
     from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.rotations.average import average_rotations
     from sfm_shapefit.rotations.averaged import AveragedRotations
+    from sfm_shapefit.rotations.options import AveragingOptions
+    from sfm_shapefit.scene.freedom import FreedomOptions
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
+    from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
 
 _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
@@ -58,7 +64,13 @@ _HOMES = {
     "pipeline.relative_rotations": ("relative_rotations",),
     "pipeline.write": ("WriteOptions", "write_map_result", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "facts.options": ("LocateOptions", "MapOptions"),
+    "facts.options": ("InspectOptions", "LocateOptions", "MapOptions", "SourceOptions"),
+    "judgement.options": ("TrustOptions",),
+    "pairs.options": ("DirectionOptions",),
+    "placement.options": ("GaugeOptions",),
+    "rotations.options": ("AveragingOptions",),
+    "scene.freedom": ("FreedomOptions",),
+    "tracks.options": ("NodeOptions", "StructureOptions"),
     "pipeline.place": ("place",),
     "placement.place": ("Placement",),
     "refinement.options": ("PlacementOptions",),
@@ -78,18 +90,27 @@ __all__ = [
     "AdjustedModel",
     "AdjustmentOptions",
     "AveragedRotations",
+    "AveragingOptions",
     "Certificate",
+    "DirectionOptions",
+    "FreedomOptions",
+    "GaugeOptions",
     "InputError",
+    "InspectOptions",
     "LocateOptions",
     "LocateResult",
     "MapOptions",
     "MapResult",
+    "NodeOptions",
     "Placement",
     "PlacementOptions",
     "ShapeFitError",
     "SolverOptions",
     "SolverResult",
+    "SourceOptions",
     "Status",
+    "StructureOptions",
+    "TrustOptions",
     "UnsolvableError",
     "ViewGraph",
     "WriteOptions",

@@ -6,6 +6,7 @@ The gate runs it after `warm-up`, which must have compiled everything.
 """
 
 import sys
+from pathlib import Path
 
 from numba.core import event as events
 
@@ -17,7 +18,7 @@ COMMANDS = """
     evaluate {out}/located data_synthetic/courtyard/truth
     inspect data_synthetic/courtyard/sparse/0
     solve data_synthetic/graph40.txt {out}/solved -q
-    solve data_synthetic/graph40.txt {out}/split --method admm -q
+    solve data_synthetic/graph40.txt {out}/split --config {admm} -q
     map data_synthetic/ring8/database.db {out}/mapped -q
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
@@ -45,8 +46,10 @@ class Names(events.Listener):
 
 if __name__ == "__main__":
     names = Names()
+    admm = Path(sys.argv[1] + ".toml")
+    admm.write_text('solver = "admm"', encoding="utf-8")
     with events.install_listener("numba:compile", names):
-        for command in COMMANDS.format(out=sys.argv[1]).strip().splitlines():
+        for command in COMMANDS.format(out=sys.argv[1], admm=admm).strip().splitlines():
             app(command.split(), standalone_mode=False)
     print("compiled:", *names.compiled, file=sys.stderr)  # noqa: T201
     sys.exit(bool(names.compiled))

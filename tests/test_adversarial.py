@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import LocateOptions
+from sfm_shapefit import TrustOptions
 from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import camera_rows
 from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
@@ -22,7 +22,7 @@ from tests.scenes import RING, copied, edit_database
 
 N = 12
 BAD = N - 1
-MIN_TRUST = LocateOptions().min_trust
+MIN_TRUST = TrustOptions().min_trust
 CENTERS = np.random.default_rng(1).standard_normal((N, 3))
 ALL = all_pairs(N)
 OF_BAD = [k for k, (_, j) in enumerate(ALL) if j == BAD]

@@ -23,23 +23,17 @@ STILL_TO_DO = {
 }
 # Public names that several modules still define. The list may only become shorter.
 STILL_ALIKE = {
+    "bundle_adjust",
     "CameraPoses",
     "Group",
     "Images",
     "Int32Array",
     "Intrinsics",
-    "Join",
-    "KnownDistance",
     "Measured",
     "OnIteration",
     "Options",
     "Points",
-    "RigidGroups",
-    "Rows",
-    "Told",
     "UInt64Array",
-    "bundle_adjust",
-    "shorten",
 }
 
 # The identifier would be the subject of such a sentence; the shape of an array may stand before it.

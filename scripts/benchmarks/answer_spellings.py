@@ -19,7 +19,7 @@ _NEW = {
     "--refine-intrinsics": "--intrinsics",
     "--refine-rigs": "--rigs free",
     "--refine-with-priors": "",
-    "--scale prior": "",
+    "--scale prior": "--priors database",
 }
 """Today's text and the new one: of a command, a flag, or a flag with a value.
 

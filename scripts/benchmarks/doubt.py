@@ -67,7 +67,8 @@ FACTORS = (1.1, 0.9, 1.3, 0.7, 2.4, 1.0 / 2.4)
 TRUSTED = 0.6
 GROUP, LARGE_ENOUGH = 5, 15
 """Cameras of a group that is turned, and of the least scene in which groups are."""
-OPTIONS = LocateOptions(threads=2)
+THREADS = 2
+OPTIONS = LocateOptions(threads=THREADS)
 
 
 class Scene(NamedTuple):
@@ -154,17 +155,18 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
 def measured(model: PosedModel, scene: Scene) -> Iterator[tuple[Any, Measured]]:
     """Yield the matches of a scene at a model, and what they tell."""
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), OPTIONS) as source:
-        wanted = Wanted(tracks=wants_points(source, OPTIONS), errors=True)
-        yield source, measure(source, OPTIONS, Clock(), wanted)
+        wanted = Wanted(tracks=wants_points(source, OPTIONS.nodes), errors=True)
+        yield source, measure(source, OPTIONS.directions, Clock(threads=THREADS), wanted)
 
 
 def judge(model: PosedModel, scene: Scene) -> tuple[PairDirections, Judged]:
     """Place the cameras of a model and judge them: `locate` without points."""
-    rigid = find_rigid_parts(model, OPTIONS, has_priors=False)
+    rigid = find_rigid_parts(model, OPTIONS.placement)
     with measured(model, scene) as (source, told):
         graph = add_evidence(rigid.apply(build_graph(source.model, told)), told)
-        placement = judge_placement(next(place_cameras(graph, OPTIONS, Clock())), OPTIONS)
-        relative = ask_pairs(source, told.directions, OPTIONS)
+        placed = next(place_cameras(graph, OPTIONS.placement, OPTIONS.nodes, Clock(threads=THREADS)))
+        placement = judge_placement(placed, OPTIONS.placement)
+        relative = ask_pairs(source, told.directions, THREADS)
     return told.directions, doubt_cameras(placement, told.directions, relative, model)
 
 
@@ -239,7 +241,7 @@ def change_focal_lengths(scene: Scene) -> Row:
         for factor in (1.0, *FACTORS):
             changed, camera = change_camera(model, chosen, factor)
             with measured(changed, scene) as (source, told):
-                found = question_focal_lengths(source, told.directions, OPTIONS)
+                found = question_focal_lengths(source, told.directions, THREADS)
             right = factor != 1.0 and [doubt.camera for doubt in found[:1]] == [camera]
             asked += factor != 1.0
             named += right

@@ -19,7 +19,7 @@ workers may share them, with the same bits again.
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import IntArray, hand_back_memory
-from sfm_shapefit.base.executors import answers
+from sfm_shapefit.base.executors import Advance, answers, nobody
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, number_points
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
@@ -47,7 +47,7 @@ def triangulate(
     images: Images,
     matched: MatchedKeypoints,
     options: StructureOptions,
-    advance: Callable[[int, int], None] = lambda _done, _total: None,
+    advance: Advance = nobody,
     executor: Executor | None = None,
 ) -> Points:
     """Return the points of all matches at the poses of images, a block of tracks at a time; none is filtered.

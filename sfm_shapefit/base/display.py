@@ -25,7 +25,7 @@ class Row(NamedTuple):
 
 
 def row(label: str, text: str) -> Row:
-    """Return a row of one line, or of none if there is nothing to tell."""
+    """Return a row of one line, or of none if the text is empty."""
     return Row(label, [text] if text else [])
 
 

@@ -7,10 +7,17 @@ from typing import TypeVar
 
 from sfm_shapefit.base.errors import ShapeFitError
 
+Advance = Callable[[int, int], None]
+"""Called with the work done so far and the work in all."""
+
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
 
 _TASKS_AT_ONCE = 32  # tasks submitted ahead of the answers; bounds the memory that they take
+
+
+def nobody(_done: int, _total: int) -> None:
+    """Hear of progress, and tell no one."""
 
 
 class WorkerError(ShapeFitError):

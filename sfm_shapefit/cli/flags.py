@@ -1,17 +1,18 @@
 """Flags are the fields of the settings classes, in their groups, and their help is each field's sentence."""
 
 import inspect
+import itertools
 import re
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.base.settings import Settings, option, setting_groups
+from sfm_shapefit.base.settings import Settings, hint, homes_of, option, setting_groups
 
 Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -36,9 +37,10 @@ PriorsFile = Annotated[
     Path | None,
     typer.Option(
         "--priors",
-        metavar="FILE|FOLDER",
-        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; or the "
-        "folder of the images, for the GPS positions of their EXIF data.",
+        metavar="FILE|FOLDER|database",
+        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; the "
+        "folder of the images, for the GPS positions of their EXIF data; or the database's own pose priors. "
+        "Those that have standard deviations pull the cameras by them.",
     ),
 ]
 
@@ -61,6 +63,7 @@ ExecutorName = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+Config = Annotated[Path | None, typer.Option("--config", help="Options from a TOML file; flags win over it.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Images = Annotated[
     Path | None,
@@ -100,21 +103,21 @@ _EARLIER_NAMES: dict[str, str] = {}
 """Flags that are taken beside their present names, without standing in any help."""
 
 
-_PLACE = (
-    *("rotations", "max_rotation_error", "reverse", "objective", "refine", "g2o", "onedsfm", "threads"),
-    *("overwrite", "report", "json", "strict", "quiet", "verbose"),
-)
+_GONE = {
+    "refine_with_priors": "priors that have standard deviations pull the cameras by themselves now",
+}
+"""What to say of options that are no more, by their names."""
+
+
 _FIRST_SCREEN = {
     "locate": (
         *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
         *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
     "map": (
-        *("priors", "control_points", "known_distance", "gravity", "without", "sequence", "join"),
+        *("priors", "control_points", "known_distance", "gravity", "without", "min_model_size", "join"),
         *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
-    "place": _PLACE,
-    "solve": _PLACE,
     "synth": (
         *("shape", "num_images", "num_points", "rig", "images", "pixel_noise_px", "wrong_match_fraction"),
         *("corrupted_pair_fraction", "rotation_noise_deg", "repeated_fraction", "model", "database", "seed"),
@@ -188,12 +191,29 @@ class GroupedCommand(TyperCommand):
             flag, equals, value = arg.partition("=")
             present = _EARLIER_NAMES.get(flag, flag)
             renamed.append(present + equals + value if flag not in known and present in known else arg)
+        if not ctx.resilient_parsing:
+            self._refuse_unknown(ctx, renamed, known)
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
         extra = super().parse_args(ctx, _gather_values(renamed))
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)
         return extra
+
+    def _refuse_unknown(self, ctx: Any, args: Sequence[str], known: set[str]) -> None:
+        """Refuse flags that are keys of --config now, or are no more; others are the parser's business."""
+        settings = getattr(self.callback, "settings", None)
+        groups = () if settings is None else setting_groups(settings)
+        keys = {name: item.name for one in groups for item in one.options for name in (item.also, item.name)}
+        for word in itertools.takewhile(lambda word: word != "--", args):
+            flag = word.partition("=")[0]
+            name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
+            if not flag.startswith("--") or flag in known:
+                continue
+            if name in _GONE:
+                ctx.fail(f"{flag} is gone: {_GONE[name]}")
+            if name in keys:
+                ctx.fail(f"{flag} is a key of --config now: {keys[name]} = ...")
 
 
 def _first_words(text: str) -> str:
@@ -214,51 +234,48 @@ def _refuse_extra(ctx: Any, extra: Sequence[str]) -> None:
 
 
 def takes(
-    *settings: type[Settings], only: Sequence[str] = (), without: Sequence[str] = ()
+    *flags: Sequence[inspect.Parameter], settings: type[Settings] | None = None
 ) -> Callable[[Command], Command]:
-    """Give a command one flag per field of some settings classes, None where the user says nothing.
+    """Give a command flags, as of `flags_of`, None where the user says nothing.
 
-    `only` names the fields that matter to the command, if not all do, or `without` those that do not.
+    Options of its `settings` that are no flags are keys of --config.
     """
 
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        flags = [
-            flag
-            for one in settings
-            for flag in _flags(one)
-            if (not only or flag.name in only) and flag.name not in without
-        ]
-        parameters = own + flags
+        parameters = [*own, *(flag for some in flags for flag in some)]
         command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
+        command.settings = settings  # type: ignore[attr-defined]
         return command
 
     return decorate
 
 
-def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
-    """Return a keyword parameter with a typer option for each field."""
-    kinds, parameters = get_type_hints(settings), []
+def flags_of(settings: type[Settings], *names: str) -> list[inspect.Parameter]:
+    """Return a keyword parameter with a typer option for each option of a class, or those that are named."""
+    parameters = []
     for group in setting_groups(settings):
-        for item in group.fields:
+        for item in group.options:
+            if names and item.name not in names:
+                continue
             flag = _flag_of(item.name)
-            if item.metadata["also"]:
-                _EARLIER_NAMES[_flag_of(item.metadata["also"])] = flag
+            if item.also:
+                _EARLIER_NAMES[_flag_of(item.also)] = flag
             is_switch = settings is OutputFlags and item.default is False
-            has_opposite = kinds[item.name] is bool and not is_switch
-            names = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
-            names += [_SHORT[item.name]] if item.name in _SHORT else []
+            has_opposite = item.kind is bool and not is_switch
+            spelled = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
+            spelled += [_SHORT[item.name]] if item.name in _SHORT else []
             shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
             default = "" if item.default in (None, "", ()) or is_switch else f" [default: {shown}]"
             flagged = typer.Option(
-                *names,
-                help=item.metadata["help"] + default,
+                *spelled,
+                help=item.help + default,
                 rich_help_panel=group.title,
-                metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
+                metavar=_METAVARS.get(item.name, _METAVARS.get(item.kind)),
             )
-            kind = str if item.name in _WORDS_OR_NUMBERS else kinds[item.name]
+            kind = str if item.name in _WORDS_OR_NUMBERS else item.kind
             annotation: Any = Annotated[(list[str] if item.name in _REPEATED else kind) | None, flagged]
             keyword = inspect.Parameter.KEYWORD_ONLY
             parameters.append(inspect.Parameter(item.name, keyword, default=None, annotation=annotation))
@@ -311,9 +328,8 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
         InputError: if the file is none that may be read.
         typer.BadParameter: if it is no TOML, or an option is unknown or has a wrong value.
     """
-    earlier = {item.metadata["also"]: item.name for item in fields(settings)}
-    known = {item.name for item in fields(settings)}
-    values = _read_toml(config, known, earlier) if config else {}
+    known = homes_of(settings)
+    values = _read_toml(config, settings) if config else {}
     flags = {name: value for name, value in given.items() if value is not None and name in known}
     for name in _REPEATED.keys() & flags.keys():
         flags[name] = tuple(_values_of(name, text) for text in flags[name])
@@ -325,8 +341,8 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
         raise typer.BadParameter(str(error)) from error
 
 
-def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str, Any]:
-    """Return the values of a TOML file whose keys are options."""
+def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
+    """Return the values of a TOML file whose keys are options, or groups of them."""
     from sfm_shapefit.files.lines import refuse_irregular_file
 
     refuse_irregular_file(path)
@@ -336,10 +352,12 @@ def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str
         raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
+    homes = homes_of(settings)
+    earlier = {item.also: item.name for one in setting_groups(settings) for item in one.options if item.also}
     values = {earlier.get(name, name): value for name, value in read.items()}
-    for name in values:
-        if name not in known:
-            raise typer.BadParameter(f"{path}: {name!r} is no option; known are {', '.join(sorted(known))}")
+    for name in values.keys() - {*homes, *homes.values()}:
+        reason = f"is gone: {_GONE[name]}" if name in _GONE else f"is no option; {hint(name, sorted(homes))}"
+        raise typer.BadParameter(f"{path}: {name!r} {reason}")
     return values
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import typer
 
 from sfm_shapefit.base.display import row
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     catch_termination,
@@ -151,10 +152,8 @@ def command_run(
             from sfm_shapefit.report.thumbnails import refuse_no_folder
 
             refuse_no_folder(Path(flags.images))
-        named = [
-            flags.images,
-            *(getattr(options, name, "") for name in ("fix", "without", "control_points", "gravity")),
-        ]
+        values = flat_values(options)
+        named = [flags.images, *(values.get(n, "") for n in ("fix", "without", "control_points", "gravity"))]
         paths = [*inputs, config, *(Path(name) for name in named if name)]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)

@@ -16,22 +16,19 @@ from sfm_shapefit.cli.console import (
     report_errors,
     show_progress,
 )
-from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
-from sfm_shapefit.cli.root import app
-from sfm_shapefit.facts.options import LocateOptions
-
-_INSPECTED = (
-    "directions",
-    "solver",
-    "objective",
-    "refine",
-    "points",
-    "min_inliers",
-    "min_inlier_ratio",
-    "inlier_threshold_px",
-    "threads",
+from sfm_shapefit.cli.flags import (
+    Config,
+    Database,
+    GroupedCommand,
+    InputPath,
+    Json,
+    flags_of,
+    one_path,
+    read_options,
+    takes,
 )
-"""The options of `locate` that decide what the view graph is and what becomes of it."""
+from sfm_shapefit.cli.root import app
+from sfm_shapefit.facts.options import InspectOptions
 
 
 @app.command(
@@ -40,7 +37,7 @@ _INSPECTED = (
     short_help="Diagnose a model and say what locate would do; write nothing.",
     epilog="Example: sfm-shapefit inspect sparse/0",
 )
-@takes(LocateOptions, only=_INSPECTED)
+@takes(flags_of(InspectOptions, "points", "without", "adjust", "threads"), settings=InspectOptions)
 def inspect_command(
     model: Annotated[
         Path | None,
@@ -50,12 +47,13 @@ def inspect_command(
     input_path: InputPath = None,
     database: Database = None,
     as_json: Json = False,
+    config: Config = None,
     **given: Any,
 ) -> None:
     """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
     source = one_path(model, input_path, "MODEL")
     with report_errors():
-        options = read_options(LocateOptions, given)
+        options = read_options(InspectOptions, given, config)
 
         from sfm_shapefit.pipeline.inspect import inspect as inspect_model
 

@@ -12,12 +12,29 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
+    flags_of,
     one_path,
     takes,
 )
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import LocateOptions
+
+_FLAGS = (
+    *(
+        "control_points",
+        "known_distance",
+        "fix",
+        "without",
+        "rotations",
+        "intrinsics",
+        "rigs",
+        "adjust",
+        "scale",
+    ),
+    *("min_trust", "points", "threads", "max_memory_mb"),
+)
+"""Options that are flags; the others are keys of --config."""
 
 
 @app.command(
@@ -26,7 +43,7 @@ from sfm_shapefit.facts.options import LocateOptions
     short_help="Place the cameras of a model from its rotations and matches.",
     epilog="Example: sfm-shapefit locate sparse/0 out",
 )
-@takes(LocateOptions, OutputFlags)
+@takes(flags_of(LocateOptions, *_FLAGS), flags_of(OutputFlags), settings=LocateOptions)
 def locate_command(
     model: ModelArgument = None,
     out: OutArgument = None,
@@ -46,7 +63,7 @@ def locate_command(
         from sfm_shapefit.pipeline.locate import locate
         from sfm_shapefit.pipeline.write import write_result
 
-        with open_executor(executor, run.options.num_threads()) as workers:
+        with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
             found = locate(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )

@@ -12,12 +12,29 @@ from sfm_shapefit.cli.flags import (
     OutputFlags,
     OutputPath,
     PriorsFile,
+    flags_of,
     one_path,
     takes,
 )
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import MapOptions
+
+_FLAGS = (
+    *(
+        "control_points",
+        "known_distance",
+        "gravity",
+        "without",
+        "intrinsics",
+        "rigs",
+        "adjust",
+        "scale",
+        "join",
+    ),
+    *("min_trust", "min_points_per_image", "min_model_size", "points", "threads", "max_memory_mb"),
+)
+"""Options that are flags; the others are keys of --config."""
 
 
 @app.command(
@@ -26,7 +43,7 @@ from sfm_shapefit.facts.options import MapOptions
     short_help="From the matches of a database alone: rotations, then locate.",
     epilog="Example: sfm-shapefit map database.db out --adjust full",
 )
-@takes(MapOptions, OutputFlags)
+@takes(flags_of(MapOptions, *_FLAGS), flags_of(OutputFlags), settings=MapOptions)
 def map_command(
     database: Annotated[
         Path | None, typer.Argument(metavar="DATABASE", help="COLMAP database with verified matches.")
@@ -47,7 +64,7 @@ def map_command(
         from sfm_shapefit.pipeline.map import map_database
         from sfm_shapefit.pipeline.write import write_result
 
-        with open_executor(executor, run.options.num_threads()) as workers:
+        with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
         write_result(found, target, **run.writing)
         run.show(found, source, target)

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
+from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, flags_of, one_path, takes
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -18,7 +18,11 @@ from sfm_shapefit.refinement.options import PlacementOptions
     short_help="Place the nodes of a bare view graph, or of relative poses.",
     epilog="Example: sfm-shapefit place graph.txt out",
 )
-@takes(PlacementOptions, OutputFlags, without=("images",))  # nodes have none
+@takes(
+    flags_of(PlacementOptions, "objective", "tol", "threads"),
+    [flag for flag in flags_of(OutputFlags) if flag.name != "images"],  # nodes have none
+    settings=PlacementOptions,
+)
 def place_command(
     graph: Annotated[
         Path | None,

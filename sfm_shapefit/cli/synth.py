@@ -8,7 +8,15 @@ import typer
 from sfm_shapefit.base.display import Row, row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli.console import print_table, report_errors
-from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputPath, one_path, read_options, takes
+from sfm_shapefit.cli.flags import (
+    GroupedCommand,
+    OutArgument,
+    OutputPath,
+    flags_of,
+    one_path,
+    read_options,
+    takes,
+)
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
@@ -23,7 +31,7 @@ Images = Annotated[
     short_help="Make a synthetic workspace with known truth.",
     epilog="Example: sfm-shapefit synth ring --shape ring --num-images 50",
 )
-@takes(SceneOptions, WorkspaceOptions, RenderOptions)
+@takes(flags_of(SceneOptions), flags_of(WorkspaceOptions), flags_of(RenderOptions))
 def synth_command(
     out: OutArgument = None, *, output_path: OutputPath = None, images: Images = False, **given: Any
 ) -> None:

@@ -7,11 +7,12 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 
 import html
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.base.display import Displayed, Row, Telling, row
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, JoinedFacts, MapFacts
@@ -94,7 +95,7 @@ class MapResult(Displayed):
         return MapFacts.taken_from(
             self,
             inputs=DatabaseInputs(database=str(self.database)),
-            options=asdict(self.options),
+            options=flat_values(self.options),
             models=[
                 Component(
                     folder=str(number),

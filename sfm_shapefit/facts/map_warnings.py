@@ -6,8 +6,8 @@ import numpy as np
 
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
-from sfm_shapefit.facts.options import KnownDistance
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
+from sfm_shapefit.placement.options import KnownDistance
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.

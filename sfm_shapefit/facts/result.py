@@ -1,7 +1,7 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
 from sfm_shapefit.facts.intrinsics import Intrinsics
@@ -25,7 +26,7 @@ from sfm_shapefit.facts.model import (
     PlacementAdjustment,
     RotationRefinement,
 )
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.placed import (
     IN_MEMORY,
     SOLVER_UNITS,
@@ -51,6 +52,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.matches import PairNames
@@ -96,7 +98,7 @@ class LocateResult(Displayed):
     reconstruction: "pycolmap.Reconstruction"
     """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
     inputs: Inputs
-    options: LocateOptions
+    options: PlacingOptions
     model: PosedModel
     """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
     directions: PairDirections
@@ -125,6 +127,8 @@ class LocateResult(Displayed):
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+    distances: tuple[KnownDistance, ...] = ()
+    """Those that were told of its images."""
     triplet_scores: FloatArray | None = None
     """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
     matched_shares: FloatArray | None = None
@@ -174,7 +178,7 @@ class LocateResult(Displayed):
         return ModelFacts.taken_from(
             self,
             **facts,
-            options=asdict(self.options),
+            options=flat_values(self.options),
             inputs=self.inputs.facts,
             not_trusted=self._not_trusted(),
             few_points={self.model.names[camera]: count for camera, count in self.few_points.items()},
@@ -190,7 +194,7 @@ class LocateResult(Displayed):
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,
-            known_distances=told_distances(self.options.known_distance, model),
+            known_distances=told_distances(self.distances, model),
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(model)),
@@ -274,7 +278,9 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
+            reason = (
+                f"it sees {counted(count, 'point')}, fewer than {self.options.structure.min_points_per_image}"
+            )
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
@@ -420,7 +426,7 @@ class GraphResult(Displayed):
         return GraphFacts(
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
             verdict=self.verdict,
-            options=asdict(self.options),
+            options=flat_values(self.options),
             delivered=Delivered.compare(placement, placement.locations, adjusted=False),
             timings_s=self.timings_s,
             warnings=list(graph_warnings(placement)),

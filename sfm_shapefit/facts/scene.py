@@ -12,7 +12,7 @@ from sfm_shapefit.base.wording import counted
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.facts.options import KnownDistance
+    from sfm_shapefit.placement.options import KnownDistance
 
 
 class Loop(Record):

@@ -6,11 +6,11 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
@@ -152,7 +152,7 @@ def focal_warnings(
 def graph_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
     yield from quality_warnings(placement)
-    floor = LocateOptions().min_trust
+    floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):
         yield (

@@ -3,10 +3,10 @@
 Do not use, if any of these holds:
 
     the residuals of the pairs that agree have a level above 5 degrees
-    of the observations of two or more matches, half or more contradict the cameras: they see no 3D point, and
+    half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
-    of the pairs that say anything of a direction, fewer than a quarter agree
-    of the cameras that were placed, fewer than half are in the output
+    fewer than a quarter of the pairs that say anything of a direction agree
+    fewer than half of the cameras that were placed are in the output
 
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
 placed but are not in the output, and that are kept though their matches make no points. Look also, though no
@@ -38,14 +38,14 @@ from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 
 UNCERTAIN_SHARE = 0.05
-"""Share of the extent of all above which the standard deviation of a camera counts as large."""
-_MOST_LEVEL_DEG = 5.0
+"""Share of the extent of all; a larger standard deviation of a camera counts as large."""
+_MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
+# Share of observations that contradict, and share that sees a point: see the header.
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
-_LEAST_PAIRS = 0.25
-_LEAST_KEPT = 0.5
-_LOW_TRUST = 0.75
-# Cameras within so many median distances of the median say how large the scene is.
-_INSIDE = 30.0
+_LEAST_PAIRS = 0.25  # share of agreeing pairs; below, the model is not to be used
+_LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
+_LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
+_INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
 
 class Grade(enum.Enum):

@@ -48,7 +48,7 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
         part,
         placement.refined.locations,
         undetermined_nodes=placement.refined.reset_nodes,
-        max_bytes=options.factor_memory_mb * 1_000_000,
+        max_bytes=options.solver.factor_bytes,
         agreement=agreement,
     )
     second = find_second_configuration(part.graph, part.pairs, agreement.agrees, assessment.level_deg)

@@ -57,14 +57,14 @@ class ObservationShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservationCounts:
-    """Numbers of the keypoints that are matched in two or more other posed images; 0 without a pose."""
+    """Numbers of keypoints that are matched in two or more other posed images, by image; 0 without a pose."""
 
     checked: IntArray
-    """(i,) all such keypoints of each image."""
+    """(i,) their number."""
     agreeing: IntArray
-    """(i,) keypoints among them that see a 3D point."""
+    """(i,) number that sees a 3D point."""
     contradicting: IntArray
-    """(i,) keypoints among them that see none, and most of whose matches miss the cameras' epipolar lines."""
+    """(i,) number that sees none, and most of whose matches miss the epipolar lines of the cameras."""
 
     def shares(self, chosen: BoolArray) -> ObservationShares:
         """Return the shares of some of the images (i,) together."""

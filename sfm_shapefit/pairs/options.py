@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from sfm_shapefit.base.settings import Settings, explained, option
 
+LEAST_MATCHES = 15
+"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
+
 
 @explained
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +35,11 @@ class DirectionOptions(Settings):
         "Largest Sampson error of an inlier; a Sampson error of 2 px allows 2.8 px off the epipolar line.",
     )
     num_hypotheses: int = option(200, "Two-match hypotheses per pair.")
+    without: str = option(
+        "",
+        "Pairs that are left out, as wrong ones of repeated structure: a file with the names of two images "
+        "per line, as pairs.csv or doubtful_pairs.csv has them.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

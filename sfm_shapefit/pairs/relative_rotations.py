@@ -50,7 +50,3 @@ class RelativeRotations:
 
 AGREEMENT_DEG = 5.0
 """Degrees up to which a pair agrees with averaged rotations; right pairs are mostly within one."""
-
-
-LEAST_MATCHES = 15
-"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""

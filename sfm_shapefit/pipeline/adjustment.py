@@ -14,20 +14,22 @@ from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions, Rotations
 from sfm_shapefit.files.colmap.model import PosedModel, turned_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.rigs import rigid_parts
 from sfm_shapefit.pipeline.seed import Located, PosedPart, pose_images, posed_part, read_links
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
 
 _SAID_OF_MATCHES = (
@@ -39,15 +41,15 @@ _SAID_OF_MATCHES = (
 )
 
 
-def pull_of_rotations(options: LocateOptions) -> float | None:
+def pull_of_rotations(rotations: Rotations) -> float | None:
     """Return by which standard deviation given rotations pull, see `Freedom`; None: as the matches say."""
-    if not isinstance(options.rotations, str):
-        return math.radians(options.rotations)
-    return {"auto": None, "held": 0.0, "free": math.inf}[options.rotations]
+    if not isinstance(rotations, str):
+        return math.radians(rotations)
+    return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
 
 
 def pull_cameras(
-    model: PosedModel, located: Located, priors: PositionPriors, options: LocateOptions
+    model: PosedModel, located: Located, priors: PositionPriors, options: PlacementOptions
 ) -> Located:
     """Return the cameras pulled by position priors, which hold the gauge from here on.
 
@@ -79,7 +81,7 @@ def adjust_placed(
     source: MatchSource,
     directions: PairDirections,
     located: Located,
-    options: LocateOptions,
+    options: PlacingOptions,
     clock: Clock,
     pull_rad: float | None,
 ) -> AfterAdjustment:
@@ -92,8 +94,8 @@ def adjust_placed(
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     posed = posed_part(pose_images(model, everyone))
     links = read_links(source, everyone, posed, clock.advance)
-    freedom = replace(located.freedom, pull_rad=pull_rad)
-    adjusted = adjust_placement(posed.images, links, options, freedom, located.given_of(posed, model))
+    freedom, given = replace(located.freedom, pull_rad=pull_rad), located.given_of(posed, model)
+    adjusted = adjust_placement(posed.images, links, options.structure, freedom, given)
     del links
     similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
     centers[posed.rows] = adjusted.images.centers
@@ -102,11 +104,11 @@ def adjust_placed(
         source = source.at(turned_model(model, adjusted.images))
         corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
         is_corrected = np.isin(model.images.frame_of, corrected)
-        directions = _measure_again(source, directions, is_corrected, options, clock)
+        directions = _measure_again(source, directions, is_corrected, options.directions, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
-            measured = find_rigid_parts(source.model, options, has_priors=False).apply(measured)
+            measured = rigid_parts(source.model, located.fixed_images(model)).apply(measured)
         placement = replace(placement, measured=measured)
     return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted, posed)
 
@@ -127,7 +129,7 @@ def _measure_again(
     source: MatchSource,
     before: PairDirections,
     corrected: BoolArray,
-    options: LocateOptions,
+    options: DirectionOptions,
     clock: Clock,
 ) -> PairDirections:
     """Return the usable directions as they are at other rotations; the others, and what is said, stay.
@@ -137,8 +139,7 @@ def _measure_again(
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)
     batches = source.view.batches(without=others, advance=clock.advance)
-    threads = options.num_threads()
-    again = concatenate([estimate_directions(batch, options, threads) for batch in batches])
+    again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()
     is_anew = corrected[again.pairs[rows]].any(axis=1)
     taken = {"directions": rows, **dict.fromkeys(_SAID_OF_MATCHES, rows[is_anew])}

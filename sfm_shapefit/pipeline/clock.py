@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from sfm_shapefit.base.arrays import hand_back_memory
-from sfm_shapefit.solver.options import IterationInfo
+from sfm_shapefit.solver.options import IterationInfo, SolverOptions
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the work done so far and the work in all."""
@@ -22,11 +22,21 @@ class Clock:
     stage: str = ""
     executor: Executor | None = None
     """Shares out pairs and tracks among its workers; None: all is done in this process."""
+    threads: int = field(default_factory=SolverOptions().num_threads)
+    """Of this process."""
 
     @classmethod
-    def of(cls, progress: Progress | None, executor: Executor | None = None) -> "Clock":
+    def of(
+        cls, progress: Progress | None, options: SolverOptions, executor: Executor | None = None
+    ) -> "Clock":
         """Return the clock of a run whose caller may want to hear of its progress."""
-        return cls(executor=executor) if progress is None else cls(progress, executor=executor)
+        clock = cls(executor=executor, threads=options.num_threads())
+        clock.progress = progress or clock.progress
+        return clock
+
+    def anew(self) -> "Clock":
+        """Return a clock of the same run that has measured nothing."""
+        return Clock(self.progress, executor=self.executor, threads=self.threads)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

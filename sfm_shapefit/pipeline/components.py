@@ -12,7 +12,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
@@ -20,6 +19,7 @@ from sfm_shapefit.pipeline.gravity import refine_with_gravity
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.options import AveragingOptions
 from sfm_shapefit.scene.given import Gravity
 
 # What only unsound pairs, or pairs below `min_matches`, tie to the rest.
@@ -32,7 +32,7 @@ _UNTIED = (
 class ComponentAveraging(NamedTuple):
     """How the rotations of components are averaged."""
 
-    options: MapOptions
+    options: AveragingOptions
     clock: Clock
     gravity: Gravity | None
     """Of the frames."""
@@ -101,7 +101,7 @@ class ComponentAveraging(NamedTuple):
                     f"none of {counted(len(used), 'pair')} has {self.options.min_matches} inlier matches; "
                     "lower min_matches"
                 )
-            return average_relative_rotations(num_frames, some.subset(used), self.options.num_threads())
+            return average_relative_rotations(num_frames, some.subset(used), self.clock.threads)
 
         averaged = average(relative)
         if not evidence.any():

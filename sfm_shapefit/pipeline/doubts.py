@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
@@ -56,14 +55,12 @@ _AGREEING_DEG = 3.0
 
 
 def ask_pairs(
-    source: MatchSource, directions: PairDirections, options: LocateOptions, among: IntArray | None = None
-) -> RelativeRotations | None:
-    """Return the relative rotations of the pairs of doubtful cameras; None if nothing is to be doubted.
+    source: MatchSource, directions: PairDirections, threads: int, among: IntArray | None = None
+) -> RelativeRotations:
+    """Return the relative rotations of the pairs of doubtful cameras.
 
     Only pairs `among` some images are asked, by their index; None: all.
     """
-    if options.rotations == "held":
-        return None
     chosen = _doubtful_pairs(directions, source.model.num_images)
     if not chosen.any():
         return concatenate_rotations([])
@@ -77,9 +74,7 @@ def ask_pairs(
         if num_pairs > MANY_PAIRS:
             asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
             likely = _poses_as_given(source.model, directions, np.array(asked, dtype=np.int64))
-        parts.append(
-            estimate_relative_rotations(rays, options.num_threads(), num_pairs=num_pairs, likely=likely)
-        )
+        parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
     return concatenate_rotations(parts)
 
 
@@ -123,15 +118,13 @@ def doubt_cameras(
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
 
 
-def confirm_rotations(source: MatchSource, directions: PairDirections, options: LocateOptions) -> BoolArray:
+def confirm_rotations(source: MatchSource, directions: PairDirections, threads: int) -> BoolArray:
     """Return which images (n,) have a rotation that the matches of their pairs confirm, none being placed.
 
     As `doubt_cameras` judges them, but for the baselines, which are not known yet.
     """
     model = source.model
-    relative = ask_pairs(source, directions, options)
-    if relative is None:
-        return np.ones(model.num_images, dtype=np.bool_)
+    relative = ask_pairs(source, directions, threads)
     pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
     pairs = pairs.subset(_weighed(directions, model.num_images))
     _, labels = np.unique(model.frame_ids, return_inverse=True)
@@ -140,7 +133,7 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, options: 
 
 
 def question_focal_lengths(
-    source: MatchSource, directions: PairDirections, options: LocateOptions
+    source: MatchSource, directions: PairDirections, threads: int
 ) -> tuple[FocalDoubt, ...]:
     """Return the cameras whose matches prefer another focal length; their labels are COLMAP's camera ids.
 
@@ -163,7 +156,7 @@ def question_focal_lengths(
     for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         parts.append(_thin(model, batch, rows, _FOCAL_MATCHES[1]))
-    found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, options.num_threads())
+    found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, threads)
     return tuple(doubt._replace(camera=int(ids[doubt.camera])) for doubt in found)
 
 

@@ -33,7 +33,6 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.facts.model import ExaminedFacts
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
@@ -41,11 +40,13 @@ from sfm_shapefit.files.colmap.points import ModelPictures, points_of
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.solver.options import SolverOptions
 
 _FAR_DEG, _FAR_LEVELS = 1.0, 6.0
 _FEWEST_POINTS = 30
@@ -80,12 +81,12 @@ def examine(
     Raises:
         InputError: if the model or the database cannot be used.
     """
-    options, clock = LocateOptions(), Clock.of(progress)
+    clock = Clock.of(progress, SolverOptions())
     with clock("read"):
         model = read_model(folder)
-        inputs = choose_inputs(folder, database, options.directions)
+        inputs = choose_inputs(folder, database)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, options, clock)
+        found = examine_source(matches, DirectionOptions(), clock)
     poses = poses_of(model, [row.name for row in found.cameras])
     # The input is what is shown; there is nothing to be compared with it.
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
@@ -98,7 +99,7 @@ def examine(
     return replace(drawing, further=further, points=points), found.facts
 
 
-def examine_source(matches: MatchSource, options: LocateOptions, clock: Clock) -> Examined:
+def examine_source(matches: MatchSource, options: DirectionOptions, clock: Clock) -> Examined:
     """Return what can be said of a model whose matches are open.
 
     Args:

@@ -169,7 +169,7 @@ def locate_rigs(folder: Path) -> None:
 
 
 def locate_around_fixed(folder: Path) -> None:
-    """Locate cameras around others that stay, and refine them with priors."""
+    """Locate cameras around others that stay, and by priors that pull."""
     model = _workspace(folder)
     posed = read_model(model)
     names = folder / "fixed.txt"
@@ -177,7 +177,7 @@ def locate_around_fixed(folder: Path) -> None:
     locate(model, fix=str(names))
     rows = [f"{name} {x} {y} {z} 0.1" for name, (x, y, z) in zip(posed.names, posed.centers, strict=True)]
     (folder / "priors.txt").write_text("\n".join(rows))
-    locate(model, priors=folder / "priors.txt", refine_with_priors=True)
+    locate(model, priors=folder / "priors.txt")
 
 
 def map_matches(folder: Path) -> None:

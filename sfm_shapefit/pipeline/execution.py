@@ -1,11 +1,11 @@
 """Pairs measured by other processes or machines, through any `concurrent.futures` executor.
 
 What is measured of pairs, directions or relative rotations, is a function of a batch of their matches. The
-pairs of a database are cut into parts of some hundred thousand matches. A task has the function and a part,
-which names the file and carries the cameras, without which matches are no rays. Its worker opens the file
-read-only for itself, reads its part, and sends back what it measured. Every pair is
-estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
-of one process, to the bit, whichever worker did what, and however often.
+pairs of a database are cut into parts of some hundred thousand matches. A part names the file and carries the
+cameras, without which matches are no rays. A worker gets it with the function, opens the file read-only for
+itself, and sends back what it measured. Every pair is estimated by itself with draws of its own, and the
+parts are put together in their order: the answer is that of one process, to the bit, whichever worker did
+what, and however often.
 
 A worker that dies is the executor's business: a pool of processes breaks, which is reported; dask gives the
 task to another one.
@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context, resource_tracker
 from typing import Any, Generic, TypeVar
 
 from sfm_shapefit.base.errors import MissingExtraError
-from sfm_shapefit.base.executors import WorkerError, answers
-from sfm_shapefit.scene.matches import Advance, MatchBatch, MatchPart, View
+from sfm_shapefit.base.executors import Advance, WorkerError, answers
+from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 Measured = TypeVar("Measured")
 
@@ -43,14 +44,6 @@ class PairWork(Generic[Measured]):
     matches_per_task: int = MATCHES_PER_TASK
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PairTask(Generic[Measured]):
-    """Some pairs, and what to measure of them elsewhere."""
-
-    part: MatchPart
-    work: PairWork[Measured]
-
-
 def measure_with_workers(
     view: View[Any], work: PairWork[Measured], executor: Executor, advance: Advance
 ) -> list[Measured]:
@@ -62,20 +55,19 @@ def measure_with_workers(
         WorkerError: if a worker died and the executor does not replace it.
         InputError: as a worker found the database.
     """
-    tasks = (PairTask(part=part, work=work) for part in view.parts(work.matches_per_task))
     found: list[Measured] = []
     done = 0
-    for task, measured in answers(executor, measure_task, tasks):
+    for part, measured in answers(executor, partial(measure_part, work), view.parts(work.matches_per_task)):
         found += measured
-        done += task.part.num_pairs
+        done += part.num_pairs
         advance(done, view.num_pairs)
     return found
 
 
-def measure_task(task: PairTask[Measured]) -> list[Measured]:
-    """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
-    with task.part.open() as view:
-        return [task.work.estimate(batch) for batch in view.batches(task.work.min_matches)]
+def measure_part(work: PairWork[Measured], part: MatchPart) -> list[Measured]:
+    """Return what is measured of the pairs of a part, a value per batch; what a worker runs."""
+    with part.open() as view:
+        return [work.estimate(batch) for batch in view.batches(work.min_matches)]
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -46,6 +47,7 @@ class FirstPlacement(NamedTuple):
 def adjust_first_placement(
     source: MatchSource,
     rule: GaugeRule,
+    options: PlacingOptions,
     clock: Clock,
     lenses: FreeLenses,
     *,
@@ -55,7 +57,8 @@ def adjust_first_placement(
 
     Args:
         source: at the averaged rotations.
-        rule: what sets the gauge, with the options of the run.
+        rule: what sets the gauge.
+        options: of the run.
         clock: of the run.
         lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
@@ -64,11 +67,11 @@ def adjust_first_placement(
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    model, options = source.model, rule.options
-    measured = measure(source, options, clock, Wanted(tracks=wants_points(source, options)))
+    model, wanted = source.model, Wanted(tracks=wants_points(source, options.nodes))
+    measured = measure(source, options.directions, clock, wanted)
     graph = rule.rigid.apply(build_graph(model, measured))
     del measured  # arrays of all pairs
-    placement = next(place_cameras(graph, options, clock))
+    placement = next(place_cameras(graph, options.placement, options.nodes, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = unit_gauge(placement.locations)
     if placement.unit is not None:  # the offsets of sensors have theirs
@@ -77,8 +80,8 @@ def adjust_first_placement(
     del graph
     posed = posed_part(pose_images(model, located))
     links = partial(read_links, source, located, posed, clock.advance)
-    freedom = Freedom(lenses=lenses, has_sensors=options.rigs == "free")
-    adjusted = adjust_thinly(posed.images, links, options, freedom, thorough=thorough)
+    freedom = Freedom(lenses=lenses, has_sensors=options.freedom.rigs == "free" and model.has_rigs)
+    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, thorough=thorough)
     rotations, centers = model.rotations.copy(), np.full((model.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(model.num_images), posed.rows)

@@ -1,6 +1,7 @@
 """Which scale, origin and axes the output gets: as asked, or by what is known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,13 +10,13 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.facts.options import KnownDistance, LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
+    ScaleKind,
     coincide,
     distance_gauge,
     input_gauge,
@@ -24,51 +25,67 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
+from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.scene.given import PositionPriors
+
+SETS_SCALE: dict[ScaleKind, str] = {
+    "fixed": "the fixed cameras",
+    "rig": "the rigs",
+    "control points": "the control points",
+    "distance": "the known distances",
+    "prior": "the position priors",
+    "input": "the input",
+    "unit": "an arbitrary unit",
+}
+"""What a scale is that of, in words."""
+
+PRIORS_OF_DATABASE = "database"
+"""In place of a table or folder: the database's own pose priors."""
 
 
 def read_priors(
-    model: PosedModel, file: DatabaseFile | None, options: LocateOptions, table: Path | str | None
+    model: PosedModel, file: DatabaseFile | None, asked: Path | str | None
 ) -> PositionPriors | None:
-    """Return the position priors of the model's images, if they are wanted.
+    """Return the position priors of the model's images, if they are asked for.
 
     Raises:
-        InputError: if they are wanted and there are none, or they can have no effect.
+        InputError: if they are asked for and there are none.
     """
-    if options.scale not in ("auto", "prior") and table is not None:
-        raise InputError(f"priors have no effect with the scale {options.scale}; leave out one of the two")
-    if options.control_points and table is not None:
-        raise InputError(
-            "control points and position priors would both set the scale; leave out one of the two"
-        )
-    if options.known_distance and (table is not None or options.refine_with_priors):
-        raise InputError(
-            "known distances and position priors would both set the scale; leave out one of the two"
-        )
-    if table is not None:
-        return exif_priors(Path(table), model) if Path(table).is_dir() else table_priors(Path(table), model)
-    if options.scale != "prior":
-        if options.refine_with_priors:
-            raise InputError("refine_with_priors needs priors; give a table, or the scale prior")
+    if asked is None:
         return None
-    if file is None:
-        raise InputError("the scale prior needs position priors; give a table with --priors, or a database")
-    return database_priors(file, model)
+    if str(asked) == PRIORS_OF_DATABASE:
+        if file is None:
+            raise InputError("there is no database whose priors could be taken; give one with --database")
+        return database_priors(file, model)
+    return exif_priors(Path(asked), model) if Path(asked).is_dir() else table_priors(Path(asked), model)
+
+
+def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str], missing: str) -> None:
+    """Refuse known distances of images that there are not; `missing` says so, but for the name.
+
+    Raises:
+        InputError: with the first such name.
+    """
+    for name in (name for one in known for name in one[:2]):
+        if name not in names:
+            raise InputError(f"known_distance: {missing} {name}")
 
 
 class GaugeRule(NamedTuple):
-    """What sets scale, origin and axes of the output: as asked, or by what is known."""
+    """What sets scale, origin and axes of the output, by precedence."""
 
     model: PosedModel
     rigid: Rigid
-    options: LocateOptions
-    priors: PositionPriors | None
+    scale: Scale
+    """Where nothing else is known."""
+    priors: PositionPriors | None = None
+    distances: Sequence[KnownDistance] = ()
 
     def choose(self, cameras: IntArray, locations: FloatArray, unit: float | None) -> Gauge:
         """Return the gauge of cameras that were found.
 
-        Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
-        given, else the input. A single fixed camera moves only the origin.
+        Rigid groups know the scale; else known distances tell it, else priors, else the input. A single fixed
+        camera moves the origin and keeps the axes, so that priors, which turn them, have no part.
 
         Args:
             cameras: (k,) those in the output, ascending.
@@ -76,26 +93,23 @@ class GaugeRule(NamedTuple):
             unit: length of the unit of rigid groups in the locations' units; None without such groups.
 
         Raises:
-            InputError: if what is asked for is not determined.
+            InputError: if what is known does not determine the scale.
             UnsolvableError: if the only fixed image is not among the cameras.
         """
-        model, rigid, options = self.model, self.rigid, self.options
+        model, rigid = self.model, self.rigid
         centers, fixed = model.centers[cameras], rigid.fixed[cameras]
         has_centers = not coincide(model.centers - model.frame_offsets)
         if not has_centers:
             centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
-        if options.known_distance:
-            for name in (name for one in options.known_distance for name in one[:2]):
-                if name not in model.names:
-                    raise InputError(f"known_distance: the model has no posed image {name}")
+        if self.distances:
             names = [model.names[camera] for camera in cameras.tolist()]
-            gauge = gauge_of_distances(names, locations, options.known_distance)
-        elif self.priors is not None:
+            gauge = gauge_of_distances(names, locations, self.distances)
+        elif self.priors is not None and not rigid.fixed.any():
             gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
         else:
-            gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
+            gauge = unit_gauge(locations) if self.scale == "unit" else input_gauge(locations, centers)
         if not rigid.fixed.any():
             return gauge
         name = model.names[int(np.argmax(rigid.fixed))]
@@ -104,6 +118,36 @@ class GaugeRule(NamedTuple):
                 f"{name} is to stay where it is, but the matches do not tie it to the others"
             )
         return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
+
+    def check(self, chosen: Gauge, cameras: IntArray, centers: FloatArray) -> Iterator[str]:
+        """Yield how far the scale is off what is known and did not set it, a sentence each.
+
+        Args:
+            chosen: the gauge of the output.
+            cameras: (k,) those in the output, ascending.
+            centers: (k, 3) where they are in the output.
+        """
+        names = [self.model.names[camera] for camera in cameras.tolist()]
+        if self.distances and chosen.scale != "distance":
+            found = partial(gauge_of_distances, names, centers, self.distances)
+            yield say_unused("known distances were", chosen, found)
+        if self.priors is not None and chosen.scale != "prior":
+            found = partial(prior_gauge, centers, self.priors.of(cameras))
+            yield say_unused("position priors were", chosen, found)
+
+
+def say_unused(what: str, chosen: Gauge, find: Callable[[], Gauge]) -> str:
+    """Say that something known did not set the scale, and by how much it differs from what did."""
+    unused = f"{what} not used for the scale, which is that of {SETS_SCALE[chosen.scale]}"
+    try:
+        return f"{unused}; {off_by(find().similarity.scale)}"
+    except (InputError, UnsolvableError) as error:
+        return f"{unused}, and do not check it: {error}"
+
+
+def off_by(scale: float) -> str:
+    """Say by how much scales differ whose ratio this is."""
+    return f"they differ by {100.0 * abs(scale - 1.0):.3g} %"
 
 
 def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) -> FloatArray:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.facts.options import GRAVITY_OF_DATABASE, MapOptions
 from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import PosedModel
@@ -22,22 +21,23 @@ from sfm_shapefit.rotations.gravity import (
     turn_upright,
     with_gravity,
 )
+from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import Gravity
 
 _NAMED = 3
 
 
-def read_gravity(file: DatabaseFile, model: PosedModel, options: MapOptions) -> Gravity | None:
+def read_gravity(file: DatabaseFile, model: PosedModel, source: str) -> Gravity | None:
     """Return the gravities of a model's images, if they are wanted.
 
     Raises:
         InputError: as the readers.
     """
-    if not options.gravity:
+    if not source:
         return None
-    if options.gravity == GRAVITY_OF_DATABASE:
+    if source == GRAVITY_OF_DATABASE:
         return database_gravity(file, model)
-    return table_gravity(Path(options.gravity), model)
+    return table_gravity(Path(source), model)
 
 
 def refine_with_gravity(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.options import LocateOptions, Source
+from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.model import PosedModel
@@ -75,7 +75,7 @@ def open_matches(model: PosedModel, inputs: Inputs) -> DatabaseMatches | TrackMa
 
 
 def see_matches(
-    matches: Matches, model: PosedModel, inputs: Inputs, options: LocateOptions | None = None
+    matches: Matches, model: PosedModel, inputs: Inputs, options: PlacingOptions | None = None
 ) -> MatchSource:
     """Return the matches as a model's images see them; without options memory has no limit.
 
@@ -83,20 +83,20 @@ def see_matches(
         InputError: if there is no way to stay below the limit.
     """
     source = MatchSource(matches=matches, view=matches.at(model, inputs.left_out), inputs=inputs)
-    if options is None or not options.max_memory_mb or not source.has_database:
+    if options is None or not options.memory.max_memory_mb or not source.has_database:
         return source
     bare = replace(
         source.workload(),
-        adjusts=options.adjusts_cameras(model.num_images),
-        adjusts_bundle=options.adjust == "full",
+        adjusts=options.placement.refines and options.freedom.adjusts_cameras(model.num_images),
+        adjusts_bundle=options.freedom.adjust == "full",
     )
-    work = replace(bare, has_points=options.uses_points(model.num_images))
-    return source.at(model, choose_economy(work, bare, options.max_memory_mb))
+    work = replace(bare, has_points=options.nodes.uses_points(model.num_images))
+    return source.at(model, choose_economy(work, bare, options.memory.max_memory_mb))
 
 
 @contextmanager
 def open_source(
-    model: PosedModel, inputs: Inputs, options: LocateOptions | None = None
+    model: PosedModel, inputs: Inputs, options: PlacingOptions | None = None
 ) -> Iterator[MatchSource]:
     """Open the matches that were chosen, as `see_matches` sees them, and close them in the end."""
     with closing(open_matches(model, inputs)) as matches:
@@ -117,21 +117,23 @@ def without_structure(
     return replace(model, reconstruction=bare), read_colors(model.reconstruction)
 
 
-def read_left_out(inputs: Inputs, names: Collection[str], options: LocateOptions) -> Inputs:
+def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Inputs:
     """Return the inputs without the pairs that the user wants to be left out.
 
     Raises:
         InputError: if the list cannot be read, names an unknown image, or there is no database.
     """
-    if not options.without:
+    if not without:
         return inputs
     if inputs.database is None:
         raise InputError("pairs can be left out of the matches of a database only; give one with --database")
-    return replace(inputs, left_out=read_pair_list(Path(options.without), names))
+    return replace(inputs, left_out=read_pair_list(Path(without), names))
 
 
 def choose_inputs(
-    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source
+    reconstruction: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None,
+    source: Source = "auto",
 ) -> Inputs:
     """Decide where directions come from, and say how."""
     folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None

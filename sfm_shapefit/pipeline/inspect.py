@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.inspected import Inspection
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import InspectOptions
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.doubts import confirm_rotations
-from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.measure import (
     Wanted,
     add_evidence,
@@ -33,7 +33,7 @@ def inspect(
     source: "pycolmap.Reconstruction | Path | str",
     database: Path | str | None = None,
     *,
-    options: LocateOptions | None = None,
+    options: InspectOptions | None = None,
     progress: Progress | None = None,
     **overrides: Any,
 ) -> Inspection:
@@ -54,7 +54,7 @@ def inspect(
         InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
             is diagnosed; `diagnosis.obstacle` says why.
     """
-    options = merge_options(options, LocateOptions, overrides)
+    options = merge_options(options, InspectOptions, overrides)
     if isinstance(source, Path | str) and Path(source).is_file():
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
@@ -64,26 +64,30 @@ def inspect(
             num_images=graph.num_nodes,
             statuses={DirectionStatus.USABLE.value: graph.num_edges},
             points="no: a bare graph has no matches",
-            diagnosis=diagnose(graph, options),
+            diagnosis=diagnose(graph, options.placement),
         )
-    clock = Clock.of(progress)
+    clock = Clock.of(progress, options.placement.solver)
     with clock("read"):
         model = read_model(source)
-        inputs = choose_inputs(source, database, options.directions)
+        inputs = choose_inputs(source, database, options.source.directions)
+        inputs = read_left_out(inputs, model.names, options.directions.without)
     with open_source(model, inputs) as matches:
         with clock("directions"):
-            measured = measure(matches, options, clock, Wanted(tracks=wants_points(matches, options)))
+            wanted = Wanted(tracks=wants_points(matches, options.nodes))
+            measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
         with clock("diagnosis"):
             with_points = add_evidence(build_graph(model, measured), measured)
             grouped = group_frames(model, with_points)
-            work = describe_work(count_work(matches, directions), grouped, options)
+            work = count_work(matches, directions)
+            work = describe_work(grouped, work, options.placement, options.freedom)
+            confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
                 directions=inputs.statement,
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
-                points=options.points_statement(model.num_images, with_points.num_points),
-                diagnosis=diagnose(with_points, options, confirm_rotations(matches, directions, options)),
+                points=options.nodes.points_statement(model.num_images, with_points.num_points),
+                diagnosis=diagnose(with_points, options.placement, confirmed),
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),
             )

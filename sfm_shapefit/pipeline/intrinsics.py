@@ -2,7 +2,6 @@
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.facts.intrinsics import Intrinsics
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.intrinsics import (
     Origin,
     calibrate_view_graph,
@@ -12,6 +11,7 @@ from sfm_shapefit.files.colmap.intrinsics import (
 )
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.scene.freedom import IntrinsicsFreedom
 from sfm_shapefit.scene.matches import PairNames
 
 # A view graph that wants a focal length further off says more about the graph than about the lens.
@@ -21,7 +21,7 @@ _MOST_OFF = 4.0
 def settle_intrinsics(
     model: PosedModel,
     file: DatabaseFile | None,
-    options: LocateOptions,
+    wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
 ) -> tuple[PosedModel, Intrinsics]:
     """Return the model to start from, and which intrinsics the adjustments may change.
@@ -29,13 +29,12 @@ def settle_intrinsics(
     Args:
         model: as given, of which nothing changes.
         file: the database, if there is one, which says which intrinsics are guesses.
-        options: `intrinsics`.
+        wanted: intrinsics that may change.
         left_out: pairs that say nothing of focal lengths.
 
     Raises:
         InputError: if the database cannot be read.
     """
-    wanted = options.intrinsics
     guessed = {} if file is None else find_uncalibrated(file, model)
     cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}

@@ -10,7 +10,7 @@ The verdict is no better than that of any of the models.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
@@ -18,10 +18,10 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
 from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
-from sfm_shapefit.facts.options import KnownDistance
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
 from sfm_shapefit.facts.scene import told_distances
@@ -33,6 +33,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import choose_inputs, see_matches
 from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import Matches, PairNames
 
@@ -89,17 +90,17 @@ def tell_group(
     gauge, rescale = _choose_scale(group, located.gauge, known)
     group = _rescaled(group, rescale)
     model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
-    inputs = choose_inputs(group.reconstruction, database, located.options.directions)
+    inputs = choose_inputs(group.reconstruction, database)
     inputs = replace(inputs, left_out=told.left_out)
     own = Clock(clock.progress)
-    found = examine_source(see_matches(matches, model, inputs), located.options, own)
+    found = examine_source(see_matches(matches, model, inputs), located.options.directions, own)
     weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
     cameras = list(_camera_rows(found.cameras, group, models))
     seen, measures = found.facts, (float(np.median(model.focal_lengths_px)), UNITS[gauge.scale])
     first = next(iter(group.world_from))
     facts = JoinedFacts(
         inputs=inputs.facts,
-        options=asdict(located.options) | {"known_distance": tuple(known)},
+        options=flat_values(located.options) | {"known_distance": tuple(known)},
         verdict=_judge(weak, seen.verdict.reasons, group, models),
         models=[str(number) for number in group.world_from],
         joins=[join.facts(f"joined_{first}") for join in group.joins],

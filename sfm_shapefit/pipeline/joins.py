@@ -241,7 +241,7 @@ class _Evidence:
 
     def _tie(self, between: "_Between", first: int, second: int) -> Ties:
         """Return the matches between two models with centers and points in the worlds of these."""
-        options = self.models[first].located.options
+        options = self.models[first].located.options.structure
         points = []
         for k, number in enumerate((first, second)):
             structure, ids = self.models[number].located.reconstruction, between.points[:, k]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -16,7 +17,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.pipeline.gauge_choice import read_priors
+from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
 from sfm_shapefit.pipeline.inputs import (
     choose_inputs,
     open_matches,
@@ -57,9 +58,8 @@ def locate(
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
-        priors: a table of position priors, see `files.colmap.priors`, or the folder of the images, whose
-            EXIF data have them; the database's own pose priors
-            serve if the scale is "prior" and there is no table.
+        priors: a table of position priors, see `files.colmap.priors`, the folder of the images, whose EXIF
+            data have them, or "database" for its own pose priors.
         executor: shares out pairs and tracks among its workers, which must see the file of the database, with
             the same answer to the bit; it is not shut down. None: all is done here.
 
@@ -76,23 +76,29 @@ def locate(
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, LocateOptions, overrides)
-    clock = Clock.of(progress, executor)
+    clock = Clock.of(progress, options.placement.solver, executor)
     with ExitStack() as stack:
         with clock("read"):
             model = read_model(reconstruction)
-            inputs = choose_inputs(reconstruction, database, options.directions)
-            inputs = read_left_out(inputs, model.names, options)
+            inputs = choose_inputs(reconstruction, database, options.source.directions)
+            inputs = read_left_out(inputs, model.names, options.directions.without)
+            refuse_unknown_names(options.gauge.known_distance, model.names, "the model has no posed image")
+            if options.freedom.rigs == "free" and not model.has_rigs:
+                raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
             matches = stack.enter_context(closing(open_matches(model, inputs)))
-            model, intrinsics = settle_intrinsics(model, matches.file, options, inputs.left_out)
-            known = read_priors(model, matches.file, options, priors)
-            control = read_control(model, options)
-            rigid = find_rigid_parts(model, options, has_priors=known is not None)
+            wanted = options.freedom.intrinsics
+            model, intrinsics = settle_intrinsics(model, matches.file, wanted, inputs.left_out)
+            known = read_priors(model, matches.file, priors)
+            control = read_control(model, options.gauge.control_points)
+            rigid = find_rigid_parts(model, options.placement, options.fix)
             model, colors = without_structure(model, matches)
             source = see_matches(matches, model, inputs, options)
         told = Told(
             inputs,
             rigid,
-            pull_of_rotations(options),
+            pull_of_rotations(options.rotations),
+            scale=options.gauge.scale,
+            distances=options.gauge.known_distance,
             priors=known,
             control=control,
             intrinsics=intrinsics,

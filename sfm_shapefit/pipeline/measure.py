@@ -9,12 +9,12 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.pairs.estimate import estimate_directions
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
@@ -22,6 +22,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
+from sfm_shapefit.tracks.options import NodeOptions
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
 # Beyond so many pairs standard deviations take the pairs as independent.
@@ -59,7 +60,7 @@ DIRECTIONS = Wanted()
 
 
 def measure(
-    source: MatchSource, options: LocateOptions, clock: Clock, wanted: Wanted = DIRECTIONS
+    source: MatchSource, options: DirectionOptions, clock: Clock, wanted: Wanted = DIRECTIONS
 ) -> Measured:
     """Measure the direction of every pair that the source has, and what is wanted beside, in one pass.
 
@@ -69,7 +70,7 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    threads, beside = options.num_threads(), _Beside(source, options, wanted)
+    beside = _Beside(source, options.inlier_threshold_px, wanted)
     if clock.executor is not None and source.has_database:
         work = PairWork(estimate=partial(estimate_directions, options=options))
         parts = measure_with_workers(source.view, work, clock.executor, clock.advance)
@@ -82,7 +83,7 @@ def measure(
     else:
         parts = []
         for batch in source.view.batches(advance=clock.advance):
-            parts.append(estimate_directions(batch, options, threads))
+            parts.append(estimate_directions(batch, options, clock.threads))
             beside.add(batch, parts[-1])
     if not parts:
         raise UnsolvableError(
@@ -94,8 +95,8 @@ def measure(
 class _Beside:
     """What is made of each batch beside its directions."""
 
-    def __init__(self, source: MatchSource, options: LocateOptions, wanted: Wanted) -> None:
-        view, threshold_px = source.view, options.inlier_threshold_px
+    def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
+        view = source.view
         self._threshold_px, self._num_usable = threshold_px, 0
         self.errors: list[FloatArray] | None = [] if wanted.errors else None
         self._joiner = None
@@ -144,7 +145,7 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def wants_points(source: MatchSource, options: LocateOptions) -> bool:
+def wants_points(source: MatchSource, options: NodeOptions) -> bool:
     """Return whether 3D points join the view graph."""
     return options.uses_points(source.model.num_images) and source.economy.points
 

@@ -9,20 +9,21 @@ The limit is looked at twice before anything is solved: with the counts of the d
 known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.inspected import Forecast
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS, PLENTY, Reading
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method
@@ -73,7 +74,7 @@ class Workload:
     adjusts_bundle: bool = False
     """Whether the seed goes through bundle adjustment, which cannot be given up."""
     needs_factor: bool = False
-    """Whether the factor cannot be given up, since the solve itself, or priors that pull, work with it."""
+    """Whether the factor cannot be given up, since the solve itself works with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +93,12 @@ class Economy:
     """Whether placed cameras may be adjusted by their matches."""
     factor: bool = True
     """Whether there is a factor for the refinement and the standard deviations."""
+
+    def limit(self, options: PlacementOptions) -> PlacementOptions:
+        """Return how to place: as asked, or, if the factor is given up, unrefined and without one."""
+        if self.factor:
+            return options
+        return replace(options, solver=replace(options.solver, factor_memory_mb=NO_FACTOR), refine=False)
 
 
 def _list_economies() -> Iterator[Economy]:
@@ -141,37 +148,39 @@ def choose_economy(
 
 
 def keep_within_memory(
-    work: Workload, measured: MeasuredGraph, options: LocateOptions, least: Economy
-) -> tuple[Economy, MeasuredGraph, LocateOptions]:
-    """Return what is given up, `least` or more, to stay below `options.max_memory_mb`, if that is not 0.
+    measured: MeasuredGraph, describe: Callable[[MeasuredGraph], Workload], limit_mb: int, least: Economy
+) -> tuple[Economy, MeasuredGraph]:
+    """Return what is given up, `least` or more, to stay below a limit that is not 0, and the graph then.
 
-    The graph and the options come back as they are then; the work is what there is to do but for the graph.
+    Args:
+        measured: graph to be placed.
+        describe: returns what there is to do with a graph.
+        limit_mb: peak memory in MB to stay below.
+        least: what is given up already.
 
     Raises:
         InputError: with the number needed, if there is no way.
     """
-    if not options.max_memory_mb:
-        return least, measured, options
+    if not limit_mb:
+        return least, measured
     bare = measured.without_points()
-    economy = choose_economy(
-        describe_work(work, measured, options),
-        describe_work(work, bare, options),
-        options.max_memory_mb,
-        least,
-    )
-    if not economy.factor:
-        options = replace(options, factor_memory_mb=NO_FACTOR, refine=False)
-    return economy, measured if economy.points else bare, options
+    economy = choose_economy(describe(measured), describe(bare), limit_mb, least)
+    return economy, measured if economy.points else bare
 
 
-def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOptions) -> Workload:
-    """Return what there is to do once the graph is known: its factor is planned, nothing is solved."""
+def describe_work(
+    measured: MeasuredGraph, work: Workload, placement: PlacementOptions, freedom: FreedomOptions
+) -> Workload:
+    """Return what there is to do once the graph is known: its factor is planned, nothing is solved.
+
+    `work` is what there is to do but for the graph.
+    """
     graph, entries = measured.graph, 0
-    needs_factor = measured.groups is not None or options.refine_with_priors
+    needs_factor = measured.groups is not None
     if graph.num_edges:
         plan = _plan_factor(measured)
-        needs_factor = needs_factor or choose_method(graph, options).method == "newton"
-        max_bytes = np.inf if needs_factor else options.factor_memory_mb * 1_000_000
+        needs_factor = needs_factor or choose_method(graph, placement.solver).method == "newton"
+        max_bytes = np.inf if needs_factor else placement.solver.factor_bytes
         if plan is not None and plan.num_bytes(graph.dimension, np.float64) <= max_bytes:
             entries = plan.num_bytes(1, np.uint8)
     return replace(
@@ -180,8 +189,8 @@ def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOption
         num_nodes=graph.num_nodes,
         num_sampled=graph.num_edges if work.num_sampled else 0,
         has_points=measured.num_points > 0,
-        adjusts=options.adjusts_cameras(work.num_images),
-        adjusts_bundle=options.adjust == "full",
+        adjusts=placement.refines and freedom.adjusts_cameras(work.num_images),
+        adjusts_bundle=freedom.adjust == "full",
         factor_entries=entries,
         needs_factor=needs_factor,
     )

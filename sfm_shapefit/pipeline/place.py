@@ -91,7 +91,7 @@ def place_graph_file(
         UnsolvableError: if the directions determine nothing.
     """
     options = merge_options(options, PlacementOptions, overrides)
-    clock = Clock.of(progress)
+    clock = Clock.of(progress, options.solver)
     cam_from_world, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -99,8 +99,9 @@ def place_graph_file(
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
         with clock("rotations"):
-            threads = options.num_threads()
-            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg, threads)
+            graph, cam_from_world, statement = _orient(
+                geometries, rotations, max_rotation_error_deg, clock.threads
+            )
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:

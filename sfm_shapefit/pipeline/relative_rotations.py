@@ -1,6 +1,5 @@
 """`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, fields
@@ -8,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple, get_args
 
+from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import PosedModel, read_model
@@ -18,7 +18,8 @@ from sfm_shapefit.pairs.essential import (
     estimate_relative_rotations,
     stored_relative_rotations,
 )
-from sfm_shapefit.pairs.relative_rotations import LEAST_MATCHES, RelativeRotations
+from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.scene.matches import View
@@ -42,7 +43,7 @@ class Sharing(NamedTuple):
     threads: int = 1
     executor: Executor | None = None
     """Its workers do the work instead of threads."""
-    advance: Callable[[int, int], None] = lambda _done, _total: None
+    advance: Advance = nobody
     """Called with the pairs that are done and their number."""
 
 
@@ -78,16 +79,15 @@ def relative_rotations(
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options = SolverOptions(threads=threads)
     if source not in get_args(RelativeSource):
         raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
-    clock = Clock.of(progress)
+    clock = Clock.of(progress, SolverOptions(threads=threads), executor)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         model = read_model(read_images(file).reconstruction)
         view = DatabaseMatches(file, model.names).at(model)
-        sharing = Sharing(options.num_threads(), executor, clock.advance)
+        sharing = Sharing(clock.threads, executor, clock.advance)
         if source == "stored":
             found = stored_relative_rotations(view, min_matches)
         else:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.facts.options import FIX_SOLVED, LocateOptions
+from sfm_shapefit.facts.options import FIX_SOLVED
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
@@ -25,8 +25,10 @@ from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.placement.tied_groups import is_scaled
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
+from sfm_shapefit.tracks.options import NodeOptions
 
 # Extent of the fixed centers, of their distance from the origin, that counts as none.
 _COINCIDENT = 1e-9
@@ -50,37 +52,28 @@ class Rigid(NamedTuple):
         return replace(measured, groups=groups, fixed_group=self.fixed_group)
 
 
-def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
-    """Return what moves together and what not at all; priors, if there are any, set scale and axes.
+def find_rigid_parts(model: PosedModel, options: PlacementOptions, fix: str = "") -> Rigid:
+    """Return what moves together and what not at all: the frames of rigs, and images that are to be fixed.
 
     Raises:
-        InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
-            asked for than rigs or fixed images have.
+        InputError: if a name to be fixed is unknown, the fixed images stand at one place, or the options are
+            none that rigid groups go with.
     """
-    fixed = _read_fixed_images(model, options.fix)
+    rigid = rigid_parts(model, _read_fixed_images(model, fix))
+    if rigid.groups is not None:
+        refuse_admm(options.solver)
+    return rigid
+
+
+def rigid_parts(model: PosedModel, fixed: BoolArray) -> Rigid:
+    """Return what moves together in a model, of which some images (n,) are fixed.
+
+    Raises:
+        InputError: if these stand at one place.
+    """
     count = int(np.sum(fixed))
-    if options.scale == "rig" and not model.has_rigs:
-        raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
-    if options.rigs == "free" and not model.has_rigs:
-        raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
-    if count and has_priors:
-        raise InputError(
-            "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"
-        )
     if not model.has_rigs and count < 2:
         return Rigid(fixed, None, None)
-    if (
-        options.scale not in ("auto", "input", "rig")
-        or options.known_distance
-        or has_priors
-        or options.control_points
-    ):
-        source = "rigs" if model.has_rigs else "fixed cameras"
-        raise InputError(
-            f"the scale is that of the {source}; leave out other scales, known distances, priors and control "
-            "points"
-        )
-    refuse_admm(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
@@ -113,7 +106,11 @@ def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
 
 
 def place_cameras(
-    measured: MeasuredGraph, options: LocateOptions, clock: Clock, near: Near | None = None
+    measured: MeasuredGraph,
+    options: PlacementOptions,
+    nodes: NodeOptions,
+    clock: Clock,
+    near: Near | None = None,
 ) -> Iterator[Placement]:
     """Place the rigid pieces of a graph; with rigid groups, 3D points take part only where they are needed.
 
@@ -122,7 +119,7 @@ def place_cameras(
     """
     hand_back_memory()  # of what the graph was made of
     placed = partial(place_pieces, options=options, near=near, on_iteration=clock.iteration)
-    if measured.groups is None or not measured.num_points or options.points == "always":
+    if measured.groups is None or not measured.num_points or nodes.points == "always":
         yield from placed(measured)
         return
     first = second = None
@@ -143,7 +140,7 @@ def place_cameras(
     yield found
 
 
-def _count_held(placement: Placement, options: LocateOptions) -> int:
+def _count_held(placement: Placement, options: PlacementOptions) -> int:
     """Return how many of the placed cameras do not hang loose."""
     loose = sum(len(group.cameras) for group in judge(placement, options).assessment.loose_groups)
     return len(placement.cameras) - loose

@@ -1,7 +1,6 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,8 +12,9 @@ from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
+from sfm_shapefit.base.executors import Advance
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.own_tracks import TrackRules, triangulate_own_tracks
 from sfm_shapefit.files.colmap.point_colors import PointColors, color_points
@@ -68,6 +68,10 @@ class Located(NamedTuple):
         """The images that are in the output, ascending."""
         return self.placement.cameras[self.kept]
 
+    def fixed_images(self, model: PosedModel) -> BoolArray:
+        """Return which images of the model (n,) keep their poses."""
+        return np.zeros(model.num_images, np.bool_) if self.fixed is None else self.fixed
+
     def given_of(self, posed: "PosedPart", model: PosedModel) -> GivenPoses:
         """Return what is known of the frames of some posed images of the model."""
         return self.given._replace(fixed=self.fixed_frames(model)).of(posed.frames)
@@ -110,7 +114,7 @@ def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
 def build_seeded_model(
     source: MatchSource,
     located: Located,
-    options: LocateOptions,
+    options: PlacingOptions,
     clock: Clock,
     colors: PointColors | None = None,
 ) -> Seeded:
@@ -124,16 +128,16 @@ def build_seeded_model(
     images, points, adjusted = _make_points(source, located, options, clock)
     hand_back_memory()  # of the links, before their matches are read again
     fixed = located.fixed_frames(model)
-    seen = images_of_few_points(points, images, options.min_points_per_image, fixed)
+    seen = images_of_few_points(points, images, options.structure.min_points_per_image, fixed)
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:
-        limit_px = options.max_reprojection_error_px
+        limit_px = options.structure.max_reprojection_error_px
         counts = count_observations(
             points, images, view.num_keypoints, view.batches(), model.rotations, limit_px
         )
         unsupported = images_without_support(counts, images, fixed)
-        if options.min_trust > 0.0:
+        if options.trust.min_trust > 0.0:
             seen = np.where(unsupported, points.count_seen(len(seen)), seen)
             images, points = _leave_out(unsupported, images, points)
         shares = counts.shares(images.is_posed)
@@ -152,7 +156,7 @@ def build_seeded_model(
 
 
 def _make_points(
-    source: MatchSource, located: Located, options: LocateOptions, clock: Clock
+    source: MatchSource, located: Located, options: PlacingOptions, clock: Clock
 ) -> tuple[Images, Points, Estimate | None]:
     """Return the images of the model with points, filtered, and how bundle adjustment went, if asked for."""
     model, adjusted, links, advance = source.model, None, None, clock.advance
@@ -160,28 +164,27 @@ def _make_points(
     posed = posed_part(images)
     own = not source.has_database
     with clock("structure"):
-        if not own or options.adjust == "full":
+        if not own or options.freedom.adjust == "full":
             links = read_links(source, located, posed, advance)
-    with clock("bundle adjustment" if options.adjust == "full" else "triangulation"):
-        if options.adjust == "full":  # which triangulates at the poses of the start itself
+    with clock("bundle adjustment" if options.freedom.adjust == "full" else "triangulation"):
+        if options.freedom.adjust == "full":  # which triangulates at the poses of the start itself
             assert links is not None
             freedom, given = located.freedom.of(posed.frames), located.given_of(posed, model)
-            adjusted, points = bundle_adjust(posed.images, links, options, freedom, given)
+            adjusted, points = bundle_adjust(posed.images, links, options.structure, freedom, given)
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         elif own:
+            limits = options.structure
             rules = TrackRules(
-                options.max_reprojection_error_px,
-                options.min_triangulation_angle_deg,
-                options.min_track_length,
+                limits.max_reprojection_error_px, limits.min_triangulation_angle_deg, limits.min_track_length
             )
             points = triangulate_own_tracks(
                 model.reconstruction, posed.images, rules, advance, clock.executor
             )
         else:
             assert isinstance(links, MatchedKeypoints)
-            points = triangulate(posed.images, links, options, advance, clock.executor)
+            points = triangulate(posed.images, links, options.structure, advance, clock.executor)
         del links
-        points = filter_points(points, posed.images, pictures_of(source, posed), options)
+        points = filter_points(points, posed.images, pictures_of(source, posed), options.structure)
     if adjusted is not None:
         assert points.errors_px is not None
         adjusted = replace(adjusted, final_error_px=float(points.errors_px.mean()))
@@ -201,7 +204,7 @@ def _set_gauge(
     The axes of the input are those in which the rotations agree best with the input's. What fixed cameras
     hold of the gauge is held already.
     """
-    fixed = np.zeros(model.num_images, np.bool_) if located.fixed is None else located.fixed
+    fixed = located.fixed_images(model)
     unit = None if located.placement.unit is None else 1.0
     if fixed.any() and unit is not None:
         return adjusted, located.gauge
@@ -265,20 +268,18 @@ def pictures_of(source: MatchSource, posed: PosedPart) -> ModelPictures:
     return ModelPictures(source.model.reconstruction, posed.images, keypoints)
 
 
-def read_links(
-    source: MatchSource, located: Located, posed: PosedPart, advance: Callable[[int, int], None]
-) -> Links:
+def read_links(source: MatchSource, located: Located, posed: PosedPart, advance: Advance) -> Links:
     """Return what joins the keypoints of placed images; all rays are forgotten.
 
     From here to the end of a triangulation, or an adjustment, most memory is needed.
     """
     model, placement, view = source.model, located.placement, source.view
     pictures = pictures_of(source, posed)
-    if not source.has_database:
-        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     links = view.links(without=placement.rejected_pairs, among=among, advance=advance, consume=True)
+    if not source.has_database:  # the model has its tracks already
+        return collect_tracks(posed.images, pictures, points_of(model.reconstruction, posed.images))
     place = np.full(model.num_images, -1)
     place[posed.rows] = np.arange(len(posed.rows))
     return collect_matches(posed.images, pictures, place, links, view.num_matches)

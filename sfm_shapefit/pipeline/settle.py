@@ -15,16 +15,18 @@ told of positions says how large it is, and where.
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.facts.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import (
@@ -50,7 +52,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.control_points import bring_to_control_points
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, GaugeRule
 from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import (
@@ -61,12 +63,15 @@ from sfm_shapefit.pipeline.measure import (
     measure,
     wants_points,
 )
-from sfm_shapefit.pipeline.memory import keep_within_memory
+from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
 from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
-from sfm_shapefit.placement.gauge import Gauge, tell_scale
+from sfm_shapefit.placement.gauge import tell_scale
+from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.placement.prior_pairs import compare_with_priors
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
 
 if TYPE_CHECKING:
@@ -83,6 +88,9 @@ class Told(NamedTuple):
     rigid: Rigid
     pull_rad: float | None
     """How an adjustment treats the rotations, see `Freedom`; None: as the matches say."""
+    scale: Scale = "unit"
+    """Where nothing that is known sets it."""
+    distances: tuple[KnownDistance, ...] = ()
     priors: PositionPriors | None = None
     control: ControlPoints | None = None
     gravity: Gravity | None = None
@@ -99,7 +107,18 @@ class Told(NamedTuple):
     def of_further_piece(self) -> "Told":
         """Return what is told of a further rigid piece: nothing of positions."""
         free = self.rigid._replace(fixed=np.zeros_like(self.rigid.fixed), groups=None, fixed_group=None)
-        return self._replace(rigid=free, priors=None, control=None, gravity=None, near=None)
+        return self._replace(
+            rigid=free, scale="unit", distances=(), priors=None, control=None, gravity=None, near=None
+        )
+
+    def frees_rigs(self, asked: RigFreedom) -> bool:
+        """Return whether the adjustments change where sensors stand in their rigs, if there are any."""
+        return asked == "free" and self.rigid.groups is not None
+
+    @property
+    def believes_rotations(self) -> bool:
+        """Whether the given rotations are not to be doubted."""
+        return self.pull_rad == 0.0
 
 
 class Stand(NamedTuple):
@@ -118,7 +137,7 @@ class Stand(NamedTuple):
     """How this placement was adjusted; None if it was not."""
 
 
-def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock) -> LocateResult:
+def settle(opened: MatchSource, told: Told, options: PlacingOptions, clock: Clock) -> LocateResult:
     """Place the cameras of an open source, and make the seeded models of its rigid pieces, the largest first.
 
     Args:
@@ -128,38 +147,26 @@ def settle(opened: MatchSource, told: Told, options: LocateOptions, clock: Clock
         clock: of the run.
     """
     with clock("directions"):
-        wanted = Wanted(tracks=wants_points(opened, options), errors=opened.economy.samples)
-        measured = measure(opened, options, clock, wanted)
+        wanted = Wanted(tracks=wants_points(opened, options.nodes), errors=opened.economy.samples)
+        measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions
     with clock("solve"):
         graph = told.rigid.apply(build_graph(opened.model, measured))
         work = count_work(opened, directions)
-        economy, graph, options = keep_within_memory(work, graph, options, opened.economy)
+        describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
+        economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
         source = opened.at(opened.model, economy)
         graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
         near = None if told.near is None else told.near.stand
-        pieces = list(place_cameras(graph, options, clock, near))
+        pieces = list(place_cameras(graph, economy.limit(options.placement), options.nodes, clock, near))
         del graph
     models = []
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
         piece = pieces.pop(0)
-        own = (told, options) if piece.piece == 0 else (told.of_further_piece(), of_further_piece(options))
-        models.append(finish_piece(source, directions, piece, *own, clock))
+        own = told if piece.piece == 0 else told.of_further_piece()
+        models.append(finish_piece(source, directions, piece, own, options, clock))
     return replace(models[0], further=tuple(models[1:]))
-
-
-def of_further_piece(options: LocateOptions) -> LocateOptions:
-    """Return the options of a further rigid piece, which has a unit of its own."""
-    return replace(
-        options,
-        scale="unit",
-        known_distance=(),
-        control_points="",
-        fix="",
-        refine_with_priors=False,
-        rigs="held",
-    )
 
 
 def finish_piece(
@@ -167,7 +174,7 @@ def finish_piece(
     directions: PairDirections,
     placement: Placement,
     told: Told,
-    options: LocateOptions,
+    options: PlacingOptions,
     clock: Clock,
 ) -> LocateResult:
     """Take one rigid piece from its placement to its model.
@@ -187,12 +194,17 @@ def finish_piece(
         # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
         asked = stand if told.intrinsics.free.doubts else started
         is_main = placement.piece == 0  # the lenses of a further piece are asked with those of all
-        focal_doubts = question_focal_lengths(asked.source, asked.directions, options) if is_main else ()
-        judged = _judge(stand, given, options)
-        located = _choose(stand.located, judged, options.min_trust)
+        focal_doubts = (
+            question_focal_lengths(asked.source, asked.directions, clock.threads) if is_main else ()
+        )
+        judged = _judge(stand, told, options, given, clock)
+        located = _choose(stand.located, judged, options.trust.min_trust)
     del started, placement  # with their samples of errors
     seeded = build_seeded_model(stand.source, located, options, clock, told.colors)
-    seeded, control_points, of_control = bring_to_control_points(seeded, given, told.control, options)
+    moves = located.placement.unit is None and not told.rigid.fixed.any()
+    seeded, control_points, of_control = bring_to_control_points(
+        seeded, given, told.control, options.structure, moves=moves
+    )
     seeded, of_gravity = turn_model_upright(seeded, given, told.gravity)
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
@@ -202,12 +214,20 @@ def finish_piece(
     sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
     for done in (stand.adjustment, seeded.adjusted):
         sensors |= {} if done is None else done.sensors
-    if options.rigs == "free" and not sensors:
+    if stand.located.freedom.has_sensors and not sensors:
         raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     model, directions = stand.source.model, stand.directions
-    prior_angles = _ask_priors(model, directions, told.priors, gauge, seeded.reconstruction)
+    centers = _centers_of(model, seeded.reconstruction)
+    there = np.flatnonzero(np.isfinite(centers[:, 0]))
+    unused = () if located.rule is None else located.rule.check(gauge, there, centers[there])
+    not_unit = options.gauge.scale == "unit" and gauge.scale != "unit"
+    prior_angles = None
+    if told.priors is not None and gauge.scale == "prior" and gauge.axes is not None:
+        prior_angles = compare_with_priors(
+            directions.pairs, directions.directions, told.priors, gauge, centers
+        )
     return LocateResult(
         reconstruction=seeded.reconstruction,
         inputs=told.inputs,
@@ -231,11 +251,14 @@ def finish_piece(
             *_collect_warnings(stand.source, directions, judged, located),
             *_structure_warnings(stand.source, seeded.reconstruction.num_points3D()),
             *prior_warnings(prior_angles, directions.pairs, model.names),
+            *unused,
+            *([f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"] if not_unit else []),
             *of_control,
             *of_gravity,
-            *support_warnings(_names_of(model, seeded.unsupported), is_kept=options.min_trust == 0.0),
+            *support_warnings(_names_of(model, seeded.unsupported), is_kept=options.trust.min_trust == 0.0),
         ),
         fixed=told.rigid.fixed,
+        distances=told.distances,
         prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
@@ -247,20 +270,19 @@ def finish_piece(
 
 
 def _start(
-    source: MatchSource, directions: PairDirections, placement: Placement, told: Told, options: LocateOptions
+    source: MatchSource, directions: PairDirections, placement: Placement, told: Told, options: PlacingOptions
 ) -> Stand:
     """Return where the cameras of a piece stand before they are adjusted, in the frame that is worked in.
 
     That frame is the gauge of all placed cameras, or that of priors that pull, which then stays.
     """
     model = source.model
-    rule = GaugeRule(model, told.rigid, options, told.priors)
+    rule = GaugeRule(model, told.rigid, told.scale, told.priors, told.distances)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
-    freedom = Freedom(lenses=told.intrinsics.free, has_sensors=options.rigs == "free")
+    freedom = Freedom(lenses=told.intrinsics.free, has_sensors=told.frees_rigs(options.freedom.rigs))
     located = Located(placement, everyone, gauge, told.rigid.fixed, rule, freedom=freedom)
-    if told.priors is not None and options.refine_with_priors:
-        located = pull_cameras(model, located, told.priors, options)
+    located = _pull(model, located, told, source.economy.limit(options.placement))
     stand = Stand(source, directions, located, told.intrinsics)
     if told.near is None:
         return stand
@@ -269,12 +291,28 @@ def _start(
     return stand._replace(estimate=told.near.adjusted, scale=scale)
 
 
-def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> Stand:
+def _pull(model: PosedModel, located: Located, told: Told, options: PlacementOptions) -> Located:
+    """Return the cameras pulled by the priors that have set the gauge, each by its standard deviation.
+
+    Priors without one do not pull, nor do those whose axes are not known.
+    """
+    if told.priors is None or told.control is not None or located.gauge.scale != "prior":
+        return located
+    priors = told.priors.with_sigmas()
+    if not len(priors.of(located.placement.cameras)) or located.gauge.axes is None:
+        return located
+    with suppress(UnsolvableError):  # too large a factor
+        return pull_cameras(model, located, priors, options)
+    return located
+
+
+def _adjust(stand: Stand, told: Told, options: PlacingOptions, clock: Clock) -> Stand:
     """Adjust the placed cameras, if that is wanted and was not done before."""
     located = stand.located
     num_cameras, is_pulled = len(located.placement.cameras), located.given.centers is not None
     is_small = located.placement.piece > 0 and num_cameras < _SMALLEST_ADJUSTED
-    adjusts = stand.source.economy.adjustment and options.adjusts_cameras(num_cameras)
+    adjusts = options.placement.refines and options.freedom.adjusts_cameras(num_cameras)
+    adjusts = adjusts and stand.source.economy.adjustment
     if is_small or (told.near is not None and not is_pulled) or not adjusts:
         return stand
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
@@ -295,12 +333,13 @@ def _adjust(stand: Stand, told: Told, options: LocateOptions, clock: Clock) -> S
     return stand
 
 
-def _judge(stand: Stand, given: PosedModel, options: LocateOptions) -> Judged:
+def _judge(stand: Stand, told: Told, options: PlacingOptions, given: PosedModel, clock: Clock) -> Judged:
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
-    placement = stand.located.placement
-    among = placement.cameras if placement.piece else None
-    relative = ask_pairs(stand.source, stand.directions, options, among)
-    judged = judge(placement, options)
+    placement, relative = stand.located.placement, None
+    if not told.believes_rotations:
+        among = placement.cameras if placement.piece else None
+        relative = ask_pairs(stand.source, stand.directions, clock.threads, among)
+    judged = judge(placement, stand.source.economy.limit(options.placement))
     if stand.estimate is not None:
         judged = with_uncertainty(judged, given, stand.estimate, stand.scale)
     return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
@@ -324,21 +363,13 @@ def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:
     return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(image_ids))).tolist()]
 
 
-def _ask_priors(
-    model: PosedModel,
-    directions: PairDirections,
-    priors: PositionPriors | None,
-    gauge: Gauge,
-    output: "pycolmap.Reconstruction",
-) -> PriorAngles | None:
-    """Return how far directions are off the baselines of priors that set the axes, if any do."""
-    if priors is None or gauge.scale != "prior" or gauge.axes is None:
-        return None
+def _centers_of(model: PosedModel, output: "pycolmap.Reconstruction") -> FloatArray:
+    """Return where the images of a model (n, 3) are in the output, NaN where they are not."""
     centers = np.full((model.num_images, 3), np.nan)
     for image, image_id in enumerate(model.image_ids.tolist()):
         if output.image(image_id).has_pose:
             centers[image] = output.image(image_id).projection_center()
-    return compare_with_priors(directions.pairs, directions.directions, priors, gauge, centers)
+    return centers
 
 
 def _collect_warnings(

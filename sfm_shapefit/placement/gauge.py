@@ -23,12 +23,13 @@ from sfm_shapefit.base.geometry import (
     median_spread,
     rotation_angles_deg,
 )
-from sfm_shapefit.refinement.options import Scale
 from sfm_shapefit.scene.given import Datum, PositionPriors
 
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
 _COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
+ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
+"""What can set a scale, by precedence."""
 FEWEST_PRIORS = 2  # positions; with fewer there is no scale
 _PRIORS_FOR_AXES = 3  # positions; two leave the turn about their line open
 _FLAT = 5.0  # residuals; a smaller spread across a line leaves the turn about the line open
@@ -46,8 +47,8 @@ class Gauge:
 
     similarity: Similarity
     """Scale and shift in the input's axes; its rotation is the identity."""
-    scale: Scale | Literal["fixed", "control points"]
-    """The choice that was carried out."""
+    scale: ScaleKind
+    """What set the scale."""
     statement: str
     """What scale, origin and axes the output has, for the report."""
     axes: FloatArray | None = None

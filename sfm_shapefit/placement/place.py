@@ -224,7 +224,7 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
 def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiece]:
     """Return the pieces, most cameras first; or the one of tied rigid groups."""
     if measured.groups is not None:
-        refuse_admm(options)
+        refuse_admm(options.solver)
         return [find_tied_piece(measured)]
     pieces = order_pieces(measured.graph, measured.num_cameras)
     refuse_without_triangle(measured.graph, pieces, measured.num_cameras)
@@ -243,9 +243,9 @@ def _solve_part(
 
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
-        solved = solve_groups(part.graph, part.groups, options, watched)
+        solved = solve_groups(part.graph, part.groups, options.solver, watched)
     else:
-        solved = solve(part.graph, options, on_iteration=watched)
+        solved = solve(part.graph, options.solver, on_iteration=watched)
     return solved, tuple(history)
 
 

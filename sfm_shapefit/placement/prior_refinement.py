@@ -51,9 +51,7 @@ def pull_to_priors(
     anchors = _anchor(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
     levels = np.radians(np.array(refined.levels_deg))
     metric = Metric(part.covariance, part.classes)
-    moved = refine_anchored(
-        part.graph, start, metric, levels, anchors, max_bytes=options.factor_memory_mb * 1_000_000
-    )
+    moved = refine_anchored(part.graph, start, metric, levels, anchors, max_bytes=options.solver.factor_bytes)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
     kept = replace(

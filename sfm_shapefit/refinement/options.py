@@ -3,16 +3,15 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from sfm_shapefit.base.settings import explained, option
+from sfm_shapefit.base.settings import Composed, explained, group, option
 from sfm_shapefit.solver.options import SolverOptions
 
-Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 Objective = Literal["auto", "shapefit", "lud"]
 
 
 @explained
-@dataclass(frozen=True, kw_only=True)
-class PlacementOptions(SolverOptions):
+@dataclass(frozen=True, kw_only=True, init=False)
+class PlacementOptions(Composed):
     """What follows the certified solve."""
 
     objective: Objective = option(
@@ -24,6 +23,7 @@ class PlacementOptions(SolverOptions):
     refine: bool = option(
         True, 'Refine the start robustly in the angles of the directions; only for "auto" and "lud".'
     )
+    solver: SolverOptions = group(SolverOptions)
 
     @property
     def refines(self) -> bool:

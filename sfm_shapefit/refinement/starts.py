@@ -145,7 +145,7 @@ def refine_starts(
         options: which starts, and whether to refine.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    lud, second = _find_second_start(measured, options.num_threads())
+    lud, second = _find_second_start(measured, options.solver.num_threads())
     problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
@@ -186,7 +186,7 @@ def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
 ) -> SymbolicFactor | LaplacianFactor | None:
     """Return what the refinement solves its steps with; None if its factor would be too large."""
-    graph, groups, max_bytes = measured.graph, measured.groups, options.factor_memory_mb * 1_000_000
+    graph, groups, max_bytes = measured.graph, measured.groups, options.solver.factor_bytes
     if groups is None:
         return plan_refinement(graph, max_bytes)
     try:

@@ -14,7 +14,6 @@ import html
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,9 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
+from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.model import ModelFacts
-from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.report.charts import (
     MOST_CELLS,
@@ -441,7 +441,7 @@ def _piece(k: int, piece: Piece) -> dict[str, Any]:
 
 def _options(options: dict[str, Any]) -> dict[str, list[list[str]]]:
     """Return names and values, those that differ from the defaults apart."""
-    defaults = asdict(LocateOptions())
+    defaults = flat_values(MapOptions() if "join" in options else LocateOptions())
     rows: dict[bool, list[list[str]]] = {True: [], False: []}
     for name, value in options.items():
         is_default = name in defaults and _option(defaults[name]) == _option(value)

@@ -33,6 +33,11 @@ class PositionPriors:
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
         return replace(self, known=self.known.among(cameras))
 
+    def with_sigmas(self) -> "PositionPriors":
+        """Return those whose standard deviation is known."""
+        has_sigma: BoolArray = np.asarray(np.isfinite(self.known.information).all(axis=(1, 2)))
+        return replace(self, known=self.known.subset(has_sigma))
+
     def __len__(self) -> int:
         """Return how many cameras have one."""
         return len(self.known.indices)

@@ -10,20 +10,21 @@ matters of a keypoint is the unit ray of its pixel in world axes. So there are t
 import itertools
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, hand_back_memory
+from sfm_shapefit.base.executors import Advance, nobody
 
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
 
-Advance = Callable[[int, int], None]
-"""Is told of the work that is done, and of all work."""
+KeypointNumbers = IntArray | UInt32Array
 
 KEPT_MATCHES = 1_000_000
 """So many are kept with their rays, in 80 MB."""
@@ -31,10 +32,6 @@ KEPT_MATCHES = 1_000_000
 MOST_BESIDE_TRACKS = 16_000_000
 """Of a database with more, none is kept while points are made of them: to read 30 million again takes a
 twentieth of the time of a run, and to keep them an eighth of its memory."""
-
-
-def nobody(_done: int, _total: int) -> None:
-    """Be told, and tell no one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,22 +93,6 @@ class MatchBatch(RayMatches):
 
     keypoints: IntArray
     """(M, 2) index of the keypoint in image i and in image j."""
-
-    def without(self, pairs: IntArray) -> "MatchBatch":
-        """Return all pairs but some (m, 2), whatever the order of their images."""
-        kept = ~is_among(self.pairs, pairs)
-        if kept.all():
-            return self
-        counts = np.diff(self.offsets)
-        rows = np.repeat(kept, counts)
-        return MatchBatch(
-            pairs=self.pairs[kept],
-            offsets=np.append(0, np.cumsum(counts[kept])),
-            keypoints=self.keypoints[rows],
-            rays_i=self.rays_i[rows],
-            rays_j=self.rays_j[rows],
-            pixel_angles=self.pixel_angles[kept],
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -182,6 +163,9 @@ class Matches(ABC):
     total_keypoints: int
     """Number of keypoints of all images of the file."""
 
+    def __init__(self) -> None:
+        self._views: WeakSet[View[Any]] = WeakSet()
+
     def at(
         self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
     ) -> "View[Seeing]":
@@ -190,11 +174,15 @@ class Matches(ABC):
         Args:
             images: some of these, by name, and maybe others.
             left_out: pairs that are taken for unmatched.
-            reading: how much memory may be taken; where nothing is kept, what earlier views read goes.
+            reading: how much memory may be taken; where nothing is kept, what earlier views keep goes, too.
         """
         if not reading.keeps:
             self.forget()
-        return View(self, images, left_out, reading)
+            for earlier in self._views:
+                earlier.forget()
+        view = View(self, images, left_out, reading)
+        self._views.add(view)
+        return view
 
     @abstractmethod
     def keypoints(self, name: str) -> FloatArray:
@@ -204,9 +192,13 @@ class Matches(ABC):
             InputError: if they are damaged, or a coordinate is not finite.
         """
 
-    def matched(self, name: str) -> IntArray | slice:  # noqa: ARG002
-        """Return the keypoints of an image to which matches may refer, ascending."""
-        return slice(None)
+    def matched(self, name: str) -> FloatArray:
+        """Return the pixels (m, 2) of those keypoints of an image to which matches may refer."""
+        return self.keypoints(name)
+
+    def places(self, name: str, keypoints: KeypointNumbers) -> KeypointNumbers:  # noqa: ARG002
+        """Return the places (k,) of keypoints (k,) of an image among those to which matches may refer."""
+        return keypoints
 
     @abstractmethod
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
@@ -282,15 +274,11 @@ class View(Generic[Seeing]):
         Raises:
             InputError: as `Matches.read`.
         """
-        if self.reading.keeps and self.num_matches <= KEPT_MATCHES:
-            if min_matches not in self._kept:
-                self._kept[min_matches] = list(self._batches(self._choose(min_matches), min_matches))
-            found = iter(self._kept[min_matches])
-            if without is not None:
-                some = (batch.without(without) for batch in found)
-                found = (batch for batch in some if len(batch.pairs))
-        else:
-            found = self._batches(self._choose(min_matches, without), min_matches)
+        if min_matches in self._kept and without is None:
+            return self._tell(iter(self._kept[min_matches]), advance)
+        found = self._batches(self._choose(min_matches, without), min_matches)
+        if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
+            found = iter(self._kept.setdefault(min_matches, list(found)))
         return self._tell(found, advance)
 
     def links(
@@ -369,7 +357,7 @@ class View(Generic[Seeing]):
             bounds = itertools.pairwise(found.offsets.tolist())
             for pair, (first, last) in zip(found.pairs.tolist(), bounds, strict=True):
                 for side, image in enumerate(pair):
-                    own = found.keypoints[first:last, side]
+                    own = self.matches.places(self.images.names[image], found.keypoints[first:last, side])
                     self._rays_of(image).take(own, axis=0, out=rays[side, first:last])
             yield MatchBatch(
                 pairs=found.pairs,
@@ -390,6 +378,7 @@ class View(Generic[Seeing]):
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
         """Return the matches of some of the chosen pairs."""
         pairs = self.pairs[chosen]
+        names = self.images.names
         all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
         if not all_see:
@@ -399,7 +388,8 @@ class View(Generic[Seeing]):
                 for side, image in enumerate(images):
                     blind = self._blind_of(image)
                     if blind is not None:
-                        has_ray[first:last] &= ~blind[keypoints[first:last, side]]
+                        own = self.matches.places(names[image], keypoints[first:last, side])
+                        has_ray[first:last] &= ~blind[own]
             keypoints = keypoints[has_ray]
             counts = np.bincount(np.repeat(np.arange(len(pairs)), counts)[has_ray], minlength=len(pairs))
         kept = counts >= min_matches
@@ -412,32 +402,35 @@ class View(Generic[Seeing]):
         )
 
     def _rays_of(self, image: int) -> FloatArray:
-        """Return the rays (k, 3) of all keypoints of an image, from memory if they were needed lately.
+        """Return the rays (m, 3) of an image's keypoints that may be matched, from memory if there lately.
 
-        NaN where a pixel has none, or no match refers to it.
+        NaN where a pixel has none.
         """
         if image in self._rays:
             self._rays.move_to_end(image)
             return self._rays[image]
-        xy, matched = self.keypoints(image), self.matches.matched(self.images.names[image])
-        rays, own = np.full((len(xy), 3), np.nan), self.images.world_rays(image, xy[matched])
-        rays[matched] = own
-        self._blind[image] = np.isnan(rays[:, 0]) if np.isnan(own[:, 0]).any() else None
+        rays = self.images.world_rays(image, self.matches.matched(self.images.names[image]))
         self._rays[image] = rays
         self._rays_bytes += rays.nbytes
         while self._rays_bytes > self.reading.rays_bytes:
             self._rays_bytes -= self._rays.popitem(last=False)[1].nbytes
         return rays
 
+    def forget(self) -> None:
+        """Give back the memory of all that is kept with rays; it is made again where it is needed."""
+        self._kept.clear()
+        self._forget_rays()
+
     def _forget_rays(self) -> None:
-        """Give back the memory of the rays that are kept; they are computed again where they are needed."""
+        """Give back the memory of the rays of keypoints."""
         self._rays.clear()
         self._rays_bytes = 0
 
     def _blind_of(self, image: int) -> BoolArray | None:
-        """Return which keypoints of an image have no ray, (k,); None if no match can refer to one."""
+        """Return which of the same keypoints have no ray, (m,); None if all have one."""
         if image not in self._blind:
-            self._rays_of(image)
+            blind = np.isnan(self._rays_of(image)[:, 0])
+            self._blind[image] = blind if blind.any() else None
         return self._blind[image]
 
 

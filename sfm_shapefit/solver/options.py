@@ -113,6 +113,11 @@ class SolverOptions(Settings):
         self.check_range("factor_memory_mb", NO_FACTOR)
         self.check_range("threads", 0, MAX_THREADS)
 
+    @property
+    def factor_bytes(self) -> int:
+        """What one sparse factor may take."""
+        return self.factor_memory_mb * 1_000_000
+
     def num_threads(self) -> int:
         """Return the number of threads to use."""
         return self.threads or min(os.cpu_count() or 1, MAX_THREADS)

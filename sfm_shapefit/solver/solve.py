@@ -130,7 +130,7 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     asked = options.solver != "auto"
     if options.solver == "conic":
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit), "asked for")
-    resources = Resources(options.num_threads(), options.factor_memory_mb * 1_000_000)
+    resources = Resources(options.num_threads(), options.factor_bytes)
     if options.solver == "admm":
         return Choice("admm", partial(_split, resources, None), "asked for")
     predict = cache(partial(predict_factor, graph))

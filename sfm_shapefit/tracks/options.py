@@ -1,8 +1,42 @@
-"""What a 3D point must satisfy. Pure data, and cheap to import."""
+"""Which 3D points join the view graph, and what those of the output must satisfy. Pure data, cheap."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
+
+Points = Literal["auto", "never", "always"]
+
+# With more cameras, the points would multiply the time of the solve.
+_MAX_CAMERAS_WITH_POINTS = 5_000
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class NodeOptions(Settings):
+    """3D points in the view graph."""
+
+    points: Points = option(
+        "auto",
+        "3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what "
+        'directions between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 '
+        "cameras.",
+    )
+
+    def uses_points(self, num_cameras: int) -> bool:
+        """Return whether 3D points join the view graph of so many cameras."""
+        return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
+
+    def points_statement(self, num_cameras: int, num_points: int) -> str:
+        """Say whether 3D points join the view graph of so many cameras, and why."""
+        if self.points == "never":
+            return "no, as asked"
+        if self.points == "always":
+            return f"{num_points} tracks join as nodes, as asked"
+        limit = f"{_MAX_CAMERAS_WITH_POINTS:,}"
+        if not self.uses_points(num_cameras):
+            return f"no: more than {limit} cameras, where they would multiply the time of the solve"
+        return f"{num_points} tracks join as nodes: at most {limit} cameras, so they cost little"
 
 
 @explained
@@ -20,7 +54,7 @@ class StructureOptions(Settings):
     min_points_per_image: int = option(
         0,
         "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
-        "keeps all.",
+        "keeps all. Even a wrong pose finds a few points.",
     )
     ignore_two_view_tracks: bool = option(
         True,

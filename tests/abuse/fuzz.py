@@ -111,7 +111,7 @@ def warm(base):
         (*seen,),
         (*old, "--adjust", "full"),
         (*seen, "--rotations", "free"),
-        (*seen, "--priors", base / "priors.txt", "--refine-with-priors"),
+        (*seen, "--priors", base / "priors.txt"),
         (*seen, "--fix", base / "fix.txt"),
         ("solve", base / "graph.txt", out),
         *(("map", base / "database.db", out, "--threads", 1, *stages) for stages in STAGES_OF_MAP),
@@ -235,10 +235,9 @@ def _table(base, folder, rng):
     name = pick(rng, sorted(_TABLES))
     _copy(base, folder, "sparse/0", "database.db", name)
     way = mutations.damage_text(folder / name, rng)
-    refine = ("--refine-with-priors",) if name == "priors.txt" and rng.random() < 0.5 else ()
     threads = () if name == "options.toml" else ("--threads", "1")
     command = ("locate", "sparse/0", "out", "--database", "database.db", _TABLES[name], name)
-    return Case(f"table: {name} {way}", (*command, *refine, *threads))
+    return Case(f"table: {name} {way}", (*command, *threads))
 
 
 def _foreign(base, folder, rng):

@@ -3,33 +3,55 @@
 import csv
 import dataclasses
 import inspect
+import re
 from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.base.settings import _fits, merge_options, setting_groups
-from sfm_shapefit.facts.options import LocateOptions, MapOptions
+from sfm_shapefit.base.settings import (
+    Composed,
+    Settings,
+    _fits,
+    flat_values,
+    group,
+    homes_of,
+    merge_options,
+    option,
+    setting_groups,
+)
+from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
 from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.facts.tables import CameraRow, columns_of
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.refinement.options import PlacementOptions, Scale
+from sfm_shapefit.placement.gauge import ScaleKind
+from sfm_shapefit.placement.options import GaugeOptions
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.rotations.options import AveragingOptions
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
-from sfm_shapefit.tracks.options import StructureOptions
-from tests.scenes import RING
+from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+from tests.scenes import BUNDLED, RING
 
 NAN = float("nan")
-ALL = (SolverOptions, PlacementOptions, DirectionOptions, StructureOptions, LocateOptions, MapOptions)
+ROOTLESS = {"fix", "rotations", "join"}
+"""Options of the compositions themselves."""
+COMPOSED = (PlacementOptions, InspectOptions, LocateOptions, MapOptions)
+GROUPS = (
+    *(SolverOptions, DirectionOptions, StructureOptions, NodeOptions, FreedomOptions, GaugeOptions),
+    *(AveragingOptions, SourceOptions),
+)
+ALL = (*GROUPS, *COMPOSED)
 
 
 @pytest.mark.parametrize("settings", ALL)
 def test_every_option_has_a_sentence_that_help_shows(settings):
     shown = " ".join(settings.__doc__.split())
-    for item in dataclasses.fields(settings):
-        assert item.metadata["help"].endswith(".")
-        assert f"{item.name} = {item.default!r} {item.metadata['help']}" in shown
+    for item in (item for one in setting_groups(settings) for item in one.options):
+        assert item.help.endswith(".")
+        assert f"{item.name} = {item.default!r} {item.help}" in shown
     assert "LocateOptions" in inspect.getdoc(sfm_shapefit.locate)
 
 
@@ -41,12 +63,51 @@ def test_every_default_is_what_its_option_takes(settings):
     assert not wrong
 
 
-def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
-    names = [item.name for group in setting_groups(MapOptions) for item in group.fields]
-    assert sorted(names) == sorted(item.name for item in dataclasses.fields(MapOptions))
-    again = {"adjust", "min_points_per_image"}  # for rotations that were averaged
-    own = [name for one in ALL for name in inspect.get_annotations(one)]
-    assert {name for name in own if own.count(name) > 1} == again
+@pytest.mark.parametrize("settings", COMPOSED)
+def test_each_option_belongs_to_one_group_and_has_one_name(settings):
+    names = [item.name for one in setting_groups(settings) for item in one.options]
+    assert len(names) == len(set(names))
+    assert set(names) == set(homes_of(settings)) == set(flat_values(settings()))
+
+
+def test_two_groups_with_an_option_of_one_name_are_a_programming_error():
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Other(Settings):
+        tol: float = option(0.1, "Another.")
+
+    @dataclasses.dataclass(frozen=True, kw_only=True, init=False)
+    class Both(Composed):
+        solver: SolverOptions = group(SolverOptions)
+        other: Other = group(Other)
+
+    with pytest.raises(TypeError, match="Both has several options named tol"):
+        Both()
+
+
+def test_groups_and_single_options_go_together_however_deep_they_are():
+    flat = LocateOptions(min_inliers=20, directions="tracks", tol=1e-6, min_trust=0.1)
+    grouped = LocateOptions(
+        directions=DirectionOptions(min_inliers=20),
+        source=SourceOptions(directions="tracks"),
+        placement={"tol": 1e-6},
+        trust={"min_trust": 0.1},
+    )
+    assert flat == grouped
+    assert hash(flat) == hash(grouped)
+    assert (flat.directions.min_inliers, flat.placement.solver.tol) == (20, 1e-6)
+    assert dataclasses.replace(flat, refine=False, min_trust=0.2).placement.solver.tol == 1e-6
+    assert (
+        LocateOptions(directions=DirectionOptions(min_inliers=20), min_inliers=30).directions.min_inliers
+        == 30
+    )
+    assert LocateOptions().structure.min_points_per_image == 0
+    assert MapOptions(min_track_length=3).structure == StructureOptions(
+        min_track_length=3, min_points_per_image=30
+    )
+    with pytest.raises(TypeError, match=r"'placement' is no option of MapOptions; give PlacementOptions"):
+        MapOptions(placement=3)
+    with pytest.raises(TypeError, match="'min_inlier' is no option of DirectionOptions; did you mean"):
+        MapOptions(directions={"min_inlier": 3})
 
 
 OUT_OF_RANGE = {
@@ -56,7 +117,7 @@ OUT_OF_RANGE = {
         *(("max_reprojection_error_px", 0.0), ("max_reprojection_error_px", NAN)),
         *(("min_triangulation_angle_deg", 90.0), ("min_track_length", 1)),
     ],
-    LocateOptions: [("min_inlier_ratio", 3.0), ("tol", 2.0), ("threads", -1)],
+    LocateOptions: [("min_inlier_ratio", 3.0), ("tol", 2.0), ("threads", -1), ("max_memory_mb", -1)],
     SceneOptions: [
         *(("shape", "torus"), ("num_images", 1), ("pixel_noise_px", NAN), ("focal_length_px", 0.0)),
         *(("wrong_match_fraction", 1.5), ("corrupted_pair_fraction", -0.1)),
@@ -80,21 +141,17 @@ REFUSED = [
     (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
     (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-    (LocateOptions, {"rotations": "free", "adjust": "none"}, "matters only to an adjustment"),
-    (LocateOptions, {"rotations": 0.1, "adjust": "none"}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": "free", "adjust": "none"}, "rotations=free needs an adjustment"),
+    (LocateOptions, {"rotations": 0.1, "adjust": "none"}, "rotations=0.1 needs an adjustment"),
+    (LocateOptions, {"intrinsics": "focal", "adjust": "none"}, "intrinsics=focal needs an adjustment"),
+    (MapOptions, {"rigs": "free", "adjust": "none"}, "rigs=free needs an adjustment"),
     (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),
     (LocateOptions, {"rotations": "exact"}, "rotations must be one of auto, held, free or of type float"),
-    (MapOptions, {"rotations": "held"}, "map finds the rotations itself"),
-    (MapOptions, {"fix": "names.txt"}, "a database has no positions that cameras could stay at"),
-    (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
-    (LocateOptions, {"scale": "distance"}, "needs known_distance"),
-    (LocateOptions, {"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),
     (LocateOptions, {"known_distance": ("a", "b", -1.0)}, "must be positive"),
     (LocateOptions, {"known_distance": ("a", "a", 1.0)}, "two different images"),
     (LocateOptions, {"known_distance": ("a", "b")}, "two image names and a number"),
     (LocateOptions, {"known_distance": 3.0}, "known_distance must be of type tuple"),
     (MapOptions, {"min_matches": 5}, "min_matches must be at least 15"),
-    (MapOptions, {"directions": "tracks"}, "a database has no tracks"),
     (WorkspaceOptions, {"model": "rotations", "database": False}, "model = 'rotations' needs database"),
 ]
 
@@ -106,13 +163,16 @@ def test_a_wrong_value_is_refused_by_name(settings, wrong, message):
 
 
 def test_integers_serve_as_floats_and_numpy_numbers_as_their_kind():
-    assert LocateOptions(tol=np.float64(1e-6), min_inliers=np.int64(20), min_trust=1).min_inliers == 20
+    assert (
+        LocateOptions(tol=np.float64(1e-6), min_inliers=np.int64(20), min_trust=1).directions.min_inliers
+        == 20
+    )
 
 
 def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
     given = LocateOptions(min_trust=0.2, points="never")
     merged = merge_options(given, LocateOptions, {"min_trust": 0.0})
-    assert (merged.min_trust, merged.points) == (0.0, "never")
+    assert (merged.trust.min_trust, merged.nodes.points) == (0.0, "never")
     assert merge_options(None, LocateOptions, {}) == LocateOptions()
     with pytest.raises(
         TypeError, match=r"options must be LocateOptions\(\.\.\.\), got a dict; or give single"
@@ -133,6 +193,20 @@ def test_completion_shows_public_names_only_and_after_two_arguments_all_are_give
             kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
             by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
             assert by_position <= {"certify": 3, "average_rotations": 3}.get(name, 2), name
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        (MapOptions, "rotations"),
+        (MapOptions, "fix"),
+        (InspectOptions, "min_trust"),
+        (LocateOptions, "gravity"),
+    ],
+)
+def test_a_command_knows_the_options_of_its_own_groups_only(settings, name):
+    with pytest.raises(TypeError, match=f"'{name}' is no option of {settings.__name__}"):
+        merge_options(None, settings, {name: "free"})
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +248,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
 
 
 def test_every_scale_has_its_unit():
-    assert set(UNITS) == {*get_args(Scale), "fixed", "control points"} - {"auto"}
+    assert set(UNITS) == {*get_args(ScaleKind)}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):
@@ -197,3 +271,13 @@ def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_
     assert np.isnan(
         [unplaced["x"][0], unplaced["trust"][0], unplaced["piece"][0], unplaced["sigma_y"][0]]
     ).all()
+
+
+def test_the_documentation_lists_every_option_in_its_group():
+    text = (BUNDLED.parent / "docs" / "options.md").read_text(encoding="utf-8")
+    listed = {}
+    for group_name, names in re.findall(r"^\| `([\w.]+)` \| (.*) \|$", text, flags=re.MULTILINE):
+        listed |= dict.fromkeys(re.findall(r"`(\w+)`", names), group_name.split(".")[0])
+    for settings in (LocateOptions, MapOptions):
+        homes = {name: home for name, home in homes_of(settings).items() if name not in ROOTLESS}
+        assert {name: listed.get(name) for name in homes} == homes

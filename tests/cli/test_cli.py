@@ -1,6 +1,5 @@
 """The commands as users type them: results, exit codes, one sentence per error, nothing left over."""
 
-import dataclasses
 import json
 import re
 import shutil
@@ -16,6 +15,7 @@ from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit.base import atomic_folder as output
+from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.graph_text import graph_text
@@ -97,7 +97,7 @@ def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
     run("locate", RING_MODEL, code=2)
     run("locate", RING_MODEL, tmp_path / "out", "--output_path", tmp_path / "o", code=2)
     run("locate", RING_MODEL, tmp_path / "out", "--scale", "metric", code=2)
-    run("locate", RING_MODEL, tmp_path / "out", "--min-inlier-ratio", "7", code=2)
+    run("locate", RING_MODEL, tmp_path / "out", "--min-trust", "7", code=2)
     run("frobnicate", code=2)
     assert list(tmp_path.iterdir()) == []
 
@@ -148,25 +148,30 @@ def test_the_program_ends_without_a_last_search_for_garbage():
     assert run_python("-c", script).stdout.endswith("\nTrue\n")
 
 
-def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
-    flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
+def test_earlier_names_of_options_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
+    config = tmp_path / "options.toml"
+    config.write_text('method = "conic"\nfactor_memory = 500\n')
+    flags = ("--config", config, "--json", "--no-report")
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
     options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
+    said = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--method=conic", code=2).stderr
+    assert "--method=conic is a key" not in said
+    assert "--method is a key of --config now: solver = ..." in " ".join(said.split())
     text = run("place", "--help-all").stdout
     assert "--method" not in text
-    assert "--factor-memory " not in text
     assert run("solve", "--help-all").stdout == text.replace(" place ", " solve ", 1)
 
 
-def test_help_lists_every_option_as_a_flag_with_its_sentence_in_the_groups_of_the_stages():
+def test_help_lists_flags_with_their_sentences_in_the_groups_of_the_stages():
     text = run("locate", "--help-all").stdout
     titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert titles[:2] == ["Arguments:", "Options:"]
     assert titles[-1] == "What is written and shown:"
-    assert len(titles) == 8
-    for field in dataclasses.fields(LocateOptions):
-        assert f"--{field.name.replace('_', '-')}" in text
+    for one in setting_groups(LocateOptions):
+        flags = [item for item in one.options if f"\n  --{item.name.replace('_', '-')} " in text]
+        assert (f"{one.title}:" in titles) == bool(flags)
+        assert all(item.help[:20] in " ".join(text.split()) for item in flags)
     assert not re.search(r"\[default:\s*(None)?\]", text)
 
 
@@ -177,6 +182,7 @@ def test_help_fits_a_screen_and_help_all_has_the_rest(name):
         set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", text, flags=re.MULTILINE)) for text in (first, every)
     ]
     assert len(listed[0]) <= 16
+    assert len(listed[1]) <= 28
     assert listed[0] - {"--help-all"} <= listed[1]
     assert ("--help-all" in listed[0]) == (len(listed[1]) > len(listed[0]))
 
@@ -189,33 +195,41 @@ def plain(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("flags", "changed"),
+    ("keys", "changed"),
     [
         (
-            "--min-inlier-ratio 0.95 --adjust full --scale unit",
+            "min_inlier_ratio=0.95 adjust='full' scale='unit'",
             "num_pairs_rejected bundle_adjustment scale",
         ),
-        ("--inlier-threshold-px 0.3", "num_pairs_rejected"),
-        ("--max-reprojection-error-px 0.3", "num_points"),
-        ("--min-triangulation-angle-deg 40", "num_points"),
-        ("--solver conic", "solve"),
-        ("--tol 1e-3", "solve"),
-        ("--directions tracks", "inputs"),
-        ("--rotations 0.05", "adjustment"),
+        ("directions={inlier_threshold_px=0.3}", "num_pairs_rejected"),
+        ("max_reprojection_error_px=0.3", "num_points"),
+        ("structure={min_triangulation_angle_deg=40}", "num_points"),
+        ("solver='conic'", "solve"),
+        ("placement={tol=1e-3}", "solve"),
+        ("directions='tracks'", "inputs"),
+        ("rotations=0.05", "adjustment"),
     ],
 )
-def test_each_flag_matters(tmp_path, plain, flags, changed):
-    arguments = ("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", *flags.split())
-    facts = json.loads(run(*arguments).stdout)
+def test_each_key_matters_by_its_name_and_in_the_table_of_its_group(tmp_path, plain, keys, changed):
+    (tmp_path / "options.toml").write_text("\n".join(keys.split()))
+    flags = ("--json", "--no-report", "--config", tmp_path / "options.toml")
+    facts = json.loads(run("locate", COURTYARD / "truth", tmp_path / "out", *flags).stdout)
     assert all(facts[key] != plain[key] for key in changed.split())
 
 
-def test_a_flag_that_leaves_no_direction_is_refused(tmp_path):
-    few = ("--min-inliers", "1000000")
+def test_a_key_that_leaves_no_direction_is_refused(tmp_path):
+    (tmp_path / "options.toml").write_text("min_inliers = 1000000")
+    few = ("--config", tmp_path / "options.toml")
     assert "none of the" in run_refused("locate", COURTYARD / "truth", tmp_path / "out", *few, code=4)
 
 
-@pytest.mark.parametrize("text", ["scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'", "refine_with_priors = true"),
+        *("[directions]\nmin_inlier = 3", "[gauge]\nscale = 'prior'", "rotations = 'free'\nadjust = 'none'"),
+    ],
+)
 def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
     run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)
@@ -223,10 +237,12 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
 
 
 def test_a_config_file_sets_options_and_flags_win(tmp_path):
-    (tmp_path / "options.toml").write_text('scale = "unit"\nmin_inliers = 20\n')
-    flags = ("--json", "--config", tmp_path / "options.toml", "--min-inliers", "16")
+    text = 'scale = "unit"\n[directions]\nmin_inliers = 20\n[trust]\nmin_trust = 0.1\n'
+    (tmp_path / "options.toml").write_text(text)
+    flags = ("--json", "--config", tmp_path / "options.toml", "--min-trust", "0.2")
     facts = json.loads(run("locate", FACADE_MODEL, tmp_path / "a", *flags).stdout)
-    assert (facts["options"]["scale"], facts["options"]["min_inliers"]) == ("unit", 16)
+    values = [facts["options"][name] for name in ("scale", "min_inliers", "min_trust")]
+    assert values == ["unit", 20, 0.2]
     assert facts["scale"].startswith("unit")
 
 
@@ -410,7 +426,8 @@ def test_a_scale_from_meaningless_centers_and_a_model_without_points_are_warned_
         rotation = frame.rig_from_world.rotation
         frame.rig_from_world = pycolmap.Rigid3d(rotation, 100.0 * rng.standard_normal(3))
     model.write(tmp_path)
-    flags = ("--database", RING / "database.db", "--min-triangulation-angle-deg", "89", "--json")
+    (tmp_path / "options.toml").write_text("min_triangulation_angle_deg = 89")
+    flags = ("--database", RING / "database.db", "--config", tmp_path / "options.toml", "--json")
     facts = json.loads(run("locate", tmp_path, tmp_path / "out", *flags).stdout)
     assert facts["num_points"] == 0
     assert any("of their spread off" in warning for warning in facts["warnings"])

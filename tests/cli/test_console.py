@@ -60,9 +60,9 @@ def test_locate_counts_pairs_and_images():
     assert_counted_up(stages["triangulation"], num_tracks)
 
 
-def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations():
+def test_tracks_of_a_model_are_counted_by_pairs_and_the_solve_by_iterations():
     stages = stages_of(lambda progress: locate(FACADE / "sparse/0", directions="tracks", progress=progress))
-    assert_counted_up(stages["directions"], 9)
+    assert_counted_up(stages["directions"], 36)  # pairs of 9 images
     iterations = stages["solve"][1:-1]
     assert [done for done, _ in iterations] == list(range(1, len(iterations) + 1))
     assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`

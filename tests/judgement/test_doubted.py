@@ -138,8 +138,6 @@ def test_measured_rotations_are_not_doubted():
     found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="held")
     assert found.placement.assessment.doubts is None
     assert "rotation" not in "".join(row.reason for row in found.cameras)
-    with pytest.raises(ValueError, match="map finds the rotations itself"):
-        sfm_shapefit.MapOptions(rotations="held")
 
 
 @pytest.mark.slow

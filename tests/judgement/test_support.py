@@ -31,7 +31,7 @@ def judge(images, points):
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs, options) as source:
         view = source.view
-        limit_px = options.max_reprojection_error_px
+        limit_px = options.structure.max_reprojection_error_px
         counts = count_observations(
             points, images, view.num_keypoints, view.batches(), model.rotations, limit_px
         )

@@ -147,7 +147,7 @@ def test_the_five_turned_cameras_of_lego_are_recognized_and_kept_by_a_floor_of_z
     found = sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db", min_trust=0.0)
     assert found.kept.all()
     assert any(row.reason for row in found.cameras if row.placed)
-    floor = sfm_shapefit.LocateOptions().min_trust
+    floor = sfm_shapefit.TrustOptions().min_trust
     lost = {row.name for row in found.cameras if not row.placed or row.trust < floor}
     assert len(lost & WRONG_OF_LEGO) >= 4
     assert len(lost - WRONG_OF_LEGO) <= 6

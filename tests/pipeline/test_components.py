@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging
+from sfm_shapefit.rotations.options import AveragingOptions
 
 
 def averaged(pairs, weight_shares, **options):
@@ -21,7 +21,7 @@ def averaged(pairs, weight_shares, **options):
         weight_shares=np.array(weight_shares),
     )
     reasons: dict[int, str] = {}
-    components = ComponentAveraging(MapOptions(**options), Clock(), gravity=None, shares={})
+    components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None, shares={})
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
     return [frames.tolist() for frames, _ in found], reasons
 

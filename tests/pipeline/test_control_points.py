@@ -7,7 +7,6 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.colmap.control_points import read_control_points
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.control_points import read_control
@@ -167,7 +166,7 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
 def test_a_file_that_cannot_serve_is_refused(ring, tmp_path, projection, lines, said):
     path = written(tmp_path, lines, projection)
     with pytest.raises(InputError, match=path.replace(".", r"\.")) as refused:
-        read_control(read_model(ring), LocateOptions(control_points=path))
+        read_control(read_model(ring), path)
     assert said in str(refused.value)
 
 
@@ -175,15 +174,6 @@ def test_an_empty_file_is_refused(ring, tmp_path):
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match=r"is empty; its first line is the projection"):
         read_control_points(tmp_path / "empty.txt", read_model(ring))
-
-
-def test_only_one_thing_sets_the_scale(ring, tmp_path):
-    path = written(tmp_path, TWICE)
-    for other in ({"scale": "unit"}, {"known_distance": ("a", "b", 1.0)}, {"fix": "solved"}):
-        with pytest.raises(ValueError, match="would both set the scale; leave out one"):
-            LocateOptions(control_points=path, **other)
-    with pytest.raises(InputError, match="control points and position priors would both set the scale"):
-        sfm_shapefit.locate(ring, RING / "database.db", control_points=path, priors=path)
 
 
 def test_points_that_cannot_be_triangulated_leave_the_model_as_it_is(ring, tmp_path):

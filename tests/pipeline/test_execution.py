@@ -18,10 +18,9 @@ from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
 from sfm_shapefit.pipeline import execution
 from sfm_shapefit.pipeline.execution import (
-    PairTask,
     PairWork,
     WorkerError,
-    measure_task,
+    measure_part,
     measure_with_workers,
     open_executor,
 )
@@ -50,7 +49,7 @@ WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()
 def serial(workspace, model):
     with view_of(workspace / "database.db", model) as view:
         (part,) = view.parts(10**9)
-    (found,) = measure_task(PairTask(part=part, work=WORK))
+    (found,) = measure_part(WORK, part)
     return found
 
 
@@ -84,13 +83,13 @@ def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(workspace, m
     assert_same_bits(found, serial(workspace, model))
 
 
-def _die(_task):
+def _die(_work, _part):
     os._exit(1)
 
 
 @pytest.mark.slow
 def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", _die)
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", _die)
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         pytest.raises(WorkerError, match=r"a worker failed .* run again"),
@@ -99,21 +98,21 @@ def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch)
 
 
 def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
-    def refuse(_task):
+    def refuse(_work, _part):
         raise InputError("the database is damaged")
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", refuse)
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", refuse)
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
         shared(workspace, model, pool)
 
 
-def die_once(flag, task):
+def die_once(flag, work, part):
     """Kill the first worker that comes here, in the middle of the work."""
     try:
         os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
     except FileExistsError:
         time.sleep(0.05)
-        return measure_task(task)
+        return measure_part(work, part)
     os._exit(1)
 
 
@@ -121,7 +120,7 @@ def die_once(flag, task):
 def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", partial(die_once, str(flag)))
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
         found, _ = shared(workspace, model, pool)
     assert flag.exists()

@@ -97,25 +97,25 @@ def test_priors_fit_best_as_they_are(ring, adjusted, tmp_path, pulled):
     noise = 0.01 * np.random.default_rng(1).standard_normal(model.centers.shape)
     positions = 2.0 * (model.centers + noise) @ turn.T + [100.0, 200.0, 300.0]
     rows = [
-        f"{name} {x!r} {y!r} {z!r} 0.02"
+        f"{name} {x!r} {y!r} {z!r}{' 0.02' * pulled}"
         for name, (x, y, z) in zip(model.names, positions.tolist(), strict=True)
     ]
     (tmp_path / "priors.txt").write_text("\n".join(rows))
-    table = {"priors": tmp_path / "priors.txt", "refine_with_priors": pulled}
-    found, centers, rotations = located(ring, **table, **adjusted)
+    found, centers, rotations = located(ring, priors=tmp_path / "priors.txt", **adjusted)
     assert found.gauge.scale == "prior"
     assert ("the priors moved cameras by" in found.gauge.statement) == pulled
     if pulled:
         # What is pulled fits better than any similarity of what was placed.
         assert np.median(np.linalg.norm(centers - positions, axis=1)) < 1.538 * 0.02
         return
-    information = np.tile(0.02**-2 * np.eye(3), (len(positions), 1, 1))
+    information = np.full((len(positions), 3, 3), np.nan)
     known = KnownPositions(np.arange(len(positions)), positions, information)
     priors = PositionPriors(known=known, statement="")
     again = prior_gauge(centers, priors)
-    assert again.similarity.scale == pytest.approx(1.0, abs=EXACT)
-    np.testing.assert_allclose(again.axes, np.eye(3), atol=EXACT)
-    np.testing.assert_allclose(again.similarity.translation, 0.0, atol=1e3 * EXACT)
+    # Weights by the level of the residuals are no fixed point after twenty rounds.
+    assert again.similarity.scale == pytest.approx(1.0, abs=1e-4)
+    np.testing.assert_allclose(again.axes, np.eye(3), atol=1e-4)
+    np.testing.assert_allclose(again.similarity.translation, 0.0, atol=0.1)
     np.testing.assert_allclose(found.gauge.axes, turn, atol=0.02)
     assert_in_the_axes_of(found.model, rotations @ found.gauge.axes)
     assert_says_where(found, centers)

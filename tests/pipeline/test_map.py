@@ -21,7 +21,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline import execution, relative_rotations
-from sfm_shapefit.pipeline.execution import PairTask, open_executor
+from sfm_shapefit.pipeline.execution import open_executor
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
@@ -93,7 +93,6 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
     found = sfm_shapefit.map_database(
         changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}"),
         priors=table,
-        refine_with_priors=True,
         **FAST,
     )
     scales = {}
@@ -233,9 +232,12 @@ def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--rotations", "held"], "map finds the rotations itself"),
-        (["--rotations", "0.1"], "map finds the rotations itself"),
-        (["--rotations", "exact"], "rotations must be one of auto, held, free or of type float, got 'exact'"),
+        (["--rotations", "held"], "No such option: --rotations"),
+        (["--fix", "solved"], "No such option: --fix"),
+        (["--sequence", "none"], "--sequence is a key of --config now: sequence = ..."),
+        (["--no-refine"], "--no-refine is a key of --config now: refine = ..."),
+        (["--refine-with-priors"], "--refine-with-priors is gone: priors that have standard deviations pull"),
+        (["--rigs", "free", "--adjust", "none"], "rigs=free needs an adjustment"),
         (["--min-points-per-image", "-1"], "min_points_per_image must be"),
     ],
 )
@@ -280,7 +282,7 @@ class Counting(ThreadPoolExecutor):
         self.tasks = {}
 
     def submit(self, work, /, task):
-        kind = task.work.estimate.func.__name__ if isinstance(task, PairTask) else work.__name__
+        kind = work.args[0].estimate.func.__name__ if isinstance(work, partial) else work.__name__
         self.tasks[kind] = self.tasks.get(kind, 0) + 1
         return super().submit(work, task)
 
@@ -315,7 +317,7 @@ def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_pa
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
     monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
-    monkeypatch.setattr(execution, "measure_task", partial(die_once, str(flag)))
+    monkeypatch.setattr(execution, "measure_part", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
         shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
     monkeypatch.undo()
@@ -340,7 +342,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
         kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
         return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.map.measure_rotations", with_a_false_loop)
+    monkeypatch.setattr("sfm_shapefit.pipeline.map_run.measure_rotations", with_a_false_loop)
     found = sfm_shapefit.map_database(database, sequence="names", **FAST)
     (loop,) = found.models[0].located.loops
     names = found.models[0].names

@@ -2,12 +2,13 @@
 
 import re
 from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import InputError, LocateOptions
+from sfm_shapefit import InputError
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -20,6 +21,8 @@ from sfm_shapefit.pipeline.memory import (
     forecast,
     keep_within_memory,
 )
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive, random_graph_problem
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -76,31 +79,38 @@ def loop_graph(num_nodes=400):
     return ViewGraph(num_nodes, np.sort(edges, axis=1), np.tile([1.0, 0.0, 0.0], (len(edges), 1)))
 
 
+PLACEMENT = PlacementOptions()
 LOOP_WORK = Workload(
     num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
 )
 
 
+def describe(measured, work, options=PLACEMENT):
+    """What there is to do with a graph, its cameras adjusted."""
+    return describe_work(measured, work, options, FreedomOptions())
+
+
 def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_nothing_is_refined():
     graph = loop_graph()
     plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
-    split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
-    with_priors = LocateOptions(solver="admm", refine_with_priors=True)
-    for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
-        work = describe_work(LOOP_WORK, measured, options)
+    split, newton = PlacementOptions(solver="admm"), PlacementOptions(solver="newton")
+    for measured, options in ((plain, newton), (grouped, split), (grouped, newton)):
+        work = describe(measured, LOOP_WORK, options)
         assert work.needs_factor
         peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
         assert peaks[0] == peaks[1]  # so that it is never chosen
-    full = describe_work(LOOP_WORK, plain, split)
+    full = describe(plain, LOOP_WORK, split)
     assert full.factor_entries > 0
     assert not full.needs_factor
     least = forecast(full, ECONOMIES[-1]).peak_mb
     assert forecast(full, ECONOMIES[-2]).peak_mb > least
-    limited = replace(split, max_memory_mb=int(np.ceil(least)))
-    economy, kept, changed = keep_within_memory(LOOP_WORK, plain, limited, ECONOMIES[0])
+    of_split = partial(describe, work=LOOP_WORK, options=split)
+    economy, kept = keep_within_memory(plain, of_split, int(np.ceil(least)), ECONOMIES[0])
     assert economy is ECONOMIES[-1]
     assert kept is plain
-    assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
+    changed = economy.limit(split)
+    assert changed == PlacementOptions(solver="admm", factor_memory_mb=NO_FACTOR, refine=False)
+    assert ECONOMIES[-2].limit(split) is split
     assert "neither refined" in economy.statement
 
 
@@ -111,12 +121,13 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
     work = Workload(
         num_images=140, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=140
     )
-    limit = forecast(describe_work(work, measured.without_points(), LocateOptions()), ECONOMIES[3]).peak_mb
-    options = LocateOptions(max_memory_mb=int(np.ceil(limit)))
-    economy, kept, _ = keep_within_memory(work, measured, options, ECONOMIES[0])
+    limit = forecast(describe(measured.without_points(), work), ECONOMIES[3]).peak_mb
+    economy, kept = keep_within_memory(
+        measured, partial(describe, work=work), int(np.ceil(limit)), ECONOMIES[0]
+    )
     assert not economy.points
     assert kept.num_points == 0
-    assert keep_within_memory(work, measured, LocateOptions(), ECONOMIES[0])[1] is measured
+    assert keep_within_memory(measured, partial(describe, work=work), 0, ECONOMIES[0])[1] is measured
 
 
 def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_for():
@@ -131,15 +142,12 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
     assert forecast(asked, ECONOMIES[-1]).peak_mb > 14 * 144
     measured = MeasuredGraph(loop_graph())
     last = [economy for economy in ECONOMIES if economy.adjustment][-1]
-    needed = forecast(describe_work(crowded, measured, LocateOptions()), last).peak_mb
-    options = LocateOptions(max_memory_mb=int(needed) - 1)
-    economy = keep_within_memory(crowded, measured, options, ECONOMIES[0])[0]
+    of_crowded = partial(describe, work=crowded)
+    needed = forecast(of_crowded(measured), last).peak_mb
+    economy = keep_within_memory(measured, of_crowded, int(needed) - 1, ECONOMIES[0])[0]
     assert "not adjusted" in economy.statement
     assert not economy.adjustment
-    free = replace(options, rotations="free")  # which without an adjustment would have no effect
-    assert keep_within_memory(crowded, measured, free, ECONOMIES[0])[2] == free
-    plenty = replace(options, max_memory_mb=10**6)
-    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[0].adjustment
+    assert keep_within_memory(measured, of_crowded, 10**6, ECONOMIES[0])[0].adjustment
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import (
     SceneOptions,
     WorkspaceOptions,
@@ -29,6 +30,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.tracks.options import NodeOptions
 from tests.program import run
 from tests.scenes import RING, copied, edit_database, read_from
 
@@ -169,17 +171,31 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
 
 def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
     model = workspace / "sparse" / "0"
-    for source, option, sentence in (
-        (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
-        (model, {"solver": "admm"}, "no solver admm"),
-        (RING / "sparse" / "0", {"scale": "rig"}, "no rig of several cameras"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            sfm_shapefit.locate(source, **option)
+    with pytest.raises(InputError, match="no solver admm"):
+        sfm_shapefit.locate(model, solver="admm")
 
     seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
     assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
+
+
+def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, rigs, tmp_path):
+    model = read_model(workspace / "truth")
+    apart = float(np.linalg.norm(model.centers[0] - model.centers[20]))
+    rows = zip(model.names, (3.0 * model.centers).tolist(), strict=True)
+    (tmp_path / "priors.txt").write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
+    known = (model.names[0], model.names[20], 2.0 * apart)
+    told = {"known_distance": known, "priors": tmp_path / "priors.txt", "scale": "unit"}
+    found = sfm_shapefit.locate(workspace / "sparse" / "0", points="never", **told)
+    assert found.gauge.scale == "rig"
+    unused = [warning for warning in found.warnings if "not used" in warning]
+    assert [warning.rpartition(" ")[0].partition("; ")[0] for warning in unused][:2] == [
+        f"{what} were not used for the scale, which is that of the rigs"
+        for what in ("known distances", "position priors")
+    ]
+    off = [float(warning.split(" by ")[1].split()[0]) for warning in unused[:2]]
+    np.testing.assert_allclose(off, [100.0, 200.0], atol=1.0)
+    assert unused[2] == "the scale unit was not used, but that of the rigs"
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
@@ -245,7 +261,7 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
     monkeypatch.setattr(rigs_stage, "place_pieces", place_pieces)
     monkeypatch.setattr(rigs_stage, "judge", lambda placement, _: placement)
     measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
-    assert list(rigs_stage.place_cameras(measured, LocateOptions(), Clock())) == [loose]
+    assert list(rigs_stage.place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())) == [loose]
 
 
 def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
@@ -440,11 +456,9 @@ def test_a_component_without_rigs_has_a_scale_of_its_own_beside_one_with_rigs(wo
         f"DELETE FROM frame_data WHERE frame_id IN ({of_second})",
         *(f"DELETE FROM {table} WHERE rig_id = 2" for table in ("frames", "rig_sensors", "rigs")),
     )
-    found = sfm_shapefit.map_database(database, scale="rig", points="never")
+    found = sfm_shapefit.map_database(database, points="never")
     scales = [model.located.gauge.scale for model in found.models]
     assert sorted(scales) == ["rig", "unit"]
-    with pytest.raises(InputError, match="no rig of several cameras to take the scale from"):
-        sfm_shapefit.map_database(RING / "database.db", scale="rig")
 
 
 def test_rigs_that_cannot_be_refined_are_refused(tmp_path):

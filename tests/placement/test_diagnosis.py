@@ -164,7 +164,8 @@ def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_pa
     run("inspect", graph, "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)
-    run("inspect", graph, "--min-inlier-ratio", "7", code=2)
+    (tmp_path / "options.toml").write_text("min_inlier_ratio = 7")
+    run("inspect", graph, "--config", tmp_path / "options.toml", code=2)
     graph.write_text(graph_text(exact_graph(t[:5], [(k, (k + 1) % 5) for k in range(5)])))
     result = run("inspect", graph, "--json", code=4)
     facts = json.loads(result.stdout)["diagnosis"]

@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit import InputError, LocateOptions, locate
+from sfm_shapefit import InputError, PlacementOptions, locate
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.facts.warnings import prior_warnings
@@ -26,7 +26,7 @@ from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angl
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
-from tests.scenes import RING, read_from
+from tests.scenes import BUNDLED, RING, read_from
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -95,8 +95,6 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
     joined = ("--known-distance=0003.jpg", "0007.jpg", "42.5")
     again = json.loads(run("locate", RING_MODEL, tmp_path / "two", "--json", *joined).stdout)
     assert again["known_distances"] == json.loads(result.stdout)["known_distances"]
-    both = ("--priors", write_priors(tmp_path))
-    assert "leave out one of the two" in run_refused("locate", RING_MODEL, tmp_path / "none", *known, *both)
 
 
 def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
@@ -104,21 +102,13 @@ def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
     t, names = model.centers[:6], model.names
 
     def placed(*known):
-        options = LocateOptions(known_distance=known)
-        rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
+        rule = GaugeRule(model, find_rigid_parts(model, PlacementOptions()), "auto", distances=known)
         return rule.choose(np.arange(6), t, None).similarity.apply(t)
 
     found = placed((names[1], names[4], 3.0), (names[2], names[7], 9.0))
     assert np.linalg.norm(found[1] - found[4]) == pytest.approx(3.0, rel=1e-12)
     with pytest.raises(UnsolvableError, match=f"{names[7]} could not be placed"):
         placed((names[2], names[7], 9.0))
-
-
-def write_priors(folder):
-    """A table of one position, which is refused before it is read."""
-    table = folder / "gps.csv"
-    table.write_text("0001.jpg,0,0,0\n")
-    return table
 
 
 def test_several_known_distances_are_fitted_robustly_and_say_how_well():
@@ -269,18 +259,15 @@ def test_a_malformed_line_of_a_table_is_named(ring, tmp_path, line, message):
         table_priors(path, ring)
 
 
-def test_priors_of_other_images_or_without_effect_are_refused(ring, tmp_path):
+def test_priors_of_other_images_and_those_that_there_are_not_are_refused(ring, tmp_path):
     path = tmp_path / "priors.txt"
     path.write_text("other.jpg 1 2 3\n")
     with pytest.raises(InputError, match="no prior of the model's images"):
         table_priors(path, ring)
-    table = write_table(path, ring, ring.centers)
-    for flags, sentence in (
-        (("--priors", table, "--scale", "unit"), "no effect with the scale unit"),
-        (("--scale", "prior"), "give a table with --priors"),
-        (("--refine-with-priors",), "needs priors"),
-    ):
-        assert sentence in run_refused("locate", RING_MODEL, tmp_path / "out", *flags)
+    of_database = ("--priors", "database")
+    assert "no position prior" in run_refused("locate", RING_MODEL, tmp_path / "out", *of_database)
+    tracks = BUNDLED / "facade9" / "sparse" / "0"
+    assert "give one with --database" in run_refused("locate", tracks, tmp_path / "out", *of_database)
 
 
 NEW = (
@@ -436,11 +423,12 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     sigma = 0.01
     noisy = ring.centers + sigma * rng.standard_normal(ring.centers.shape)
     table = write_table(tmp_path / "priors.txt", ring, noisy)
-    table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
     arguments = ("locate", RING_MODEL, "--priors", table, "--no-report", "--json")
     plain = json.loads(run(*arguments, tmp_path / "plain").stdout)
-    facts = json.loads(run(*arguments, tmp_path / "out", "--refine-with-priors").stdout)
-    assert facts["scale"].startswith(plain["scale"] + "; the priors moved cameras by ")
+    assert "the priors moved cameras" not in plain["scale"]
+    table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
+    facts = json.loads(run(*arguments, tmp_path / "out").stdout)
+    assert "; the priors moved cameras by " in facts["scale"]
     off = []
     for folder in ("plain", "out"):
         model = pycolmap.Reconstruction(tmp_path / folder)

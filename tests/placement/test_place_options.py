@@ -1,12 +1,11 @@
 """Every option of a placement with plain graphs, rigs, fixed cameras and priors: obeyed or refused."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.settings import homes_of
 from sfm_shapefit.facts.warnings import quality_warnings
 from sfm_shapefit.graph.groups import separate
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -79,7 +78,7 @@ def usual(request) -> tuple[str, MeasuredGraph, Placement]:
 
 
 def test_the_table_has_every_option():
-    assert set(OPTIONS) == {field.name for field in fields(PlacementOptions)}
+    assert set(OPTIONS) == set(homes_of(PlacementOptions))
 
 
 @pytest.mark.parametrize("name", OPTIONS)
@@ -103,7 +102,7 @@ def test_groups_are_placed_without_the_refinement_where_only_its_factor_would_be
     def refuse(*_given, **_more):
         raise UnsolvableError("too large")
 
-    monkeypatch.setattr(starts, "ReducedFactor", refuse)
+    monkeypatch.setattr(starts, "RigidReduction", refuse)
     found = place(measure(kind))
     assert not found.refined.is_refined
     assert "the factor for that would be too large" in found.refined.reason

@@ -20,7 +20,7 @@ from tests.problems import shape_error
 
 def finished(problem, **options):
     graph, settings = problem.view_graph, PlacementOptions(**options)
-    return refine_starts(MeasuredGraph(graph), solve(graph, settings), settings)
+    return refine_starts(MeasuredGraph(graph), solve(graph, settings.solver), settings)
 
 
 @pytest.fixture(scope="module")

@@ -71,7 +71,7 @@ def test_of_many_cameras_so_many_pairs_are_drawn_with_the_same_area(monkeypatch)
     rotations[:6] = turn(np.array([0.0, 0.0, 1.0]), 90.0) @ rotations[:6]
     model = ComparedPoses(rotations, truth.centers)
     all_pairs = relative_pose_errors(model, truth, extent=5.0)
-    monkeypatch.setattr(pose_errors, "MAX_PAIRS", 1000)
+    monkeypatch.setattr(pose_errors, "MOST_COMPARED_PAIRS", 1000)
     some = relative_pose_errors(model, truth, extent=5.0)
     assert len(all_pairs) == 1770
     assert len(some) == 1000

@@ -75,6 +75,7 @@ class DatabaseMatches(Matches):
             InputError: if it is no COLMAP database, or has fewer than two of the images; later reads raise
                 it for damaged rows, naming image or pair.
         """
+        super().__init__()
         self.file, self.names = file, tuple(names)
         check_schema(file)
         index_of_id = match_names(file, names)

@@ -6,7 +6,6 @@ with the same bits again.
 """
 
 import math
-from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.executors import answers
+from sfm_shapefit.base.executors import Advance, answers
 from sfm_shapefit.files.colmap.model import points2d_xy
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene.images import Images
@@ -42,7 +41,7 @@ def triangulate_own_tracks(
     source: pycolmap.Reconstruction,
     images: Images,
     rules: TrackRules,
-    advance: Callable[[int, int], None],
+    advance: Advance,
     executor: Executor | None = None,
 ) -> Points:
     """Return the points of a model, each triangulated from its own track at other poses.

@@ -9,7 +9,16 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import PosedModel, observed_points, points2d_xy
-from sfm_shapefit.scene.matches import PLENTY, Matches, PairNames, Reading, Seeing, View, batch_ranges
+from sfm_shapefit.scene.matches import (
+    PLENTY,
+    KeypointNumbers,
+    Matches,
+    PairNames,
+    Reading,
+    Seeing,
+    View,
+    batch_ranges,
+)
 
 
 class TrackMatches(Matches):
@@ -20,6 +29,7 @@ class TrackMatches(Matches):
 
     def __init__(self, model: PosedModel) -> None:
         """Collect what the images observe, and count the matches of each pair."""
+        super().__init__()
         self.names = model.names
         images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
         self._images = dict(zip(model.names, images, strict=True))
@@ -57,9 +67,13 @@ class TrackMatches(Matches):
             raise InputError(f"image {name} has a point whose coordinates are not finite")
         return xy
 
-    def matched(self, name: str) -> IntArray:
-        """Return which points of an image observe a 3D point, ascending."""
-        return self._matched[name]
+    def matched(self, name: str) -> FloatArray:
+        """Return the pixels (m, 2) of those points of an image that observe a 3D point."""
+        return self.keypoints(name)[self._matched[name]]
+
+    def places(self, name: str, keypoints: KeypointNumbers) -> IntArray:
+        """Return the places (k,) of some of these points (k,) among them."""
+        return np.searchsorted(self._matched[name], keypoints)
 
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:  # noqa: ARG002
         """Return the matches of pairs; they are made anew each time."""

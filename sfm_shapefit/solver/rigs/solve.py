@@ -77,7 +77,7 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
     if options.solver == "conic":
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
     factor = RigidReduction(
-        graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_memory_mb * 1_000_000
+        graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes
     )
 
     def newton(graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None) -> tuple[Any, ...]:

@@ -1,0 +1,171 @@
+"""From the averaged rotations of each component of a database to its model."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.facts.map_result import MappedModel
+from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.facts.scene import Loop
+from sfm_shapefit.files.colmap.intrinsics import with_parameters
+from sfm_shapefit.files.colmap.model import PosedModel, sensors_of
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.components import pairs_among
+from sfm_shapefit.pipeline.first_placement import adjust_first_placement
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.inputs import see_matches
+from sfm_shapefit.pipeline.map_run import MapRun
+from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.settle import Told, settle
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
+from sfm_shapefit.rotations.arrangements import agreeing_pairs
+from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.sequences import Visit
+from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.matches import PairNames
+
+
+def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> PosedModel:
+    """Return the images with the intrinsics that first placements of all components find.
+
+    Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
+    ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
+    in several components the one with most images counts.
+    """
+    found: dict[int, list[float]] = {}
+    for _, members, averaging in run.average_images(relative, {}):
+        model = run.pose(run.unposed.image_ids[members].tolist(), averaging.rotations)
+        source = see_matches(run.matches, model, run.inputs_of(model), run.options)
+        rule = GaugeRule(model, find_rigid_parts(model, run.options.placement), "unit")
+        with suppress(UnsolvableError):
+            with run.clock("first placement"):
+                free = run.intrinsics.free
+                first = adjust_first_placement(source, rule, run.options, run.clock, free, thorough=False)
+            found = first.parameters() | found
+    return with_parameters(run.unposed, found)
+
+
+def locate_components(
+    run: MapRun, relative: RelativeRotations, visits: Sequence[Visit], reasons: dict[int, str]
+) -> list[MappedModel]:
+    """Return a model of each component that can be placed, most cameras first.
+
+    Why a frame belongs to none is written to `reasons`, which starts with one for each.
+    """
+    models = []
+    for frames, members, averaging in run.average_images(relative, reasons):
+        try:
+            located = _locate_component(run, members, averaging, relative)
+        except UnsolvableError as error:
+            reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
+            continue
+        names = tuple(run.unposed.names[k] for k in members.tolist())
+        located = replace(located, loops=tuple(_loops_of(visits, run.unposed.names, set(names))))
+        models.append(MappedModel(located=located, averaging=averaging, names=names))
+        for k in frames.tolist():
+            del reasons[k]
+    return sorted(models, key=lambda model: -int(model.located.kept.sum()))
+
+
+def _locate_component(
+    run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
+) -> LocateResult:
+    """Place one component, on the position priors of its images if they can set a scale."""
+    priors = None if run.priors is None else run.priors.of(members)
+    if priors is None or len(priors) < FEWEST_PRIORS:
+        return _locate_with_priors(run, members, averaging, relative, None)
+    try:
+        return _locate_with_priors(run, members, averaging, relative, priors)
+    except UselessPriorsError as error:  # which other components need not share
+        found = _locate_with_priors(run, members, averaging, relative, None)
+        return replace(
+            found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
+        )
+
+
+def _locate_with_priors(
+    run: MapRun,
+    members: IntArray,
+    averaging: AveragedRotations,
+    relative: RelativeRotations,
+    priors: PositionPriors | None,
+) -> LocateResult:
+    """Place one component: adjust a first placement, and locate from the rotations of that."""
+    image_ids = run.unposed.image_ids[members].tolist()
+    control = None if run.control is None else run.control.of(members)
+    gravity = None if run.gravity is None else run.gravity.among(members)
+    names = {run.unposed.names[k] for k in members.tolist()}
+    distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
+    model = run.pose(image_ids, averaging.rotations)
+    inputs = run.inputs_of(model)
+    if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
+        _, among = pairs_among(relative, members)
+        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
+    rigid = find_rigid_parts(model, run.options.placement)
+    averaged = see_matches(run.matches, model, inputs, run.options)
+    source, first, intrinsics = averaged, None, run.intrinsics
+    if run.options.freedom.adjust != "none":
+        with run.clock("first placement"):
+            rule = GaugeRule(model, rigid, "unit")
+            first = adjust_first_placement(averaged, rule, run.options, run.clock, intrinsics.free)
+        intrinsics = intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses)
+        source = averaged.at(run.pose_as(image_ids, first))
+        rigid = find_rigid_parts(source.model, run.options.placement)
+    told = Told(
+        inputs,
+        rigid,
+        np.inf,
+        distances=distances,
+        priors=priors,
+        control=control,
+        gravity=gravity,
+        intrinsics=intrinsics,
+        rigs=sensors_of(model.reconstruction),
+        near=first,
+    )
+    with run.clock("locate"):
+        found = settle(source, told, run.options, run.clock.anew())
+    ends = members[found.directions.pairs].tolist()
+    unknown = (np.nan, np.nan)
+    scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
+    return replace(
+        found,
+        triplet_scores=scores[:, 0],
+        matched_shares=scores[:, 1],
+        suspicions=tuple(_suspicions(averaging)),
+    )
+
+
+def _false_pairs(model: PosedModel, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:
+    """Return the pairs of a model's images that its averaged rotations contradict, by name."""
+    false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
+    names = ((model.names[i], model.names[j]) for i, j in false)
+    return frozenset((min(pair), max(pair)) for pair in names)
+
+
+def _suspicions(averaging: AveragedRotations) -> Iterator[str]:
+    """Yield why a model is to be looked at, whatever its pairs say: they say the same of a folded scene."""
+    if averaging.num_repeated:
+        yield "the scene repeats itself, and pairs that would fold it were not followed"
+    if averaging.num_rivals:
+        yield "the images can be arranged in another way"
+
+
+def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
+    """Yield the visits that begin among some images, by name."""
+    for visit in visits:
+        first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
+        if first[0] in among:
+            yield Loop(
+                first=first,
+                second=second,
+                num_pairs=visit.num_pairs,
+                num_matches=visit.num_matches,
+                num_refused=visit.num_refused,
+                angle_deg=visit.angle_deg,
+                tolerance_deg=visit.tolerance_deg,
+            )

@@ -1,0 +1,194 @@
+"""What `map_database` reads and measures once, for all components."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.facts.result import Inputs
+from sfm_shapefit.files.colmap.database import DatabaseMatches
+from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
+from sfm_shapefit.files.colmap.intrinsics import with_parameters
+from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
+from sfm_shapefit.pairs.options import LEAST_MATCHES
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pairs.triplets import score_triplets
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.components import ComponentAveraging
+from sfm_shapefit.pipeline.control_points import read_control
+from sfm_shapefit.pipeline.first_placement import FirstPlacement
+from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
+from sfm_shapefit.pipeline.gravity import read_gravity
+from sfm_shapefit.pipeline.inputs import choose_inputs, read_left_out
+from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
+from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
+from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
+from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+from sfm_shapefit.scene.matches import PairNames, View
+
+# Pairs: the shares of more would cost more than they are worth, 0.2 ms a pair and 16 bytes a match.
+_MOST_SCORED_PAIRS = 20_000
+
+
+def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None) -> "MapRun":
+    """Read what a run works from.
+
+    Raises:
+        InputError: if the database, or a file that the options name, cannot be used.
+    """
+    path = file.path
+    with clock("read"):
+        images = read_images(file)
+        unposed = read_model(images.reconstruction)
+        frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
+        if options.freedom.rigs == "free" and len(np.unique(frame_of_image)) == len(frame_of_image):
+            raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
+        inputs = choose_inputs(images.reconstruction, path)
+        inputs = read_left_out(inputs, unposed.names, options.directions.without)
+        unposed, intrinsics = settle_intrinsics(unposed, file, options.freedom.intrinsics, inputs.left_out)
+        refuse_unknown_names(options.gauge.known_distance, unposed.names, "the database has no image")
+        positions = read_priors(unposed, file, priors)
+        control = read_control(unposed, options.gauge.control_points)
+        gravity = read_gravity(file, unposed, options.averaging.gravity)
+        matches = DatabaseMatches(file, unposed.names)
+    return MapRun(
+        options=options,
+        clock=clock,
+        matches=matches,
+        images=images,
+        unposed=unposed,
+        frame_of_image=frame_of_image,
+        sensor_rotations=sensor_rotations,
+        intrinsics=intrinsics,
+        priors=positions,
+        control=control,
+        gravity=gravity,
+        without=inputs.left_out,
+    )
+
+
+class MapRun(NamedTuple):
+    """What all components of a run have in common; the clock adds up the time that they take."""
+
+    options: MapOptions
+    clock: Clock
+    matches: DatabaseMatches
+    images: UnposedImages
+    unposed: PosedModel
+    """The images as a model."""
+    frame_of_image: IntArray
+    """(n,)"""
+    sensor_rotations: FloatArray
+    """(n, 3, 3) sensor_from_rig of each image."""
+    intrinsics: Intrinsics
+    """Which of theirs are in doubt."""
+    priors: PositionPriors | None
+    control: ControlPoints | None
+    gravity: Gravity | None
+    without: PairNames
+    """Pairs that are taken for unmatched."""
+    scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
+    """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
+
+    def measure(self) -> RelativeRotations:
+        """Return the relative rotations of all pairs, by the intrinsics that the images have."""
+        with self.clock("relative rotations"):
+            sharing = Sharing(self.clock.threads, self.clock.executor, self.clock.advance)
+            return measure_rotations(self.view(), LEAST_MATCHES, sharing)
+
+    def view(self) -> View[PosedModel]:
+        """Return the matches of all images, but for the pairs that are left out."""
+        return self.matches.at(self.unposed, self.without)
+
+    def find_videos(self, relative: RelativeRotations) -> Videos:
+        """Return the videos among the images, as far as the options want to know of them."""
+        asked = self.options.averaging.sequence
+        nothing = Videos(np.full(self.unposed.num_images, -1), np.full(self.unposed.num_images, -1))
+        videos = nothing if asked == "none" else find_videos(self.unposed.names)
+        return confirm_videos(videos, relative) if asked == "auto" else videos
+
+    def judge_loops(
+        self, videos: Videos, relative: RelativeRotations
+    ) -> tuple["MapRun", RelativeRotations, tuple[Visit, ...]]:
+        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
+        if not videos.num_videos:
+            return self, relative, ()
+        with self.clock("rotation averaging"):
+            loops = judge_loops(videos, relative, self.clock.threads)
+        names = self.unposed.names
+        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
+        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
+        without = self.without | {(min(pair), max(pair)) for pair in refused}
+        return self._replace(without=without), relative.subset(kept), loops.visits
+
+    def score_pairs(self, relative: RelativeRotations) -> "MapRun":
+        """Return the run with the scores by which pairs of repeated structure are told."""
+        pairs = list(map(tuple, relative.pairs.tolist()))
+        triplets = score_triplets(self.unposed.num_images, relative).tolist()
+        shares: dict[tuple[int, int], float] = {}
+        if len(pairs) <= _MOST_SCORED_PAIRS:
+            with self.clock("scores of pairs"):
+                view = self.view()
+                pixels = [view.keypoints(k) for k in range(self.unposed.num_images)]
+                sizes = self.unposed.image_sizes()
+                batches = list(view.links(LEAST_MATCHES))  # both look at all of them
+                partners = count_partners([len(own) for own in pixels], batches)
+                for batch in batches:
+                    found = matched_shares(pixels, sizes, partners, batch).tolist()
+                    shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
+        both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
+        return self._replace(scores=dict(zip(pairs, both, strict=True)))
+
+    def share_of_doubted_lenses(self) -> float:
+        """Return the share of images whose intrinsics are in doubt."""
+        cameras = map(self.unposed.camera, range(self.unposed.num_images))
+        return float(np.mean([camera.camera_id in self.intrinsics.free.doubts for camera in cameras]))
+
+    def average_images(
+        self, relative: RelativeRotations, reasons: dict[int, str]
+    ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
+        """Yield the frames of each component, and its images with their rotations."""
+        of_image, sensors = self.frame_of_image, self.sensor_rotations
+        of_frames = relative_rotations_of_frames(relative, of_image, sensors)
+        gravity = None if self.gravity is None else self.gravity.of_frames(of_image, sensors)
+        averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, self.shares_of_frames())
+        for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
+            members = np.flatnonzero(np.isin(of_image, frames))
+            places = np.searchsorted(frames, of_image[members])
+            yield frames, members, averaged.turned(places, sensors[members])
+
+    def shares_of_frames(self) -> dict[tuple[int, int], float]:
+        """Return the matched shares by pairs of frames; none where frames are those of rigs."""
+        if not np.array_equal(self.frame_of_image, np.arange(len(self.frame_of_image))):
+            return {}
+        return {pair: share for pair, (_, share) in self.scores.items()}
+
+    def inputs_of(self, model: PosedModel) -> Inputs:
+        """Return what the images of a component are located from."""
+        inputs = choose_inputs(model.reconstruction, self.matches.file.path)
+        return replace(inputs, left_out=self.without)
+
+    def pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
+        """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
+        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
+        run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
+        return run.pose(image_ids, first.rotations, first.parameters())
+
+    def pose(
+        self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None
+    ) -> PosedModel:
+        """Return images with these rotations and all centers 0, and parameters that were found of cameras."""
+        known = with_parameters(self.unposed, found or {})
+        images = replace(self.images, reconstruction=known.reconstruction)
+        return read_model(pose_at_origin(images, image_ids, rotations))

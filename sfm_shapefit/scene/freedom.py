@@ -1,0 +1,63 @@
+"""What may still move, as it is asked for. Pure data, and cheap to import."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sfm_shapefit.base.settings import Settings, explained, option
+
+Adjust = Literal["none", "seed", "full"]
+IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
+RigFreedom = Literal["held", "free"]
+
+# With more cameras, the adjustment would take longer than all the rest.
+_MOST_ADJUSTED_CAMERAS = 2_000
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class FreedomOptions(Settings):
+    """What is adjusted to the pixels, and what may move with it."""
+
+    adjust: Adjust = option(
+        "seed",
+        'What is adjusted to the pixels: "seed", the placed cameras by all tracks at once, and rotations as '
+        "far as they are doubtful, up to 2,000 cameras and not with objectives that deliver an optimum as it "
+        'is, or, of rotations that `map` averages, a first placement on few tracks; "full", poses and points '
+        'once more by bundle adjustment from the seed; "none", nothing.',
+    )
+    intrinsics: IntrinsicsFreedom = option(
+        "auto",
+        'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
+        'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
+        'their distortion too; "held", nothing. What was given pulls by its own weight, and stays where the '
+        "matches do not tell it. Cameras that images share stay shared.",
+    )
+    rigs: RigFreedom = option(
+        "held",
+        'Where sensors stand in their rigs: "held", where they are; "free", the adjustments change it, each '
+        "by one pose for all frames. The reference sensors stay, and so does the mean distance of the others "
+        "from them: the scale is still that of the rigs. Refused where the matches do not tell a sensor's "
+        "pose.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, asks in (
+            ("intrinsics", self.intrinsics in ("focal", "all")),
+            ("rigs", self.rigs == "free"),
+        ):
+            if asks:
+                self.refuse_held(name, getattr(self, name))
+
+    def adjusts_cameras(self, num_cameras: int) -> bool:
+        """Return whether so many placed cameras are adjusted, unless the optimum is wanted as it is."""
+        return self.adjust != "none" and num_cameras <= _MOST_ADJUSTED_CAMERAS
+
+    def refuse_held(self, name: str, value: object) -> None:
+        """Refuse a freedom, an option with its value, where nothing is adjusted that could use it.
+
+        Raises:
+            ValueError: a sentence that names both options.
+        """
+        if self.adjust == "none":
+            raise ValueError(f"{name}={value} needs an adjustment; leave out adjust=none")
