@@ -13,32 +13,11 @@ from pathlib import Path
 import pdoc
 
 NAMES = (
-    *(
-        "files.colmap.model",
-        "synthetic.rendered_workspace",
-        "files.colmap.quiet",
-        "synthetic.workspace",
-    ),
-    *(
-        "placement.diagnosis",
-        "pairs",
-        "base.errors",
-        "scene.evaluation",
-        "files",
-        "placement.gauge",
-        "facts.options",
-    ),
-    *(
-        "pipeline",
-        "placement.place",
-        "facts.result",
-        "facts.map_result",
-        "facts.tables",
-        "graph.rigidity",
-        "judgement",
-        "solver",
-    ),
-    *("synthetic", "synthetic.fixtures", "graph.viewgraph"),
+    *("base.errors", "scene.evaluation", "facts.options", "facts.result", "facts.map_result", "facts.tables"),
+    *("files.colmap.model", "files.colmap.quiet", "files.g2o", "files.glomap_text", "files.graph_text"),
+    *("files.nerf", "files.onedsfm", "files.opensfm", "files.tum", "pipeline", "pairs", "judgement"),
+    *("graph.rigidity", "graph.viewgraph", "placement.place", "placement.gauge", "placement.diagnosis"),
+    *("solver", "synthetic", "synthetic.fixtures", "synthetic.rendered_workspace", "synthetic.workspace"),
 )
 MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
 

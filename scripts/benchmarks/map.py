@@ -36,10 +36,10 @@ from harness.process import call, children_cpu_s, run_command, thread_environmen
 from harness.record import Check, Row, at_least, at_most, ratio, versions
 from harness.scenes import write_scene
 
-OURS = ("map", "map --bundle-adjust")
+OURS = ("map", "map --adjust full")
 MAPPERS, MIN_MATCHES = ("global", "incremental"), (15, 30)
 LARGEST_RATIO = 1.15
-"""Of the mean error of `map --bundle-adjust` on a further scene, to that of the better peer."""
+"""Of the mean error of `map --adjust full` on a further scene, to that of the better peer."""
 
 
 LIMITS: dict[str, tuple[tuple[float, float, int, float], ...]] = {

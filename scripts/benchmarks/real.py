@@ -70,7 +70,10 @@ ADJUSTED_SLACK = 1.15
 MADE = ("ring", "facade", "courtyard", "drive")
 MADE_SLACK = 1.05
 """How far what is delivered may be above full adjustment with rotations held."""
-DELIVERED, PLACED = "As delivered: placed, and adjusted to the pixels", "The placement alone (`--no-adjust`)"
+DELIVERED, PLACED = (
+    "As delivered: placed, and adjusted to the pixels",
+    "The placement alone (`--adjust none`)",
+)
 TIME, ADJUSTED = "Time and memory of `locate`, without bundle adjustment", "After bundle adjustment"
 AVERAGED, EXACT = "Rotations from averaging", "Made scenes with exact rotations"
 
@@ -229,10 +232,10 @@ BENCHMARK = Benchmark(
         " setting of min_num_matches) after their own bundle adjustment, as recorded for the data, not run"
         " again here; the limit is 15 % above it. Intrinsics are fixed. One run.",
         AVERAGED: "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15"
-        " matches or more), intrinsics of sparse/0, no centers; once with `--no-adjust` and once without."
+        " matches or more), intrinsics of sparse/0, no centers; once with `--adjust none` and once without."
         " The target is that of the kept rotations.",
         EXACT: "60 images, pixels off by 0.5 px, a twentieth of the matches wrong; mean position errors in"
-        " the scene's units. Full adjustment is `--bundle-adjust --rotations measured`.",
+        " the scene's units. Full adjustment is `--adjust full --rotations held`.",
     },
     closing=lambda _rows: [
         "Caveats: liberty* are judged against the model that gives their rotations, which flatters every"
