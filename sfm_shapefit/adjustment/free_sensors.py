@@ -1,16 +1,17 @@
 """Sensors that may move in their rigs: how well the observations tell where they are."""
 
 import math
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem
 from sfm_shapefit.adjustment.covariance import estimate_covariances
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
+from sfm_shapefit.scene.images import Images
 
 # Errors that keypoints share make those of a sensor's pose larger than the noise alone does, as those of a
 # focal length (`adjustment.free_lenses`).
@@ -31,28 +32,28 @@ class SensorSigma(NamedTuple):
     """Largest standard deviation of its rotation about an axis."""
 
 
-NO_SENSORS: Mapping[int, SensorSigma] = MappingProxyType({})
-"""Where rigs stay."""
-
-
 def judge_sensors(
-    camera_ids: Sequence[int], adjusted: AdjustmentProblem, options: AdjustmentOptions
+    images: Images, free: BoolArray, adjusted: AdjustmentProblem, options: AdjustmentOptions
 ) -> Mapping[int, SensorSigma]:
-    """Return how well the free sensors of a problem at its minimum are known, by the ids of their cameras.
+    """Return how well free sensors are known, by the ids of their cameras.
 
     Args:
-        camera_ids: (s,) those of the free sensors.
-        adjusted: the problem.
-        options: by which the minimum is one.
+        images: those of the problem.
+        free: (l,) lenses that moved in their rigs.
+        adjusted: the problem, at its minimum.
+        options: by which that is one.
 
     Raises:
         InputError: if the observations leave the pose of a sensor open.
     """
+    if not free.any():
+        return {}
     assert adjusted.rig is not None
     try:
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:
         raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
+    camera_ids = [images.lenses[k].id for k in np.flatnonzero(free).tolist()]
     longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max())
     limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
     off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)

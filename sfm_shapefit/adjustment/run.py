@@ -27,7 +27,7 @@ One thread does all, as the answer must not depend on their number.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,12 +42,12 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.estimate import UNREFINED, Estimate, RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import focal_sigmas
-from sfm_shapefit.adjustment.free_sensors import NO_SENSORS, SensorSigma, judge_sensors
+from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
-from sfm_shapefit.adjustment.views import observations, views_of
+from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -129,8 +129,8 @@ class AdjustmentRun:
 
     def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
         """Return the problem of points that were triangulated from tracks, at the poses of the images."""
-        sensors, seen = self.freedom.sensors(self.images), observations(tracks, found.points_seen)
-        return views_of(self.images).problem(self.images, sensors, self.given, found.points, seen)
+        sensors = self.freedom.sensors(self.images)
+        return views_of(self.images).problem(self.images, sensors, self.given, tracks, found)
 
     def problem_of_all(
         self, *, checked: bool = False
@@ -239,7 +239,7 @@ class AdjustmentRun:
         with_sensors: bool = True,
     ) -> Estimate:
         """Return where the images stand, and how well that is known at the optimum last solved for."""
-        known = self._center_errors(last)
+        known, free = self._center_errors(last), self.freedom.sensors(self.images) & with_sensors
         return Estimate(
             images=self.images,
             freedom=self.freedom,
@@ -247,19 +247,11 @@ class AdjustmentRun:
             covariances=None if known is None else known.covariances[self.images.frame_of],
             scale_sigma=None if known is None else known.scale_sigma,
             lenses=self.lenses,
-            sensors=self._judge_sensors(last) if with_sensors else NO_SENSORS,
+            sensors=judge_sensors(self.images, free, last, self.options_at_optimum()),
             initial_error_px=initial_error_px,
             converged=self.converged,
             iterations=self.iterations,
         )
-
-    def _judge_sensors(self, last: AdjustmentProblem) -> Mapping[int, SensorSigma]:
-        """Return how well free sensors are known, see `free_sensors`."""
-        free = np.flatnonzero(self.freedom.sensors(self.images))
-        if not len(free):
-            return NO_SENSORS
-        camera_ids = [self.images.lenses[k].id for k in free.tolist()]
-        return judge_sensors(camera_ids, last, self.options_at_optimum())
 
     def _center_errors(self, problem: AdjustmentProblem) -> CenterErrors | None:
         """Return how well centers and scale are known; None if that is not known.

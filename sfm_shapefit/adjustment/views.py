@@ -8,7 +8,6 @@ right angles to the camera or behind it.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,17 +19,6 @@ from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
-
-
-class Observations(NamedTuple):
-    """What cameras see of points."""
-
-    cameras: IntArray
-    """(o,)"""
-    points: IntArray
-    """(o,)"""
-    pixels: FloatArray
-    """(o, 2) as the lenses of the cameras take them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,18 +47,19 @@ class Views:
         images: Images,
         sensors: BoolArray,
         given: GivenPoses,
-        points: FloatArray,
-        seen: Observations,
+        tracks: ObservedTracks,
+        found: TriangulatedPoints,
     ) -> AdjustmentProblem:
-        """Return the problem of points and their observations, at the poses of the images.
+        """Return the problem of points, at the poses of the images.
 
         Args:
             images: those of the views.
             sensors: (l,) lenses that move in their rigs.
             given: what is known of their poses; rotations have no part yet.
-            points: (x, 3)
-            seen: what the cameras see of them.
+            tracks: observations of points.
+            found: the points.
         """
+        used = np.flatnonzero(found.points_seen >= 0)
         rotations, translations = self._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         is_plain = np.array_equal(frames, np.arange(len(images.frames.ids))) and not translations.any()
@@ -84,10 +73,10 @@ class Views:
         return AdjustmentProblem(
             rotations=images.frames.rotations,
             centers=images.frames.centers,
-            points=points,
-            cameras_seeing=seen.cameras,
-            points_seen=seen.points,
-            pixels=seen.pixels,
+            points=found.points,
+            cameras_seeing=tracks.cameras[used],
+            points_seen=found.points_seen[used],
+            pixels=tracks.pixels[used],
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
             rig=None if is_plain else rig,
@@ -144,12 +133,6 @@ def views_of(images: Images) -> Views:
         images=np.repeat(np.arange(images.num_images), [len(part) for part in parts]),
         rotations=np.concatenate(parts),
     )
-
-
-def observations(tracks: ObservedTracks, points_seen: IntArray) -> Observations:
-    """Return what tracks see of points, by the point of each of their observations, -1 for none."""
-    used = np.flatnonzero(points_seen >= 0)
-    return Observations(tracks.cameras[used], points_seen[used], tracks.pixels[used])
 
 
 def _lens_of_views(lens: Lens) -> Lens:

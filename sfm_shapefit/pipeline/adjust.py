@@ -17,7 +17,7 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.sources import collect_tracks
-from sfm_shapefit.adjustment.views import observations, views_of
+from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
@@ -25,6 +25,7 @@ from sfm_shapefit.files.colmap.points import ModelPictures, move_model, points_o
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
+from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 
 if TYPE_CHECKING:
     import pycolmap
@@ -84,21 +85,22 @@ def bundle_adjust(
     options = merge_options(options, AdjustmentOptions, overrides)
     images, points, tracks = read_bundle(reconstruction)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
-    seen = observations(tracks, np.where(has_ray, points.points_seen(), -1))
+    seen = np.where(has_ray, points.points_seen(), -1)
+    found = TriangulatedPoints(points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen)
     views, given = views_of(images), GivenPoses(fixed=np.isin(images.frames.ids, sorted(fixed_frames)))
-    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, points.xyz, seen)
+    problem = views.problem(images, np.zeros(len(images.lenses), np.bool_), given, tracks, found)
     if rotation_sigma_deg is not None:
         sigmas = np.full(problem.num_frames, np.radians(rotation_sigma_deg))
         prior = RotationPrior(rotations=problem.rotations, information=isotropic_information(sigmas))
         problem = replace(problem, rotation_prior=prior)
     adjusted = adjust(problem, options)
-    found = adjusted.problem
-    moved = views.images_of(images, found), replace(points, xyz=found.points)
+    solved = adjusted.problem
+    moved = views.images_of(images, solved), replace(points, xyz=solved.points)
     return AdjustedModel(
         reconstruction=move_model(reconstruction, *moved),
         frame_ids=tuple(images.frames.ids.tolist()),
         adjusted=adjusted,
-        covariances=estimate_covariances(found, options) if covariances else None,
+        covariances=estimate_covariances(solved, options) if covariances else None,
     )
 
 

@@ -12,7 +12,7 @@ from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.freedom import GivenPoses
-from sfm_shapefit.adjustment.views import observations, views_of
+from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.points import points_of
@@ -20,6 +20,7 @@ from sfm_shapefit.scene import lens
 from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
+from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.scenes import BUNDLED
 from tests.structures import (
     adjusted_placement,
@@ -102,8 +103,10 @@ def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
     points = points_of(given, images)
     assert points.ids.tolist() == sorted(given.point3D_ids())
     held = np.zeros(len(images.lenses), dtype=bool)
-    seen = observations(tracks, points.points_seen())
-    problem = views_of(images).problem(images, held, GivenPoses(), points.xyz, seen)
+    found = TriangulatedPoints(
+        points=points.xyz, tracks=np.arange(points.num_points), points_seen=points.points_seen()
+    )
+    problem = views_of(images).problem(images, held, GivenPoses(), tracks, found)
     assert problem.num_observations == given.compute_num_observations()
     errors = reprojection_errors_px(problem)
     sums = np.bincount(problem.points_seen, errors)
