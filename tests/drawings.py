@@ -8,7 +8,7 @@ from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
-from sfm_shapefit.report.drawing import Points, Poses, build_drawing
+from sfm_shapefit.report.drawing import DrawnPoints, Poses, build_drawing
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 
@@ -43,7 +43,7 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
         half_sizes=halves,
         focal_lengths_px=np.full(num_cameras, 1000.0),
     )
-    points = Points(
+    points = DrawnPoints(
         positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
         colors=rng.integers(60, 220, (num_points, 3)),
         num_all=3 * num_points,

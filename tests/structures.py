@@ -83,7 +83,7 @@ def placed(seed, estimate):
 def bundle_adjusted(seed, tracks, options=None, freedom=None):
     links, freedom = links_of(seed, tracks), freedom or Freedom()
     options = options or StructureOptions()
-    estimate, points = bundle_adjustment.bundle_adjust(posed_images(seed), links, options, freedom)
+    estimate, points = bundle_adjustment.adjust_seed(posed_images(seed), links, options, freedom)
     colors = tracks if isinstance(tracks, pycolmap.Reconstruction) else None
     found = placed(seed, estimate)
     return found._replace(reconstruction=with_points(found.reconstruction, points, options, colors))

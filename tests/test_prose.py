@@ -21,20 +21,6 @@ STILL_TO_DO = {
     "scene",
     "tracks",
 }
-# Public names that several modules still define. The list may only become shorter.
-STILL_ALIKE = {
-    "bundle_adjust",
-    "CameraPoses",
-    "Group",
-    "Images",
-    "Int32Array",
-    "Intrinsics",
-    "Measured",
-    "OnIteration",
-    "Options",
-    "Points",
-    "UInt64Array",
-}
 
 # The identifier would be the subject of such a sentence; the shape of an array may stand before it.
 OPENING = re.compile(
@@ -149,10 +135,7 @@ def test_no_two_public_names_are_alike():
             for name in names_of(statement):
                 if not name.startswith("_"):
                     homes[name].append(str(path.relative_to(PACKAGE)))
-    alike = {name: paths for name, paths in homes.items() if len(paths) > 1}
-    new = {name: paths for name, paths in alike.items() if name not in STILL_ALIKE}
-    assert not new
-    assert not STILL_ALIKE - set(alike), "these names stand for one thing now: take them off STILL_ALIKE"
+    assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
 
 
 def test_the_rules_see_what_they_are_to_see():

@@ -27,7 +27,7 @@ from sfm_shapefit import ViewGraph, locate
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
+from sfm_shapefit.scene.evaluation import NamedPoses, evaluate_poses
 
 EQUAL = 1.05
 """Differences below count as equal: the truth is no better."""
@@ -127,8 +127,8 @@ def _errors(centers: Mapping[str, FloatArray], folder: Path, scene: Scene) -> Er
     # Rotations are not compared.
     nowhere = np.tile(np.eye(3), (len(centers), 1, 1))
     position = evaluate_poses(
-        CameraPoses(tuple(centers), nowhere, np.array([*centers.values()])),
-        CameraPoses(truth.names, truth.rotations, truth.centers),
+        NamedPoses(tuple(centers), nowhere, np.array([*centers.values()])),
+        NamedPoses(truth.names, truth.rotations, truth.centers),
     ).position
     given = set(read_model(folder / "sparse" / "0").names) & set(truth.names)
     return Errors(position.median, position.mean, position.max, len(given - set(centers)))

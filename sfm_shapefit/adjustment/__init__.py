@@ -34,7 +34,7 @@ loss and stopping rule are kept so that answers can be compared.
 """
 
 from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
-from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
+from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnStep
 from sfm_shapefit.adjustment.problem import (
     AdjustmentProblem,
     LensPrior,
@@ -61,7 +61,7 @@ __all__ = [
     "FrameCovariances",
     "Lens",
     "LensPrior",
-    "OnIteration",
+    "OnStep",
     "Rig",
     "RotationPrior",
     "adjust",

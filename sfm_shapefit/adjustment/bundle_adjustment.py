@@ -19,7 +19,7 @@ from sfm_shapefit.tracks.options import StructureOptions
 _NOTHING_GIVEN = GivenPoses()
 
 
-def bundle_adjust(
+def adjust_seed(
     images: Images,
     links: Links,
     options: StructureOptions,
@@ -75,7 +75,7 @@ def adjust_thinly(
             length that few points leave a thousandth off. Up to 2,000 frames.
 
     Returns:
-        The gauge is as from `bundle_adjust`.
+        The gauge is as from `adjust_seed`.
 
     Raises:
         UnsolvableError: if no point can be triangulated.

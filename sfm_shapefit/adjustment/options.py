@@ -24,7 +24,7 @@ class AdjustmentStep:
     """Whether this iteration lowered the cost."""
 
 
-OnIteration = Callable[[AdjustmentStep], bool | None]
+OnStep = Callable[[AdjustmentStep], bool | None]
 """Called after each iteration; returning False, or raising, cancels the adjustment."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
-from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
+from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnStep
 from sfm_shapefit.adjustment.priors import (
     add_center_prior,
     add_lens_prior,
@@ -104,7 +104,7 @@ def adjust(
     problem: AdjustmentProblem,
     options: AdjustmentOptions | None = None,
     *,
-    on_iteration: OnIteration | None = None,
+    on_iteration: OnStep | None = None,
     **overrides: Any,
 ) -> Adjusted:
     """Minimize the reprojection errors over centers, points and what the options free.
@@ -277,7 +277,7 @@ class _Run:
         observed = sum_losses(self.layout, values, self.options.loss_scale_px, self.workers)
         return observed + sum_priors(self.problem, values, self.options.noise_px)
 
-    def iterate(self, on_iteration: OnIteration | None) -> Ending:
+    def iterate(self, on_iteration: OnStep | None) -> Ending:
         """Take steps until a reason to stop."""
         while True:
             normal = self.linearize()
@@ -297,7 +297,7 @@ class _Run:
         self.gradient_norm = _gradient_norm(normal, self.costs[-1])
         return normal
 
-    def lower(self, normal: NormalEquations, on_iteration: OnIteration | None) -> Ending | None:
+    def lower(self, normal: NormalEquations, on_iteration: OnStep | None) -> Ending | None:
         """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
         while True:
             if self.iterations >= self.options.max_iterations:

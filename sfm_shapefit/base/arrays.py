@@ -40,3 +40,4 @@ def hand_back_memory() -> None:
 
 Int32Array = npt.NDArray[np.int32]
 UInt32Array = npt.NDArray[np.uint32]
+UInt64Array = npt.NDArray[np.uint64]

@@ -105,14 +105,14 @@ class Option(NamedTuple):
     kind: Any
 
 
-class Group(NamedTuple):
+class OptionGroup(NamedTuple):
     """The single options that one settings class states itself, and what they are about."""
 
     title: str
     options: tuple[Option, ...]
 
 
-def setting_groups(settings: type[S], defaults: S | None = None) -> Iterator[Group]:
+def setting_groups(settings: type[S], defaults: S | None = None) -> Iterator[OptionGroup]:
     """Yield the options of a settings class: its own first, then those of its groups.
 
     The title of a group is the first sentence of its class.
@@ -126,7 +126,7 @@ def setting_groups(settings: type[S], defaults: S | None = None) -> Iterator[Gro
             said = item.metadata
             own.append(Option(item.name, value, said["help"], said["also"], kinds[item.name]))
     if own:
-        yield Group((settings.__doc__ or settings.__name__).split("\n")[0].rstrip("."), tuple(own))
+        yield OptionGroup((settings.__doc__ or settings.__name__).split("\n")[0].rstrip("."), tuple(own))
     for value in inside:
         yield from setting_groups(type(value), value)
 

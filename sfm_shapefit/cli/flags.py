@@ -12,9 +12,8 @@ from typing import Annotated, Any, TypeVar
 import typer
 from typer.core import TyperCommand
 
-from sfm_shapefit.base.settings import Settings, hint, homes_of, option, setting_groups
+from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
 
-Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
 
 # COLMAP's own names for paths are accepted beside the positional ones.
@@ -65,7 +64,7 @@ ExecutorName = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Config = Annotated[Path | None, typer.Option("--config", help="Options from a TOML file; flags win over it.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Images = Annotated[
+ImageFolder = Annotated[
     Path | None,
     typer.Option(
         "--images", metavar="DIR", help="Folder of the images: small pictures of them are in the report."
@@ -319,7 +318,7 @@ def _word_or_number(text: str) -> str | float:
         return text
 
 
-def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
+def read_options(settings: type[S], given: dict[str, Any], config: Path | None = None) -> S:
     """Return options from a TOML file, if there is one, and the flags that were given, which win.
 
     Flags are None where the user says nothing; what is no field of the class is left to others.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import typer
 
 from sfm_shapefit.base.display import row
-from sfm_shapefit.base.settings import flat_values
+from sfm_shapefit.base.settings import S, flat_values
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     catch_termination,
@@ -22,7 +22,7 @@ from sfm_shapefit.cli.console import (
     report_errors,
     show_progress,
 )
-from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
+from sfm_shapefit.cli.flags import OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
@@ -36,10 +36,10 @@ _NOTICED_S = 1.0
 
 
 @dataclass(slots=True, kw_only=True)
-class Run(Generic[Options]):
+class Run(Generic[S]):
     """A command at work: what it was told, and what it has to show in the end."""
 
-    options: Options
+    options: S
     flags: OutputFlags
     protect: list[Path]
     """Inputs, which OUT must not be, nor contain."""
@@ -130,12 +130,12 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
 
 @contextmanager
 def command_run(
-    settings: type[Options],
+    settings: type[S],
     given: dict[str, Any],
     target: Path,
     inputs: Sequence[Path | None],
     order: str = "MODEL OUT",
-) -> Iterator[Run[Options]]:
+) -> Iterator[Run[S]]:
     """Run a command that makes OUT: errors become one sentence and an exit code, and OUT is whole or absent.
 
     The first input is that which stands before OUT, `order` the names of both. Flags of `settings` and of

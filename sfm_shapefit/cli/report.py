@@ -14,7 +14,7 @@ from sfm_shapefit.cli.console import (
     report_errors,
     show_progress,
 )
-from sfm_shapefit.cli.flags import Database, GroupedCommand, Images, one_path
+from sfm_shapefit.cli.flags import Database, GroupedCommand, ImageFolder, one_path
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def report_command(
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
-    images: Images = None,
+    images: ImageFolder = None,
 ) -> None:
     """Write OUT/report.html anew from the other files of OUT; of any other COLMAP model, write FILE.
 

@@ -20,7 +20,7 @@ from sfm_shapefit.cli.flags import (
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
-Images = Annotated[
+DrawImages = Annotated[
     bool, typer.Option("--images", help="Draw images, and let COLMAP find the keypoints and matches in them.")
 ]
 
@@ -33,7 +33,7 @@ Images = Annotated[
 )
 @takes(flags_of(SceneOptions), flags_of(WorkspaceOptions), flags_of(RenderOptions))
 def synth_command(
-    out: OutArgument = None, *, output_path: OutputPath = None, images: Images = False, **given: Any
+    out: OutArgument = None, *, output_path: OutputPath = None, images: DrawImages = False, **given: Any
 ) -> None:
     """Make a synthetic COLMAP workspace in OUT: a database, a model, the exact truth, and images if asked."""
     target = one_path(out, output_path, "OUT")

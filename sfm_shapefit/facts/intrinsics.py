@@ -70,7 +70,7 @@ class CameraIntrinsics(Record):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Intrinsics:
+class DoubtedIntrinsics:
     """Cameras whose intrinsics are in doubt, and what became of them; by COLMAP's ids of cameras."""
 
     given: "Mapping[int, pycolmap.Camera]" = field(default_factory=dict)
@@ -84,7 +84,7 @@ class Intrinsics:
     refined: RefinedLenses = UNREFINED
     """What the adjustments made of them."""
 
-    def after(self, refined: RefinedLenses, free: FreeLenses) -> "Intrinsics":
+    def after(self, refined: RefinedLenses, free: FreeLenses) -> "DoubtedIntrinsics":
         """Return the same after one more adjustment; what it left open is held from then on."""
         undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *refined.undetermined)))
         together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined)
@@ -121,7 +121,7 @@ class Intrinsics:
         )
 
 
-NO_DOUBTS = Intrinsics()
+NO_DOUBTS = DoubtedIntrinsics()
 """Every camera is calibrated, or taken as it is."""
 
 
@@ -146,7 +146,7 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     return ["; ".join(parts) + "; each stands in locate.json"]
 
 
-def intrinsics_warnings(intrinsics: Intrinsics, rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
+def intrinsics_warnings(intrinsics: DoubtedIntrinsics, rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     """Yield which cameras keep a focal length that was never measured."""
     guessed = [row for row in rows if intrinsics.origins[row.camera] is not Origin.CALIBRATION]
     for how, what in (

@@ -14,7 +14,7 @@ from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
-from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
     BundleAdjustment,
@@ -152,7 +152,7 @@ class LocateResult(Displayed):
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
 
-    intrinsics: Intrinsics = field(default_factory=Intrinsics)
+    intrinsics: DoubtedIntrinsics = field(default_factory=DoubtedIntrinsics)
     """Cameras whose intrinsics were in doubt, and what became of them."""
     rigs: tuple[RefinedSensor, ...] = ()
     """The sensors that were refined in their rigs."""

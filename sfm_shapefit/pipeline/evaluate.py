@@ -12,8 +12,8 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
 from sfm_shapefit.scene.evaluation import (
-    CameraPoses,
     Evaluation,
+    NamedPoses,
     PositionEvaluation,
     evaluate_poses,
     evaluate_positions,
@@ -47,7 +47,7 @@ def evaluate(
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
     models = read_model(reconstruction), read_model(reference)
-    poses, truth = (CameraPoses(model.names, model.rotations, model.centers) for model in models)
+    poses, truth = (NamedPoses(model.names, model.rotations, model.centers) for model in models)
     return evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
 
 

@@ -19,13 +19,11 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context, resource_tracker
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 from sfm_shapefit.base.errors import MissingExtraError
-from sfm_shapefit.base.executors import Advance, WorkerError, answers
+from sfm_shapefit.base.executors import Advance, Answer, WorkerError, answers
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
-
-Measured = TypeVar("Measured")
 
 MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work for directions, and 230 MB."""
@@ -34,10 +32,10 @@ _RETRIES = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairWork(Generic[Measured]):
+class PairWork(Generic[Answer]):
     """What to measure of the pairs of a database."""
 
-    estimate: Callable[[MatchBatch], Measured]
+    estimate: Callable[[MatchBatch], Answer]
     """A function of a module, or a `partial` of one, so that other processes find it."""
     min_matches: int = 1
     """Pairs with fewer are left out."""
@@ -45,8 +43,8 @@ class PairWork(Generic[Measured]):
 
 
 def measure_with_workers(
-    view: View[Any], work: PairWork[Measured], executor: Executor, advance: Advance
-) -> list[Measured]:
+    view: View[Any], work: PairWork[Answer], executor: Executor, advance: Advance
+) -> list[Answer]:
     """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
 
     The executor is not shut down; `advance` is told of the pairs that are done and of their number.
@@ -55,7 +53,7 @@ def measure_with_workers(
         WorkerError: if a worker died and the executor does not replace it.
         InputError: as a worker found the database.
     """
-    found: list[Measured] = []
+    found: list[Answer] = []
     done = 0
     for part, measured in answers(executor, partial(measure_part, work), view.parts(work.matches_per_task)):
         found += measured
@@ -64,7 +62,7 @@ def measure_with_workers(
     return found
 
 
-def measure_part(work: PairWork[Measured], part: MatchPart) -> list[Measured]:
+def measure_part(work: PairWork[Answer], part: MatchPart) -> list[Answer]:
     """Return what is measured of the pairs of a part, a value per batch; what a worker runs."""
     with part.open() as view:
         return [work.estimate(batch) for batch in view.batches(work.min_matches)]

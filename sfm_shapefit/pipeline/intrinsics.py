@@ -1,7 +1,7 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
 from sfm_shapefit.files.colmap.intrinsics import (
     Origin,
     calibrate_view_graph,
@@ -23,7 +23,7 @@ def settle_intrinsics(
     file: DatabaseFile | None,
     wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
-) -> tuple[PosedModel, Intrinsics]:
+) -> tuple[PosedModel, DoubtedIntrinsics]:
     """Return the model to start from, and which intrinsics the adjustments may change.
 
     Args:
@@ -46,7 +46,7 @@ def settle_intrinsics(
         by_database = calibrate_view_graph(file, asked, left_out)
         factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}
         factors = {i: factor for i, factor in factors.items() if 1.0 / _MOST_OFF <= factor <= _MOST_OFF}
-    intrinsics = Intrinsics(
+    intrinsics = DoubtedIntrinsics(
         given={i: cameras[i] for i in origins},
         origins=origins,
         free=FreeLenses(doubts, distortion=wanted != "focal"),

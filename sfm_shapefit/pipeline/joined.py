@@ -58,7 +58,7 @@ class ToldOfJoins(NamedTuple):
     """Pairs of images whose matches say nothing."""
 
 
-class Group(NamedTuple):
+class JoinedGroup(NamedTuple):
     """Models in the world of the first of them."""
 
     reconstruction: "pycolmap.Reconstruction"
@@ -68,7 +68,7 @@ class Group(NamedTuple):
 
 
 def tell_group(
-    group: Group,
+    group: JoinedGroup,
     models: Sequence[MappedModel],
     matches: Matches,
     told: ToldOfJoins,
@@ -133,7 +133,7 @@ def tell_group(
 
 
 def _choose_scale(
-    group: Group, first: Gauge, known: Sequence[KnownDistance]
+    group: JoinedGroup, first: Gauge, known: Sequence[KnownDistance]
 ) -> tuple[Gauge, Similarity | None]:
     """Return the gauge of joined models, and the similarity that leads to it, if it is not the first one's.
 
@@ -155,7 +155,7 @@ def _choose_scale(
     return replace(first, statement=f"that of model {number}: {first.statement}", warning=warning), None
 
 
-def _rescaled(group: Group, similarity: Similarity | None) -> Group:
+def _rescaled(group: JoinedGroup, similarity: Similarity | None) -> JoinedGroup:
     """Return the models under a similarity of their world."""
     if similarity is None:
         return group
@@ -166,7 +166,7 @@ def _rescaled(group: Group, similarity: Similarity | None) -> Group:
 
 
 def _camera_rows(
-    examined: Sequence[CameraRow], group: Group, models: Sequence[MappedModel]
+    examined: Sequence[CameraRow], group: JoinedGroup, models: Sequence[MappedModel]
 ) -> Iterator[CameraRow]:
     """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
     own = {row.name: (row, number) for number in group.world_from for row in models[number].located.cameras}
@@ -184,7 +184,7 @@ def _camera_rows(
             yield CameraRow(name=name, reason=row.reason, trust=row.trust)
 
 
-def _variances_of_joins(group: Group) -> dict[int, float]:
+def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     """Return what the joins add to the variance of a center along an axis, by the number of its model."""
     found = dict.fromkeys(group.world_from, 0.0)
     for done in group.joins:  # ascending, so that the larger model is there
@@ -208,7 +208,7 @@ def _errors(
 
 
 def _judge(
-    weak: Sequence[str], reasons: tuple[str, ...], group: Group, models: Sequence[MappedModel]
+    weak: Sequence[str], reasons: tuple[str, ...], group: JoinedGroup, models: Sequence[MappedModel]
 ) -> ModelVerdict:
     """Return the verdict: what was seen of the joined model, and those of its models."""
     verdicts = {number: models[number].located.verdict for number in group.world_from}

@@ -18,7 +18,7 @@ from sfm_shapefit.files.colmap.model import PosedModel, observed_points
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.joined import Group, ToldOfJoins, tell_group
+from sfm_shapefit.pipeline.joined import JoinedGroup, ToldOfJoins, tell_group
 from sfm_shapefit.placement.join import (
     ModelJoin,
     PlacedByPriors,
@@ -283,7 +283,9 @@ def _unless_refused(found: PlacedByPriors | str | None) -> PlacedByPriors:
     raise UnsolvableError(found or _NOTHING_IN_COMMON)
 
 
-def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence) -> Iterator[Group]:
+def _merge(
+    models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence
+) -> Iterator[JoinedGroup]:
     """Yield the models that were joined, each group in the world of its largest."""
     merging = [_Merging(model.located.reconstruction, number) for number, model in enumerate(models)]
     root = list(range(len(models)))
@@ -293,7 +295,7 @@ def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Ev
             merging[root[done.to]].add(done, models[done.model], evidence.same_points(done))
     for merged in merging:
         if merged.joins:
-            yield Group(merged.reconstruction, merged.world_from, merged.joins)
+            yield JoinedGroup(merged.reconstruction, merged.world_from, merged.joins)
 
 
 class _Merging:

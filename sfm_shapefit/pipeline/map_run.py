@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.intrinsics import Intrinsics
+from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
@@ -91,7 +91,7 @@ class MapRun(NamedTuple):
     """(n,)"""
     sensor_rotations: FloatArray
     """(n, 3, 3) sensor_from_rig of each image."""
-    intrinsics: Intrinsics
+    intrinsics: DoubtedIntrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
     control: ControlPoints | None

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.bundle_adjustment import bundle_adjust
+from sfm_shapefit.adjustment.bundle_adjustment import adjust_seed
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
@@ -170,7 +170,7 @@ def _make_points(
         if options.freedom.adjust == "full":  # which triangulates at the poses of the start itself
             assert links is not None
             freedom, given = located.freedom.of(posed.frames), located.given_of(posed, model)
-            adjusted, points = bundle_adjust(posed.images, links, options.structure, freedom, given)
+            adjusted, points = adjust_seed(posed.images, links, options.structure, freedom, given)
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         elif own:
             limits = options.structure

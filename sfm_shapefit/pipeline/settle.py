@@ -25,7 +25,7 @@ from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
-from sfm_shapefit.facts.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
+from sfm_shapefit.facts.intrinsics import NO_DOUBTS, DoubtedIntrinsics, intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
@@ -95,7 +95,7 @@ class Told(NamedTuple):
     control: ControlPoints | None = None
     gravity: Gravity | None = None
     """Turns the model upright."""
-    intrinsics: Intrinsics = NO_DOUBTS
+    intrinsics: DoubtedIntrinsics = NO_DOUBTS
     """Which intrinsics are in doubt, and what became of them so far."""
     rigs: Mapping[int, Any] | None = None
     """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
@@ -128,7 +128,7 @@ class Stand(NamedTuple):
     """The matches, at the rotations that the piece has now."""
     directions: PairDirections
     located: Located
-    intrinsics: Intrinsics
+    intrinsics: DoubtedIntrinsics
     estimate: Estimate | None = None
     """Of the last adjustment; None if there was none."""
     scale: float = 1.0

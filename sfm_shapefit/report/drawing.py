@@ -155,7 +155,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Points:
+class DrawnPoints:
     """The 3D points that are drawn."""
 
     positions: FloatArray
@@ -176,7 +176,7 @@ class Drawing:
 
     cameras: Cameras
     pairs: Pairs
-    points: Points
+    points: DrawnPoints
     axes: FloatArray
     """(3, 3) rows: to the right, forward and up as seen by the cameras, in the output's axes."""
     frustum_depth: float
@@ -387,10 +387,10 @@ def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatAr
     return angles
 
 
-def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArray) -> Points:
+def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArray) -> DrawnPoints:
     """Return at most MAX_POINTS points, evenly picked, without those far out that would shrink the rest."""
     if reconstruction is None or reconstruction.num_points3D() == 0:
-        return Points(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
+        return DrawnPoints(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
     points = reconstruction.points3D
     ids = sorted(points.keys())
     count = min(len(ids), MAX_POINTS)
@@ -401,7 +401,7 @@ def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArra
     middle = np.median(both, axis=0)
     limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(positions - middle, axis=1) <= limit
-    return Points(
+    return DrawnPoints(
         positions=positions[near],
         colors=colors[near],
         num_all=len(ids),

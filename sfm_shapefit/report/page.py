@@ -35,7 +35,7 @@ from sfm_shapefit.report.charts import (
     track_length_bars,
     view_graph_matrix,
 )
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, Points, input_centers
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, DrawnPoints, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.sentences import (
     MAX_TEXT,
@@ -377,7 +377,7 @@ def _histogram_note(medians_deg: dict[str, float]) -> str:
     return f"Angle between what the matches of a pair say and where its cameras stand; medians: {medians}."
 
 
-def _tracks_note(points: Points) -> str:
+def _tracks_note(points: DrawnPoints) -> str:
     if not len(points.track_lengths):
         return ""
     share = float(np.mean(points.track_lengths <= 2))
@@ -387,7 +387,7 @@ def _tracks_note(points: Points) -> str:
     return f"{said}{weak}{_sample(points)}"
 
 
-def _reprojection_note(points: Points) -> str:
+def _reprojection_note(points: DrawnPoints) -> str:
     known = points.errors_px[np.isfinite(points.errors_px)]
     if not len(known):
         return ""
@@ -398,7 +398,7 @@ def _reprojection_note(points: Points) -> str:
     )
 
 
-def _sample(points: Points) -> str:
+def _sample(points: DrawnPoints) -> str:
     if len(points.track_lengths) >= points.num_all:
         return ""
     return f" Counted over {len(points.track_lengths):,} points, evenly picked."

@@ -62,7 +62,7 @@ _COLLINEAR_RATIO = 1e-3
 _ORTHOGONALITY_TOLERANCE = 1e-4
 
 
-class CameraPoses(NamedTuple):
+class NamedPoses(NamedTuple):
     """n cameras, known by their names."""
 
     names: Sequence[str]
@@ -243,8 +243,8 @@ class Evaluation(Displayed):
 
 
 def evaluate_poses(
-    model: CameraPoses,
-    reference: CameraPoses,
+    model: NamedPoses,
+    reference: NamedPoses,
     thresholds: Sequence[float] = (),
     *,
     trajectory: bool = False,
@@ -302,7 +302,7 @@ def evaluate_poses(
     )
 
 
-def _check_poses(owner: str, poses: CameraPoses) -> None:
+def _check_poses(owner: str, poses: NamedPoses) -> None:
     """Raise InputError unless names, rotations and centers are distinct, matching, finite and orthogonal."""
     names, rotations, centers = poses.names, poses.rotations, poses.centers
     count = len(names)

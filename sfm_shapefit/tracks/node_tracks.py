@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -33,7 +32,6 @@ _MIN_VIEWS = 3
 _MAX_MATCHES = 10_000_000
 # Rays farther apart gain nothing more, and are often wrong.
 _WIDEST_RAD = 0.5
-Int32Array = npt.NDArray[np.int32]
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 

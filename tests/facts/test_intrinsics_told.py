@@ -9,7 +9,7 @@ from sfm_shapefit.adjustment.estimate import RefinedLenses
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.facts.intrinsics import (
     CameraIntrinsics,
-    Intrinsics,
+    DoubtedIntrinsics,
     describe_intrinsics,
     intrinsics_warnings,
 )
@@ -78,7 +78,7 @@ def test_many_cameras_are_told_in_one_sentence():
 
 def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     doubt = LensDoubt(Lens("SIMPLE_RADIAL", (1000.0, 600.0, 450.0, 0.0)), 0.3, 0.1)
-    known = Intrinsics(
+    known = DoubtedIntrinsics(
         origins={1: Origin.GUESS, 2: Origin.GUESS, 3: Origin.CALIBRATION},
         free=FreeLenses({1: doubt, 2: doubt, 3: doubt}, distortion=True),
         view_graph={1: 1.1},

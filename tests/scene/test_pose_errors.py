@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.scene import pose_errors
-from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
+from sfm_shapefit.scene.evaluation import NamedPoses, evaluate_poses
 from sfm_shapefit.scene.pose_errors import (
     ComparedPoses,
     area_under_recall,
@@ -56,7 +56,7 @@ def test_missing_cameras_fail_in_all_their_pairs():
     truth = poses(3, 10)
     names = [f"{k}.jpg" for k in range(10)]
     found = evaluate_poses(
-        CameraPoses(names[:6], truth.rotations[:6], truth.centers[:6]), CameraPoses(names, *truth)
+        NamedPoses(names[:6], truth.rotations[:6], truth.centers[:6]), NamedPoses(names, *truth)
     )
     for auc in found.relative_pose_aucs:
         assert auc.auc == pytest.approx(15 / 45, abs=1e-6)
@@ -106,8 +106,8 @@ def test_a_trajectory_follows_the_names_whatever_the_order_of_the_cameras():
     order = np.array([3, 0, 4, 2, 1])
     found = [
         evaluate_poses(
-            CameraPoses(names.tolist(), rotations, moved),
-            CameraPoses(names[o].tolist(), rotations[o], line[o]),
+            NamedPoses(names.tolist(), rotations, moved),
+            NamedPoses(names[o].tolist(), rotations[o], line[o]),
             trajectory=True,
         ).trajectory
         for o in (np.arange(5), order)

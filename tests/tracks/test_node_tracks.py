@@ -10,7 +10,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.scene.evaluation import CameraPoses, evaluate_poses
+from sfm_shapefit.scene.evaluation import NamedPoses, evaluate_poses
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 
@@ -210,7 +210,7 @@ def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_can
         names = [str(k) for k in range(len(centers))]
         rotations = np.tile(np.eye(3), (len(centers), 1, 1))
         found = evaluate_poses(
-            CameraPoses(names, rotations, placement.locations), CameraPoses(names, rotations, centers)
+            NamedPoses(names, rotations, placement.locations), NamedPoses(names, rotations, centers)
         )
         errors[name] = found.position.max / np.ptp(centers[:, 0])
     assert errors["points"] < 3e-3  # of the street's length

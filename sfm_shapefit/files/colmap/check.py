@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.arrays import IntArray, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.files.lines import refuse_database, refuse_irregular_file
@@ -57,8 +57,6 @@ _FRAME_DATA = struct.Struct("<iIQ")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
 _POINT3D_BYTES = 51  # id 8, xyz 24, rgb 3, error 8, track length 8
 _TRACK_ELEMENT_BYTES = 8
-
-UInt64Array = npt.NDArray[np.uint64]
 
 
 def check_model_files(folder: Path) -> None:

@@ -11,7 +11,6 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt64Array, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
@@ -30,8 +29,6 @@ from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.posed_model import PosedModelFile
-
-UInt64Array = npt.NDArray[np.uint64]
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
@@ -367,20 +364,3 @@ def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
     keypoints = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
     points = image.get_observation_points2D()
     return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
-
-
-def sort_observations(
-    parts: Sequence[tuple[UInt64Array, IntArray, FloatArray]],
-) -> tuple[UInt64Array, IntArray, IntArray, FloatArray]:
-    """Join what images observe, sorted by point; a point's images, and keypoints in an image, stay ascending.
-
-    Args:
-        parts: for each image the ids of its points, ascending keypoints, and a value (., d) for each.
-
-    Returns:
-        Ids of points, positions of images in `parts`, keypoints and values of all observations.
-    """
-    images = np.repeat(np.arange(len(parts)), [len(ids) for ids, _, _ in parts])
-    ids, keypoints, values = (np.concatenate(column) for column in zip(*parts, strict=True))
-    order = np.argsort(ids, kind="stable")
-    return ids[order], images[order], keypoints[order], values[order]

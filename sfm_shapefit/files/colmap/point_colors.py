@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import Int32Array, IntArray
-from sfm_shapefit.files.colmap.model import UInt64Array, observed_points, points2d_xy
+from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
+from sfm_shapefit.files.colmap.model import observed_points, points2d_xy
 
 
 class SeenColors(NamedTuple):
