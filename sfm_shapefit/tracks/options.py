@@ -5,7 +5,7 @@ from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
 
-Points = Literal["auto", "never", "always"]
+PointNodes = Literal["auto", "never", "always"]
 
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
@@ -16,7 +16,7 @@ _MAX_CAMERAS_WITH_POINTS = 5_000
 class NodeOptions(Settings):
     """3D points in the view graph."""
 
-    points: Points = option(
+    points: PointNodes = option(
         "auto",
         "3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what "
         'directions between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 '
