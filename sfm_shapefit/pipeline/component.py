@@ -17,7 +17,7 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import pairs_among
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
-from sfm_shapefit.pipeline.inputs import see_matches
+from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import Told, settle
@@ -25,7 +25,6 @@ from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Visit
-from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.matches import PairNames
 
 
@@ -74,32 +73,38 @@ def locate_components(
 def _locate_component(
     run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
 ) -> LocateResult:
-    """Place one component, on the position priors of its images if they can set a scale."""
-    priors = None if run.priors is None else run.priors.of(members)
-    if priors is None or len(priors) < FEWEST_PRIORS:
-        return _locate_with_priors(run, members, averaging, relative, None)
+    """Place one component: adjust a first placement, and locate from the rotations of that."""
+    source, told = _first_adjusted(run, members, averaging, relative)
+    with run.clock("locate"):
+        found = _settle(run, source, told)
+    ends = members[found.directions.pairs].tolist()
+    unknown = (np.nan, np.nan)
+    scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
+    return replace(
+        found,
+        triplet_scores=scores[:, 0],
+        matched_shares=scores[:, 1],
+        suspicions=tuple(_suspicions(averaging)),
+    )
+
+
+def _settle(run: MapRun, source: MatchSource, told: Told) -> LocateResult:
+    """Settle a component on the position priors of its images, if they can set a scale."""
     try:
-        return _locate_with_priors(run, members, averaging, relative, priors)
+        return settle(source, told, run.options, run.clock.anew())
     except UselessPriorsError as error:  # which other components need not share
-        found = _locate_with_priors(run, members, averaging, relative, None)
+        found = settle(source, told._replace(priors=None), run.options, run.clock.anew())
         return replace(
             found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
         )
 
 
-def _locate_with_priors(
-    run: MapRun,
-    members: IntArray,
-    averaging: AveragedRotations,
-    relative: RelativeRotations,
-    priors: PositionPriors | None,
-) -> LocateResult:
-    """Place one component: adjust a first placement, and locate from the rotations of that."""
+def _first_adjusted(
+    run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
+) -> tuple[MatchSource, Told]:
+    """Return the matches of a component at the rotations of its first placement, and what is told of it."""
     image_ids = run.unposed.image_ids[members].tolist()
-    control = None if run.control is None else run.control.of(members)
-    gravity = None if run.gravity is None else run.gravity.among(members)
     names = {run.unposed.names[k] for k in members.tolist()}
-    distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
     model = run.pose(image_ids, averaging.rotations)
     inputs = run.inputs_of(model)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
@@ -115,29 +120,20 @@ def _locate_with_priors(
         intrinsics = intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses)
         source = averaged.at(run.pose_as(image_ids, first))
         rigid = find_rigid_parts(source.model, run.options.placement)
+    priors = None if run.priors is None else run.priors.of(members)
     told = Told(
         inputs,
         rigid,
         np.inf,
-        distances=distances,
-        priors=priors,
-        control=control,
-        gravity=gravity,
+        distances=tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names),
+        priors=priors if priors is not None and len(priors) >= FEWEST_PRIORS else None,
+        control=None if run.control is None else run.control.of(members),
+        gravity=None if run.gravity is None else run.gravity.among(members),
         intrinsics=intrinsics,
         rigs=sensors_of(model.reconstruction),
         near=first,
     )
-    with run.clock("locate"):
-        found = settle(source, told, run.options, run.clock.anew())
-    ends = members[found.directions.pairs].tolist()
-    unknown = (np.nan, np.nan)
-    scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
-    return replace(
-        found,
-        triplet_scores=scores[:, 0],
-        matched_shares=scores[:, 1],
-        suspicions=tuple(_suspicions(averaging)),
-    )
+    return source, told
 
 
 def _false_pairs(model: PosedModel, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline import execution, relative_rotations
 from sfm_shapefit.pipeline.execution import open_executor
+from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
@@ -107,7 +109,7 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
     assert scales == {True: "unit", False: "prior"}
 
 
-def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path):
+def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path, monkeypatch):
     truth = read_model(RING / "sparse" / "0")
     ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
     across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
@@ -117,7 +119,10 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
     rows = zip(truth.names, positions, strict=True)
     table.write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
     path = changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}")
+    first = Mock(wraps=adjust_first_placement)
+    monkeypatch.setattr("sfm_shapefit.pipeline.component.adjust_first_placement", first)
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
+    assert first.call_count == 2  # priors that are given up leave what came before them
     scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
     assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
     said = "the scale is not that of position priors: the position priors coincide"
