@@ -162,12 +162,12 @@ def _make_points(
     model, adjusted, links, advance = source.model, None, None, clock.advance
     images = pose_images(model, located)
     posed = posed_part(images)
-    own = not source.has_database
+    own, adjusts = not source.has_database, options.freedom.adjust == "full"
     with clock("structure"):
-        if not own or options.freedom.adjust == "full":
+        if adjusts or not own:
             links = read_links(source, located, posed, advance)
-    with clock("bundle adjustment" if options.freedom.adjust == "full" else "triangulation"):
-        if options.freedom.adjust == "full":  # which triangulates at the poses of the start itself
+    with clock("bundle adjustment" if adjusts else "triangulation"):
+        if adjusts:  # which triangulates at the poses of the start itself
             assert links is not None
             freedom, given = located.freedom.of(posed.frames), located.given_of(posed, model)
             adjusted, points = adjust_seed(posed.images, links, options.structure, freedom, given)

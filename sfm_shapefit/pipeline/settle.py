@@ -12,7 +12,7 @@ Each rigid piece goes through all that follows `place`. A further piece has a un
 told of positions says how large it is, and where.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.free_sensors import SensorSigma
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
@@ -66,7 +67,7 @@ from sfm_shapefit.pipeline.measure import (
 from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
 from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
-from sfm_shapefit.placement.gauge import tell_scale
+from sfm_shapefit.placement.gauge import Gauge, tell_scale
 from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import compare_with_priors
@@ -211,18 +212,13 @@ def finish_piece(
         scale = located.gauge.similarity.scale
         judged = with_uncertainty(judged, given, seeded.adjusted, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses, seeded.adjusted.freedom.lenses)
-    sensors = {} if told.near is None else dict(told.near.adjusted.sensors)
-    for done in (stand.adjustment, seeded.adjusted):
-        sensors |= {} if done is None else done.sensors
-    if stand.located.freedom.has_sensors and not sensors:
-        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
+    sensors = _refined_sensors(stand, told, seeded.adjusted)
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     model, directions = stand.source.model, stand.directions
+    named = zip(model.names, model.image_ids.tolist(), strict=True)
+    unsupported = [name for name, image_id in named if image_id in seeded.unsupported]
     centers = _centers_of(model, seeded.reconstruction)
-    there = np.flatnonzero(np.isfinite(centers[:, 0]))
-    unused = () if located.rule is None else located.rule.check(gauge, there, centers[there])
-    not_unit = options.gauge.scale == "unit" and gauge.scale != "unit"
     prior_angles = None
     if told.priors is not None and gauge.scale == "prior" and gauge.axes is not None:
         prior_angles = compare_with_priors(
@@ -248,14 +244,12 @@ def finish_piece(
         warnings=(
             *focal_warnings(model, focal_doubts, intrinsics.refined.undetermined),
             *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
-            *_collect_warnings(stand.source, directions, judged, located),
-            *_structure_warnings(stand.source, seeded.reconstruction.num_points3D()),
+            *_collect_warnings(stand, judged, located, seeded.reconstruction.num_points3D()),
             *prior_warnings(prior_angles, directions.pairs, model.names),
-            *unused,
-            *([f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"] if not_unit else []),
+            *_gauge_warnings(located, gauge, centers, options.gauge.scale),
             *of_control,
             *of_gravity,
-            *support_warnings(_names_of(model, seeded.unsupported), is_kept=options.trust.min_trust == 0.0),
+            *support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0),
         ),
         fixed=told.rigid.fixed,
         distances=told.distances,
@@ -358,9 +352,28 @@ def _choose(located: Located, judged: Judged, min_trust: float) -> Located:
     return located._replace(placement=judged, kept=kept)
 
 
-def _names_of(model: PosedModel, image_ids: Collection[int]) -> list[str]:
-    """Return the names of some images, in the order of the model."""
-    return [model.names[k] for k in np.flatnonzero(np.isin(model.image_ids, list(image_ids))).tolist()]
+def _refined_sensors(stand: Stand, told: Told, adjusted: Estimate | None) -> dict[int, SensorSigma]:
+    """Return how well the sensors are known that moved in their rigs, by the last adjustment of each.
+
+    Raises:
+        InputError: if they were to move, but nothing was adjusted.
+    """
+    first = None if told.near is None else told.near.adjusted
+    sensors: dict[int, SensorSigma] = {}
+    for done in (first, stand.adjustment, adjusted):
+        sensors |= {} if done is None else done.sensors
+    if stand.located.freedom.has_sensors and not sensors:
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
+    return sensors
+
+
+def _gauge_warnings(located: Located, gauge: Gauge, centers: FloatArray, asked: Scale) -> Iterator[str]:
+    """Yield what else is known of the size of a model and contradicts it, or did not get its way."""
+    there = np.flatnonzero(np.isfinite(centers[:, 0]))
+    if located.rule is not None:
+        yield from located.rule.check(gauge, there, centers[there])
+    if asked == "unit" and gauge.scale != "unit":
+        yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
 
 
 def _centers_of(model: PosedModel, output: "pycolmap.Reconstruction") -> FloatArray:
@@ -372,23 +385,17 @@ def _centers_of(model: PosedModel, output: "pycolmap.Reconstruction") -> FloatAr
     return centers
 
 
-def _collect_warnings(
-    source: MatchSource, directions: PairDirections, judged: Judged, located: Located
-) -> Iterator[str]:
-    """Yield what the user should know of pairs and cameras beyond the tables."""
-    yield from match_warnings(directions)
+def _collect_warnings(stand: Stand, judged: Judged, located: Located, num_points: int) -> Iterator[str]:
+    """Yield what the user should know of pairs, cameras, points and the database beyond the tables."""
+    yield from match_warnings(stand.directions)
     yield from quality_warnings(judged)
     yield from trust_warnings(judged, located.kept)
     yield from ambiguity_warnings(judged)
     if located.gauge.warning:
         yield located.gauge.warning
-    if source.economy.statement:
-        yield f"to stay below max_memory_mb, {source.economy.statement}"
-
-
-def _structure_warnings(source: MatchSource, num_points: int) -> Iterator[str]:
-    """Yield what the user should know of points and of the database."""
+    if stand.source.economy.statement:
+        yield f"to stay below max_memory_mb, {stand.source.economy.statement}"
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
-    if names := source.matches.missing_names:
+    if names := stand.source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
