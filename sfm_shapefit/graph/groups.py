@@ -21,7 +21,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen, sum_by
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.scene.images import Images
 
 _COINCIDENT = 1e-12  # share of the largest offset; a smaller offset within a group is rounding
 
@@ -149,8 +148,3 @@ class RigidGroups:
 def separate(num_nodes: int, dimension: int) -> RigidGroups:
     """Return so many nodes, each a group of its own."""
     return RigidGroups(group_of=np.arange(num_nodes), offsets=np.zeros((num_nodes, dimension)))
-
-
-def groups_of(images: Images) -> RigidGroups:
-    """Return posed images as nodes, those of a frame as one group."""
-    return RigidGroups(group_of=images.frame_of, offsets=images.offsets)

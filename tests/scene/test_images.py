@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.graph.groups import groups_of
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import Lens
 
@@ -133,10 +132,6 @@ def test_images_stand_where_frames_and_sensors_put_them(images):
             assert images.rotations[k].tobytes() == frames.rotations[frame].tobytes()
             assert not images.is_posed[k] or not images.offsets[k].any()
     assert images.has_rigs == (np.bincount(images.frame_of).max() > 1)
-    if images.is_posed.all():
-        groups = groups_of(images)
-        np.testing.assert_array_equal(groups.group_of, images.frame_of)
-        np.testing.assert_array_equal(groups.offsets, images.offsets)
 
 
 def test_arrays_are_read_only():
