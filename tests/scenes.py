@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import View
 
 ROOT = Path(__file__).parents[1]
@@ -48,10 +48,10 @@ def read_from(path: Path, read: Callable[..., Any], *given: Any) -> Any:
 
 
 @contextmanager
-def view_of(path: Path, model: PosedModel, **how: Any) -> Iterator[View[PosedModel]]:
-    """Open a database for the matches of a model's images."""
-    with closing(open_database(path, model.names)) as matches:
-        yield matches.at(model, **how)
+def view_of(path: Path, images: Images, **how: Any) -> Iterator[View]:
+    """Open a database for the matches of images."""
+    with closing(open_database(path, images.names)) as matches:
+        yield matches.at(images, **how)
 
 
 def fingerprint(folder: Path) -> dict[str, str]:

@@ -9,11 +9,15 @@ from sfm_shapefit.adjustment import bundle_adjustment
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
-from sfm_shapefit.adjustment.structure import triangulate as triangulate_matches
+from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
-from sfm_shapefit.files.colmap.own_tracks import TrackRules, triangulate_own_tracks
-from sfm_shapefit.files.colmap.points import ModelPictures, add_points, points_of
-from sfm_shapefit.files.colmap.seed import copy_without_points
+from sfm_shapefit.files.colmap.point_colors import color_points, read_colors
+from sfm_shapefit.files.colmap.points import (
+    ModelPictures,
+    add_points,
+    points2d_of,
+    points_of,
+)
 from sfm_shapefit.tracks.filter import filter_points
 from sfm_shapefit.tracks.options import StructureOptions
 
@@ -25,12 +29,32 @@ def posed_images(model):
     return own.part(np.argsort(own.ids))
 
 
+def copy_without_points(model):
+    """A copy that has no 3D points; its points2D stay and observe nothing."""
+    copy = pycolmap.Reconstruction(model)
+    for point_id in list(copy.point3D_ids()):
+        copy.delete_point3D(point_id)
+    return copy
+
+
+def colored(model, original):
+    """A copy whose points have the colors of another model's."""
+    copy = pycolmap.Reconstruction(model)
+    color_points(copy, read_colors(original))
+    return copy
+
+
+def pictures_of(model, images):
+    """The points2D of a model."""
+    return ModelPictures(images, points2d_of(model, images))
+
+
 def links_of(model, tracks) -> Links:
     """The matches that were collected, or the tracks of another model with the same keypoints."""
     if not isinstance(tracks, pycolmap.Reconstruction):
         return tracks
     images = posed_images(model)
-    return collect_tracks(images, ModelPictures(model, images), points_of(tracks, images))
+    return collect_tracks(images, pictures_of(model, images), points_of(tracks, images))
 
 
 def matches_between(model, image_ids, batches):
@@ -38,34 +62,28 @@ def matches_between(model, image_ids, batches):
     images = posed_images(model)
     place = np.array([np.flatnonzero(images.ids == i).max(initial=-1) for i in image_ids.tolist()])
     num_matches = sum(len(batch.keypoints) for batch in batches)
-    return collect_matches(images, ModelPictures(model, images), place, batches, num_matches)
+    return collect_matches(images, pictures_of(model, images), place, batches, num_matches)
 
 
 def filtered(model, options=None):
     """A copy without the points that violate the options."""
-    return with_points(model, points_of(model, posed_images(model)), options, model)
+    return colored(with_points(model, points_of(model, posed_images(model)), options), model)
 
 
-def with_points(model, points, options=None, colors=None):
+def with_points(model, points, options=None):
     """A copy with these points instead of its own, filtered."""
     images, copy = posed_images(model), copy_without_points(model)
-    kept = filter_points(points, images, ModelPictures(model, images), options or StructureOptions())
-    add_points(copy, images, kept, colors)
+    kept = filter_points(points, images, pictures_of(model, images), options or StructureOptions())
+    add_points(copy, images, kept)
     return copy
 
 
 def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None, executor=None):
     """A copy of a seed with the points of its matches, or of another model's tracks."""
     options, images = options or StructureOptions(), posed_images(seed)
-    own = tracks if isinstance(tracks, pycolmap.Reconstruction) else None
-    if own is None:
-        points = triangulate_matches(images, tracks, options, advance, executor)
-    else:
-        rules = TrackRules(
-            options.max_reprojection_error_px, options.min_triangulation_angle_deg, options.min_track_length
-        )
-        points = triangulate_own_tracks(own, images, rules, advance, executor)
-    return with_points(seed, points, options, own)
+    points = triangulate(images, links_of(seed, tracks), options, advance, executor)
+    structure = with_points(seed, points, options)
+    return colored(structure, tracks) if isinstance(tracks, pycolmap.Reconstruction) else structure
 
 
 class AdjustedModel(NamedTuple):
@@ -84,9 +102,11 @@ def bundle_adjusted(seed, tracks, options=None, freedom=None):
     links, freedom = links_of(seed, tracks), freedom or Freedom()
     options = options or StructureOptions()
     estimate, points = bundle_adjustment.adjust_seed(posed_images(seed), links, options, freedom)
-    colors = tracks if isinstance(tracks, pycolmap.Reconstruction) else None
     found = placed(seed, estimate)
-    return found._replace(reconstruction=with_points(found.reconstruction, points, options, colors))
+    structure = with_points(found.reconstruction, points, options)
+    if isinstance(tracks, pycolmap.Reconstruction):
+        structure = colored(structure, tracks)
+    return found._replace(reconstruction=structure)
 
 
 def adjusted_thinly(seed, tracks, fixed=None, **freedom):

@@ -117,7 +117,7 @@ def test_a_table_whose_rows_are_computed_is_refused(tmp_path, kind):
     edit_database(scene / "database.db", rename, COMPUTED[kind].format("images"))
     with (
         pytest.raises(InputError, match="is not a COLMAP database: its images"),
-        view_of(scene / "database.db", read_model(scene / "sparse" / "0")),
+        view_of(scene / "database.db", read_model(scene / "sparse" / "0").images),
     ):
         pytest.fail("it must not be opened")
 
@@ -151,7 +151,7 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, 
         check_model_files(model)
     with (
         pytest.raises(InputError, match="it is a pipe or a device"),
-        view_of(scene / "database.db", sound),
+        view_of(scene / "database.db", sound.images),
     ):
         pytest.fail("it must not be opened")
 

@@ -36,7 +36,7 @@ from harness.record import Check, Row, at_least, at_most
 from harness.scenes import WRONG_DEG, rotation_errors_deg, set_rotation, temporary_scene
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.files.colmap.model import PosedModel, from_posed_cameras, posed_cameras, read_model
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.judged import judge as judge_placement
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -107,14 +107,14 @@ def draw(name: str, repeats: int) -> Row:
 def turn_cameras(scene: Scene, repeats: int) -> Row:
     """Run a scene as it is, and with turned cameras."""
     model = read_model(scene.model)
-    wrong = rotation_errors_deg(model, read_model(scene.truth)) > WRONG_DEG
+    wrong = rotation_errors_deg(model.images, read_model(scene.truth).images) > WRONG_DEG
     directions, placement = judge(model, scene)
     trusted = _placed(placement, placement.assessment.trust > TRUSTED)
     rng = np.random.default_rng(zlib.crc32(scene.name.encode()))
-    chosen = rng.permutation(model.num_images)[:repeats].tolist()
+    chosen = rng.permutation(model.images.num_images)[:repeats].tolist()
     groups: list[IntArray] = [np.array([camera]) for camera in chosen]
-    if model.num_images >= LARGE_ENOUGH:
-        groups += [neighbors(directions, camera, model.num_images) for camera in chosen[:2]]
+    if model.images.num_images >= LARGE_ENOUGH:
+        groups += [neighbors(directions, camera, model.images.num_images) for camera in chosen[:2]]
     turned, kept = np.zeros(len(ANGLES_DEG), dtype=int), np.zeros(len(ANGLES_DEG), dtype=int)
     others, lost = 0, 0
     for k, angle_deg in enumerate(ANGLES_DEG):
@@ -130,7 +130,7 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
             others += int(right.sum())
             lost += int((_placed(found, found.assessment.trust < TRUSTED) & right).sum())
     blamed = int((_placed(placement, placement.assessment.trust < TRUSTED) & ~wrong).sum())
-    wrong_kept, n = int((trusted & wrong).sum()), model.num_images
+    wrong_kept, n = int((trusted & wrong).sum()), model.images.num_images
     checks = at_most(
         blamed=(blamed / n, 0.01),
         wrong_kept=(wrong_kept, 0),
@@ -138,7 +138,7 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
         kept_beyond=(int(kept[1:].sum()), 0),
     )
     if scene.name.startswith("kerry-park"):
-        frames = np.isin(model.frame_ids, model.frame_ids[trusted])
+        frames = np.isin(model.images.frame_of, model.images.frame_of[trusted])
         checks += at_least(registered=(int(frames.sum()), 48))
     cells = {
         "scene": scene.name,
@@ -152,25 +152,25 @@ def turn_cameras(scene: Scene, repeats: int) -> Row:
 
 
 @contextmanager
-def measured(model: PosedModel, scene: Scene) -> Iterator[tuple[Any, Measured]]:
+def measured(model: ColmapModel, scene: Scene) -> Iterator[tuple[Any, Measured]]:
     """Yield the matches of a scene at a model, and what they tell."""
     with open_source(model, choose_inputs(scene.model, scene.database, "auto"), OPTIONS) as source:
         wanted = Wanted(tracks=wants_points(source, OPTIONS.nodes), errors=True)
         yield source, measure(source, OPTIONS.directions, Clock(threads=THREADS), wanted)
 
 
-def judge(model: PosedModel, scene: Scene) -> tuple[PairDirections, Judged]:
+def judge(model: ColmapModel, scene: Scene) -> tuple[PairDirections, Judged]:
     """Place the cameras of a model and judge them: `locate` without points."""
-    rigid = find_rigid_parts(model, OPTIONS.placement)
+    rigid = find_rigid_parts(model.images, OPTIONS.placement)
     with measured(model, scene) as (source, told):
-        graph = add_evidence(rigid.apply(build_graph(source.model, told)), told)
+        graph = add_evidence(rigid.apply(build_graph(source.images, told)), told)
         placed = next(place_cameras(graph, OPTIONS.placement, OPTIONS.nodes, Clock(threads=THREADS)))
         placement = judge_placement(placed, OPTIONS.placement)
         relative = ask_pairs(source, told.directions, THREADS)
-    return told.directions, doubt_cameras(placement, told.directions, relative, model)
+    return told.directions, doubt_cameras(placement, told.directions, relative, model.images)
 
 
-def num_still_off(scene: Scene, changed: PosedModel, cameras: IntArray, least_deg: float) -> int:
+def num_still_off(scene: Scene, changed: ColmapModel, cameras: IntArray, least_deg: float) -> int:
     """Return how many of some turned cameras `locate` delivers with a rotation off by an angle or more.
 
     Args:
@@ -182,14 +182,16 @@ def num_still_off(scene: Scene, changed: PosedModel, cameras: IntArray, least_de
     import pycolmap
 
     given, model = pycolmap.Reconstruction(scene.model), read_model(scene.model)
-    turns = model.rotations.transpose(0, 2, 1) @ changed.rotations
-    for frame_id, first in zip(*np.unique(model.frame_ids, return_index=True), strict=True):
-        frame = given.frame(int(frame_id))
-        set_rotation(frame, frame.rig_from_world.rotation * pycolmap.Rotation3d(turns[first]))
-    delivered = read_model(sfm_shapefit.locate(given, scene.database, threads=2).reconstruction)
-    errors = dict(zip(delivered.names, rotation_errors_deg(delivered, read_model(scene.truth)), strict=True))
-    found = [errors[model.names[camera]] for camera in cameras.tolist() if model.names[camera] in errors]
-    return sum(not error < least_deg for error in found)
+    turns = model.images.frames.rotations.transpose(0, 2, 1) @ changed.images.frames.rotations
+    for frame_id, turn_of_world in zip(model.images.frames.ids.tolist(), turns, strict=True):
+        frame = given.frame(frame_id)
+        set_rotation(frame, frame.rig_from_world.rotation * pycolmap.Rotation3d(turn_of_world))
+    found = sfm_shapefit.locate(given, scene.database, threads=2)
+    delivered, names = read_model(found.reconstruction).images, model.images.names
+    off = rotation_errors_deg(delivered, read_model(scene.truth).images)
+    errors = dict(zip(delivered.names, off, strict=True))
+    still = [errors[names[camera]] for camera in cameras.tolist() if names[camera] in errors]
+    return sum(not error < least_deg for error in still)
 
 
 def _placed(placement: Judged, holds: BoolArray) -> BoolArray:
@@ -214,28 +216,23 @@ def neighbors(directions: PairDirections, camera: int, num_images: int) -> IntAr
 
 
 def turn(
-    model: PosedModel, cameras: IntArray, axis: FloatArray, angle_deg: float
-) -> tuple[PosedModel, IntArray]:
+    model: ColmapModel, cameras: IntArray, axis: FloatArray, angle_deg: float
+) -> tuple[ColmapModel, IntArray]:
     """Return a model whose cameras, with all of their frames, are turned alike, and which these are."""
     matrix = Rotation.from_rotvec(np.radians(angle_deg) * axis / np.linalg.norm(axis)).as_matrix()
-    cameras = np.flatnonzero(np.isin(model.frame_ids, model.frame_ids[cameras]))
-    rotations, offsets = np.array(model.rotations), np.array(model.frame_offsets)
-    rotations[cameras] = rotations[cameras] @ matrix.T
-    offsets[cameras] = offsets[cameras] @ matrix.T
-    rotations.flags.writeable = offsets.flags.writeable = False
-    return replace(model, rotations=rotations, frame_offsets=offsets), cameras
+    images, frames = model.images, np.unique(model.images.frame_of[cameras])
+    rotations = images.frames.rotations.copy()
+    rotations[frames] = rotations[frames] @ matrix.T
+    turned = replace(model, images=images.posed(rotations, images.frames.centers))
+    return turned, np.flatnonzero(np.isin(images.frame_of, frames))
 
 
 def change_focal_lengths(scene: Scene) -> Row:
     """Ask for focal lengths, where one camera has a wrong one and where none has."""
     model = read_model(scene.model)
-    if model.has_rigs:
-        # Without its rig the model is one of several cameras all the same.
-        model = replace(model, frame_ids=np.arange(model.num_images))
-    ids = np.array([model.camera(k).camera_id for k in range(model.num_images)])
-    images = [np.flatnonzero(ids == i) for i in np.unique(ids)]
+    images = [np.flatnonzero(model.images.lens_of == k) for k in range(len(model.images.lenses))]
     if len(images) == 1:
-        images = [np.arange(model.num_images)[::3], np.arange(model.num_images // 3)]
+        images = [np.arange(model.images.num_images)[::3], np.arange(model.images.num_images // 3)]
     asked, named, false = 0, 0, 0
     for chosen in images:
         for factor in (1.0, *FACTORS):
@@ -251,19 +248,19 @@ def change_focal_lengths(scene: Scene) -> Row:
     return Row(cells, checks, "Focal lengths")
 
 
-def change_camera(model: PosedModel, images: IntArray, factor: float) -> tuple[PosedModel, int]:
+def change_camera(model: ColmapModel, images: IntArray, factor: float) -> tuple[ColmapModel, int]:
     """Return a model some of whose images have a camera of their own, of another focal length, and its id."""
-    scene = posed_cameras(model)
-    first = scene.cameras[int(scene.camera_of[images[0]])]
-    model_name, params = first.model, list(first.params)
-    for k in range(1 if model_name.startswith(("SIMPLE", "RADIAL")) else 2):
+    own, rotations = model.images.apart(), model.images.rotations
+    first = own.lenses[own.lens_of[images[0]]]
+    params = list(first.parameters)
+    for k in range(1 if first.model.startswith(("SIMPLE", "RADIAL")) else 2):
         params[k] *= factor
-    camera_of = scene.camera_of.copy()
-    camera_of[images] = len(scene.cameras)
-    used, camera_of = np.unique(camera_of, return_inverse=True)
-    cameras = (*scene.cameras, first._replace(params=tuple(params)))
-    changed = replace(scene, cameras=tuple(cameras[k] for k in used), camera_of=camera_of)
-    return from_posed_cameras(changed), len(used)
+    lens_of, new_id = own.lens_of.copy(), own.lenses[-1].id + 1
+    lens_of[images] = len(own.lenses)
+    lenses = (*own.lenses, replace(first, parameters=tuple(params), id=new_id))
+    alone = replace(own, lenses=lenses, lens_of=lens_of, sensors=own.sensors.part(np.zeros(len(lenses), int)))
+    used = alone.part(np.arange(own.num_images))  # only lenses that an image looks through
+    return replace(model, images=used.turned_to(rotations)), new_id
 
 
 BENCHMARK = Benchmark(

@@ -128,7 +128,7 @@ def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> list[Row]:
     solved, walls_s = found.certified, [run.wall_s for run in runs]
     used = f"{len(found.placement.pairs)} of {len(found.directions.pairs)}"
     gap = f"{solved.gap:.0e}" + ("" if solved.converged else " (not converged)")
-    seen = {"placed": f"{len(found.placement.cameras)} of {found.model.num_images}"}
+    seen = {"placed": f"{len(found.placement.cameras)} of {found.images.num_images}"}
     treated = {"rotations": _treatment(found.summary()["adjustment"])}
     time_cells = {
         "set": scene.case,

@@ -207,7 +207,7 @@ def flag(folder: Path) -> Row:
     found = sfm_shapefit.locate(folder / "sparse" / "0", folder / "database.db")
     reference = next(folder / name for name in ("gt", "truth", "sparse/0") if (folder / name).is_dir())
     cameras = found.placement.cameras
-    wrong = rotation_errors_deg(found.model, read_model(reference))[cameras] > WRONG_DEG
+    wrong = rotation_errors_deg(found.images, read_model(reference).images)[cameras] > WRONG_DEG
     errors = sfm_shapefit.evaluate(found.reconstruction, reference).position
     num_wrong, caught = int(wrong.sum()), int(np.sum(wrong & ~found.kept))
     blamed = int(np.sum(~wrong & ~found.kept))

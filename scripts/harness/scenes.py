@@ -11,7 +11,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
-from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.layouts import SceneCameras
 
@@ -66,11 +66,11 @@ def errors_deg(rotations: FloatArray, truth: FloatArray) -> FloatArray:
     return rotation_angles_deg(difference @ mean_rotation_l1(difference[:_FITTED]).T)
 
 
-def rotation_errors_deg(model: PosedModel, truth: PosedModel) -> FloatArray:
-    """Return the error of each rotation of a model, (n,); NaN of an image without a truth."""
+def rotation_errors_deg(images: Images, truth: Images) -> FloatArray:
+    """Return the error of each rotation of images, (n,); NaN of an image without a truth."""
     place_of = {name: k for k, name in enumerate(truth.names)}
-    common = [k for k, name in enumerate(model.names) if name in place_of]
-    errors = np.full(len(model.names), np.nan)
-    theirs = truth.rotations[[place_of[model.names[k]] for k in common]]
-    errors[common] = errors_deg(model.rotations[common], theirs)
+    common = [k for k, name in enumerate(images.names) if name in place_of]
+    errors = np.full(len(images.names), np.nan)
+    theirs = truth.rotations[[place_of[images.names[k]] for k in common]]
+    errors[common] = errors_deg(images.rotations[common], theirs)
     return errors

@@ -67,7 +67,7 @@ def measure_directions(folder: Path) -> Directions:
     """Return the directions of the rigid piece that `locate` places."""
     found = locate(folder / "sparse" / "0", **SAME_OPTIONS)
     graph, cameras = found.placement.graph.restricted_to(found.placement.edges)
-    return Directions(tuple(found.model.names[c] for c in cameras), graph)
+    return Directions(tuple(found.images.names[c] for c in cameras), graph)
 
 
 def _solve(name: str, folder: Path, scene: Scene, directions: Directions | str) -> Answer:
@@ -113,7 +113,7 @@ def _ours(name: str, folder: Path, scene: Scene) -> Answer:
     reset_peak()
     found = locate(folder / "sparse" / "0", **options)
     peak_mb, left, placement = peak_memory_mb(), int((~found.kept).sum()), found.placement
-    names = [found.model.names[c] for c in placement.cameras[found.kept]]
+    names = [found.images.names[c] for c in placement.cameras[found.kept]]
     errors = _errors(dict(zip(names, placement.locations[found.kept], strict=True)), folder, scene)
     note = f"{left} not trusted" if left else ""
     return Answer(name, errors, found.timings_s["solve"], peak_mb=peak_mb, note=note)
@@ -121,7 +121,7 @@ def _ours(name: str, folder: Path, scene: Scene) -> Answer:
 
 def _errors(centers: Mapping[str, FloatArray], folder: Path, scene: Scene) -> Errors:
     """Return the position errors of the cameras that a contender placed, by name."""
-    truth = read_model(folder / scene.truth)
+    truth = read_model(folder / scene.truth).images
     if len(set(centers) & set(truth.names)) < 3:
         raise RuntimeError("fewer than three cameras of the truth are placed")
     # Rotations are not compared.
@@ -130,7 +130,7 @@ def _errors(centers: Mapping[str, FloatArray], folder: Path, scene: Scene) -> Er
         NamedPoses(tuple(centers), nowhere, np.array([*centers.values()])),
         NamedPoses(truth.names, truth.rotations, truth.centers),
     ).position
-    given = set(read_model(folder / "sparse" / "0").names) & set(truth.names)
+    given = set(read_model(folder / "sparse" / "0").images.names) & set(truth.names)
     return Errors(position.median, position.mean, position.max, len(given - set(centers)))
 
 

@@ -1,4 +1,4 @@
-"""Triangulation: the 3D points of posed images, from their matches.
+"""Triangulation: the 3D points of posed images, from their matches or from tracks that they have already.
 
 Matches are joined to tracks by whether they fit the given poses, and each track becomes the points that
 explain it (`tracks.triangulation`). All in memory: no database is opened. Whatever survives fits its
@@ -23,11 +23,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import IntArray, hand_back_memory
 from sfm_shapefit.base.executors import Advance, answers, nobody
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.points import Points, number_points
+from sfm_shapefit.scene.points import Points, concatenate_points, number_points
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import (
@@ -43,18 +44,19 @@ _TRACKS_A_BLOCK = 20_000
 
 def triangulate(
     images: Images,
-    matched: MatchedKeypoints,
+    links: Links,
     options: StructureOptions,
     advance: Advance = nobody,
     executor: Executor | None = None,
 ) -> Points:
-    """Return the points of all matches at the poses of images, a block of tracks at a time; none is filtered.
+    """Return the points of links at the poses of images, a block of tracks at a time; none is filtered.
 
-    By COLMAP's rule a track of two keypoints that are matched with no other one is left out.
+    By COLMAP's rule a track of two keypoints that are matched with no other one is left out. Tracks that a
+    model had keep their points' ids.
 
     Args:
         images: all of them posed.
-        matched: their matches.
+        links: their matches, or tracks.
         options: what points must satisfy.
         advance: called with the tracks of the first joining that are done, and their number.
         executor: shares out the tracks among its workers, with the same answer to the bit.
@@ -68,8 +70,16 @@ def triangulate(
         min_angle_deg=options.min_triangulation_angle_deg,
         min_length=options.min_track_length,
     )
-    joining_limits = tuple(joining_limits_px(limits.max_error_px, limits.max_error_px))
-    poses, partners, parts = views.poses(images), matched.count_partners(), list[Points]()
+    poses, parts = views.poses(images), list[Points]()
+    if isinstance(links, ObservedTracks):
+        tasks, done = _cut_own_tracks(links, poses, limits), 0
+        for task, found in answers(executor, triangulate_block, tasks):
+            parts.append(views.seen_points(task.tracks, found))
+            done += task.tracks.num_tracks
+            advance(done, links.num_tracks)
+        return concatenate_points(parts)
+    matched, joining_limits = links, tuple(joining_limits_px(limits.max_error_px, limits.max_error_px))
+    partners = matched.count_partners()
     fewest = options.fewest_views(images.num_images)
     is_left = np.ones(len(partners), dtype=np.bool_)
     for limit_px in joining_limits:
@@ -109,6 +119,14 @@ def _cut_tracks(
     for first in range(0, len(chosen), _TRACKS_A_BLOCK):
         block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
         yield BlockTask(rows=block.rows, tracks=matched.observed(block), poses=poses, limits=limits)
+
+
+def _cut_own_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> Iterator[BlockTask]:
+    """Yield tracks that are long enough to have a point, a block at a time."""
+    chosen = np.flatnonzero(tracks.lengths() >= limits.min_length)
+    for first in range(0, len(chosen), _TRACKS_A_BLOCK):
+        block = tracks.subset(chosen[first : first + _TRACKS_A_BLOCK])
+        yield BlockTask(rows=np.arange(len(block.cameras)), tracks=block, poses=poses, limits=limits)
 
 
 def triangulate_block(task: BlockTask) -> TriangulatedPoints:

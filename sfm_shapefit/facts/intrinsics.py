@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.files.colmap.intrinsics import Origin
-
-if TYPE_CHECKING:
-    import pycolmap
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 
 _NAMED = 3
 _UNCHANGED = 1e-12
@@ -73,7 +72,7 @@ class CameraIntrinsics(Record):
 class DoubtedIntrinsics:
     """Cameras whose intrinsics are in doubt, and what became of them; by COLMAP's ids of cameras."""
 
-    given: "Mapping[int, pycolmap.Camera]" = field(default_factory=dict)
+    given: Mapping[int, Lens] = field(default_factory=dict)
     """As they were given."""
     origins: Mapping[int, Origin] = field(default_factory=dict)
     """Where those come from."""
@@ -98,36 +97,31 @@ class DoubtedIntrinsics:
             return "adjusted"
         return "view graph" if camera in self.view_graph else "held"
 
-    def rows(self, model: "pycolmap.Reconstruction") -> list[CameraIntrinsics]:
-        """Return a row for each camera that took placed images of a model and was in doubt."""
-        images = [model.image(i) for i in model.reg_image_ids()]
-        counts = {i: sum(image.camera_id == i for image in images) for i in sorted(self.origins)}
-        return [self._row(camera, model.camera(camera), count) for camera, count in counts.items() if count]
+    def rows(self, images: Images) -> list[CameraIntrinsics]:
+        """Return a row for each camera that took placed images and was in doubt."""
+        counts = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)).tolist()
+        taken = zip(images.lenses, counts, strict=True)
+        return [self._row(lens.id, lens, count) for lens, count in taken if count and lens.id in self.origins]
 
-    def _row(self, camera: int, found: "pycolmap.Camera", num_images: int) -> CameraIntrinsics:
+    def _row(self, camera: int, found: Lens, num_images: int) -> CameraIntrinsics:
         given, sigma = self.given[camera], self.refined.sigmas.get(camera, np.nan)
         known = self.how(camera) == "adjusted" and np.isfinite(sigma)
         return CameraIntrinsics(
             camera=camera,
             num_images=num_images,
-            model=found.model_name,
+            model=found.model,
             origin=self.origins[camera].value,
             decided_by=self.how(camera),
-            given_focal_px=_focal_px(given),
-            focal_px=_focal_px(found),
-            focal_sigma_px=float(sigma) * _focal_px(found) if known else None,
-            given_parameters=given.params.tolist(),
-            parameters=found.params.tolist(),
+            given_focal_px=given.focal_px,
+            focal_px=found.focal_px,
+            focal_sigma_px=float(sigma) * found.focal_px if known else None,
+            given_parameters=list(given.parameters),
+            parameters=list(found.parameters),
         )
 
 
 NO_DOUBTS = DoubtedIntrinsics()
 """Every camera is calibrated, or taken as it is."""
-
-
-def _focal_px(camera: "pycolmap.Camera") -> float:
-    indices = camera.focal_length_idxs()
-    return float(np.mean(camera.params[indices])) if len(indices) else float(camera.params[0])
 
 
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
@@ -41,7 +41,6 @@ from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, wit
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
@@ -55,6 +54,7 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 from sfm_shapefit.solver.options import SolverResult
 
@@ -99,8 +99,13 @@ class LocateResult(Displayed):
     """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
     inputs: Inputs
     options: PlacingOptions
-    model: PosedModel
-    """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
+    images: Images
+    """The posed images of the input, with refined rotations if those were asked for; camera k below is image
+    k of them."""
+    placed: Images
+    """The same images in the output; NaN where they are not in it."""
+    image_names: tuple[str, ...]
+    """Names of all images of the input, posed or not."""
     directions: PairDirections
     """All pairs that were looked at, with their support."""
     placement: Judged
@@ -138,12 +143,12 @@ class LocateResult(Displayed):
     prior_angles: PriorAngles | None = None
     """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
     that set the axes."""
-    poor: dict[int, int] = field(default_factory=dict)
-    """By the id of each image that was left out because it sees too few points, or hardly any of those that
-    its matches could make: how many it sees."""
-    unsupported: frozenset[int] = frozenset()
-    """The ids of images hardly any of whose matches makes a point with a third image; left out too, unless
-    the least trust is 0."""
+    num_seen: IntArray
+    """(n,) points that an image saw which was left out because they are too few, or hardly any of those that
+    its matches could make; -1 for all others."""
+    unsupported: BoolArray
+    """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
+    least trust is 0."""
     agreeing_observations: float = math.nan
     """Of the keypoints of images in the output that are matched in two or more of the others, the share that
     sees a 3D point; NaN where there is no database."""
@@ -168,7 +173,7 @@ class LocateResult(Displayed):
         """What is told of the model: each figure of locate.json, terminal and report."""
         placement, model, gauge = self.placement, self.reconstruction, self.gauge
         solved = [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in (self, *self.further)]
-        measures = (float(np.median(self.model.focal_lengths_px)), UNITS[gauge.scale])
+        measures = (float(np.median(self.images.focal_lengths_px)), UNITS[gauge.scale])
         facts = facts_of_placement(placement, self.cameras, solved, measures) | {
             "num_images": len(self.image_names),
             "num_placed": model.num_reg_images(),
@@ -181,7 +186,7 @@ class LocateResult(Displayed):
             options=flat_values(self.options),
             inputs=self.inputs.facts,
             not_trusted=self._not_trusted(),
-            few_points={self.model.names[camera]: count for camera, count in self.few_points.items()},
+            few_points={self.images.names[camera]: count for camera, count in self.few_points.items()},
             pairs={status.name.lower(): count for status, count in self.directions.counts().items()}
             | {"outlier": len(placement.rejected_pairs)},
             agreement=EvidenceShares(
@@ -197,7 +202,7 @@ class LocateResult(Displayed):
             known_distances=told_distances(self.distances, model),
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
-            intrinsics=tuple(self.intrinsics.rows(model)),
+            intrinsics=tuple(self.intrinsics.rows(self.placed)),
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
@@ -222,11 +227,6 @@ class LocateResult(Displayed):
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
         return table_of(self, name, 3)
 
-    @cached_property
-    def image_names(self) -> tuple[str, ...]:
-        """Names of all images of the input, posed or not."""
-        return tuple(image.name for image in self.model.reconstruction.images.values())
-
     @property
     def delivered(self) -> Delivered:
         """What is certified, what is delivered, and how far apart they are."""
@@ -244,7 +244,7 @@ class LocateResult(Displayed):
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
         lenses = (f"the matches of camera {d.camera} prefer another focal length" for d in self.focal_doubts)
         repeats = tuple(match_warnings(self.directions))[:1]
-        names = [self.model.names[camera] for camera in outside]
+        names = [self.images.names[camera] for camera in outside]
         return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions))
 
     @property
@@ -260,10 +260,8 @@ class LocateResult(Displayed):
     @cached_property
     def _centers(self) -> FloatArray:
         """Centers (k, 3) of the placement's cameras in the output, NaN for those that are not in it."""
-        ids = self.model.image_ids[self.placement.cameras]
-        centers = np.full((len(ids), 3), np.nan)
-        images = (self.reconstruction.image(image_id) for image_id in ids[self.kept].tolist())
-        centers[self.kept] = [image.projection_center() for image in images]
+        centers = self.placed.centers[self.placement.cameras]
+        centers[~self.kept] = np.nan
         return centers
 
     @cached_property
@@ -284,7 +282,7 @@ class LocateResult(Displayed):
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
-        unposed = sorted(set(self.image_names) - set(self.model.names))
+        unposed = sorted(set(self.image_names) - set(self.images.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
     @cached_property
@@ -311,13 +309,12 @@ class LocateResult(Displayed):
     @property
     def few_points(self) -> dict[int, int]:
         """By the images that were left out for what they see of points, how many these are."""
-        images = enumerate(self.model.image_ids.tolist())
-        return {camera: self.poor[image_id] for camera, image_id in images if image_id in self.poor}
+        return {camera: int(self.num_seen[camera]) for camera in np.flatnonzero(self.num_seen >= 0).tolist()}
 
     @property
     def cameras_without_support(self) -> list[int]:
         """The images hardly any of whose matches makes a point with a third image, in the output or not."""
-        return np.flatnonzero(np.isin(self.model.image_ids, list(self.unsupported))).tolist()
+        return np.flatnonzero(self.unsupported).tolist()
 
     def _not_trusted(self) -> dict[str, str]:
         """Return the images that are left out because they are not trusted, and why."""
@@ -331,20 +328,22 @@ class LocateResult(Displayed):
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
-        ids = self.model.image_ids
-        judged = set(self.placement.cameras[self.kept].tolist())
-        return {
-            camera: tuple(self.reconstruction.image(image_id).projection_center().tolist())
-            for camera, image_id in enumerate(ids.tolist())
-            if camera not in judged and self.reconstruction.image(image_id).has_pose
-        }
+        carried = self.placed.is_posed
+        carried[self.placement.cameras[self.kept]] = False
+        return dict(
+            zip(
+                np.flatnonzero(carried).tolist(),
+                map(tuple, self.placed.centers[carried].tolist()),
+                strict=True,
+            )
+        )
 
     @cached_property
     def pairs(self) -> list[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
         support = self.directions.num_inliers[self.directions.usable()]
         usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
-        names = self.model.names
+        names = self.images.names
         axes = self.gauge.axes
         rows = [
             _turn(next(usable), axes)

@@ -1,18 +1,15 @@
 """What a refinement of rigs made of them: how far each sensor turned and moved, and how sure that is."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
 from sfm_shapefit.adjustment.free_sensors import SensorSigma
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.record import Record
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.scene.images import Images, Sensors
 
 
 class RefinedSensor(Record):
@@ -35,38 +32,36 @@ class RefinedSensor(Record):
 
 
 def refined_rigs(
-    given: "Mapping[int, pycolmap.Rigid3d]",
-    found: "Mapping[int, pycolmap.Rigid3d]",
-    sigmas: Mapping[int, SensorSigma],
+    given: Images, found: Images, sigmas: Mapping[int, SensorSigma]
 ) -> tuple[RefinedSensor, ...]:
     """Return a row for each sensor that was refined, by the ids of their cameras.
 
     Args:
-        given, found: the sensors' poses before and after.
-        sigmas: of the refined ones, which are those that have a row.
+        given, found: the same images with their sensors before and after.
+        sigmas: standard deviations of the refined sensors, which are those that have a row.
     """
-    return tuple(
-        _row(camera, given[camera], found[camera], sigma) for camera, sigma in sorted(sigmas.items())
-    )
+    rows = []
+    for k, lens in enumerate(found.lenses):
+        if lens.id in sigmas:
+            before, after = (images.sensors for images in (given, found))
+            moved = sensor_centers(after)[k] - sensor_centers(before)[k]
+            turn = before.rotations[k].T @ after.rotations[k]
+            rows.append(
+                RefinedSensor(
+                    camera=lens.id,
+                    turned_deg=float(rotation_angles_deg(turn[None])[0]),
+                    moved=float(np.linalg.norm(moved)),
+                    distance=float(np.linalg.norm(sensor_centers(after)[k])),
+                    turn_sigma_deg=float(np.degrees(sigmas[lens.id].turn_rad)),
+                    place_sigma=sigmas[lens.id].place,
+                )
+            )
+    return tuple(rows)
 
 
-def _row(
-    camera: int, given: "pycolmap.Rigid3d", found: "pycolmap.Rigid3d", sigma: SensorSigma
-) -> RefinedSensor:
-    turn = given.rotation.matrix().T @ found.rotation.matrix()
-    before, after = (_center(pose) for pose in (given, found))
-    return RefinedSensor(
-        camera=camera,
-        turned_deg=float(rotation_angles_deg(turn[None])[0]),
-        moved=float(np.linalg.norm(after - before)),
-        distance=float(np.linalg.norm(after)),
-        turn_sigma_deg=float(np.degrees(sigma.turn_rad)),
-        place_sigma=sigma.place,
-    )
-
-
-def _center(sensor_from_rig: "pycolmap.Rigid3d") -> "FloatArray":
-    return np.asarray(-(sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation))
+def sensor_centers(sensors: Sensors) -> FloatArray:
+    """Return where sensors stand in their rigs, (l, 3)."""
+    return np.asarray(-np.einsum("lba,lb->la", sensors.rotations, sensors.translations))
 
 
 def describe_rigs(rows: Sequence[RefinedSensor]) -> list[str]:

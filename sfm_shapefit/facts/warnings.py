@@ -6,7 +6,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
@@ -14,6 +13,7 @@ from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.options import Status
 
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
@@ -134,14 +134,14 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
 
 
 def focal_warnings(
-    model: PosedModel, doubts: tuple[FocalDoubt, ...], tried: Collection[int] = ()
+    images: Images, doubts: tuple[FocalDoubt, ...], tried: Collection[int] = ()
 ) -> Iterator[str]:
     """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
     for doubt in doubts:
         advice = "--intrinsics focal lets it change"
         if doubt.camera in tried:
             advice = "the adjustment could not tell, so calibrate that camera"
-        focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())
+        focal_px = next(lens.focal_px for lens in images.lenses if lens.id == doubt.camera)
         yield (
             f"the matches of camera {doubt.camera} prefer a focal length of about "
             f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "

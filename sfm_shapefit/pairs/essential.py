@@ -27,7 +27,6 @@ import pycolmap
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database import relative_poses
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches, View
@@ -92,7 +91,7 @@ def estimate_relative_rotations(
     return concatenate_rotations(parts)
 
 
-def stored_relative_rotations(view: View[PosedModel], min_matches: int = 1) -> RelativeRotations:
+def stored_relative_rotations(view: View, min_matches: int = 1) -> RelativeRotations:
     """Return the relative rotations that a database stores; pairs without one are left out.
 
     Nothing says how well they are known. So their information is taken as isotropic, n / (20 px)^2, with

@@ -21,7 +21,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.files.colmap.images import images_of
-from sfm_shapefit.files.colmap.points import ModelPictures, move_model, points_of
+from sfm_shapefit.files.colmap.points import ModelPictures, move_model, points2d_of, points_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import ObservedTracks
@@ -110,4 +110,8 @@ def read_bundle(reconstruction: "pycolmap.Reconstruction") -> tuple[Images, Poin
     images = every.part(np.flatnonzero(every.is_posed))
     images = images.part(np.argsort(images.ids))
     points = points_of(reconstruction, images)
-    return images, points, collect_tracks(images, ModelPictures(reconstruction, images), points)
+    return (
+        images,
+        points,
+        collect_tracks(images, ModelPictures(images, points2d_of(reconstruction, images)), points),
+    )

@@ -15,7 +15,6 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import PlacingOptions, Rotations
-from sfm_shapefit.files.colmap.model import PosedModel, turned_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import Judged
@@ -31,6 +30,7 @@ from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.images import Images
 
 _SAID_OF_MATCHES = (
     "num_inliers",
@@ -49,7 +49,7 @@ def pull_of_rotations(rotations: Rotations) -> float | None:
 
 
 def pull_cameras(
-    model: PosedModel, located: Located, priors: PositionPriors, options: PlacementOptions
+    images: Images, located: Located, priors: PositionPriors, options: PlacementOptions
 ) -> Located:
     """Return the cameras pulled by position priors, which hold the gauge from here on.
 
@@ -57,7 +57,7 @@ def pull_cameras(
         UnsolvableError: if the factor would take more memory than the options allow.
     """
     pulled = pull_to_priors(located.placement, located.gauge, priors, options)
-    frames = model.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
+    frames = images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
     given = located.given._replace(centers=pulled.anchors._replace(indices=frames))
     return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
@@ -90,36 +90,36 @@ def adjust_placed(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    model, placement = source.model, located.placement
+    images, placement = source.images, located.placement
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    posed = posed_part(pose_images(model, everyone))
+    posed = posed_part(pose_images(images, everyone))
     links = read_links(source, everyone, posed, clock.advance)
-    freedom, given = replace(located.freedom, pull_rad=pull_rad), located.given_of(posed, model)
+    freedom, given = replace(located.freedom, pull_rad=pull_rad), located.given_of(posed, images)
     adjusted = adjust_placement(posed.images, links, options.structure, freedom, given)
     del links
-    similarity, centers = located.gauge.similarity, np.empty((model.num_images, 3))
+    similarity, centers = located.gauge.similarity, np.empty((images.num_images, 3))
     centers[posed.rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     if not adjusted.freedom.holds_rotations or adjusted.lenses.sigmas or adjusted.sensors:
-        source = source.at(turned_model(model, adjusted.images))
+        source = source.at(images.turned(adjusted.images))
         corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
-        is_corrected = np.isin(model.images.frame_of, corrected)
+        is_corrected = np.isin(images.frame_of, corrected)
         directions = _measure_again(source, directions, is_corrected, options.directions, clock)
-        turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
+        turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
-            measured = rigid_parts(source.model, located.fixed_images(model)).apply(measured)
+            measured = rigid_parts(source.images, located.fixed_images(images)).apply(measured)
         placement = replace(placement, measured=measured)
     return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted, posed)
 
 
-def with_uncertainty(placement: Judged, model: PosedModel, known: Estimate, scale: float) -> Judged:
+def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: float) -> Judged:
     """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
     if known.covariances is None:
         return placement
     own = np.full((len(placement.cameras), 3, 3), np.nan)
     _, rows, there = np.intersect1d(
-        model.image_ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
+        images.ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
     )
     own[rows] = known.covariances[there] / scale**2
     return replace(placement, adjusted_covariances=own, scale_sigma=known.scale_sigma)

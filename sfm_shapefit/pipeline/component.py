@@ -11,41 +11,40 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.scene import Loop
-from sfm_shapefit.files.colmap.intrinsics import with_parameters
-from sfm_shapefit.files.colmap.model import PosedModel, sensors_of
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import pairs_among
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
-from sfm_shapefit.pipeline.map_run import MapRun
+from sfm_shapefit.pipeline.map_run import MapRun, changed_parameters
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import Told, settle
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.sequences import Visit
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 
 
-def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> PosedModel:
+def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
     """Return the images with the intrinsics that first placements of all components find.
 
     Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
     ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
     in several components the one with most images counts.
     """
-    found: dict[int, list[float]] = {}
+    found: dict[int, tuple[float, ...]] = {}
     for _, members, averaging in run.average_images(relative, {}):
-        model = run.pose(run.unposed.image_ids[members].tolist(), averaging.rotations)
-        source = see_matches(run.matches, model, run.inputs_of(model), run.options)
-        rule = GaugeRule(model, find_rigid_parts(model, run.options.placement), "unit")
+        images = run.pose(members, averaging.rotations)
+        source = see_matches(run.matches, images, run.inputs, run.options)
+        rule = GaugeRule(images, find_rigid_parts(images, run.options.placement), "unit")
         with suppress(UnsolvableError):
             with run.clock("first placement"):
                 free = run.intrinsics.free
                 first = adjust_first_placement(source, rule, run.options, run.clock, free, thorough=False)
-            found = first.parameters() | found
-    return with_parameters(run.unposed, found)
+            found = changed_parameters(first.adjusted) | found
+    return run.images.with_parameters(found)
 
 
 def locate_components(
@@ -62,8 +61,8 @@ def locate_components(
         except UnsolvableError as error:
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
-        names = tuple(run.unposed.names[k] for k in members.tolist())
-        located = replace(located, loops=tuple(_loops_of(visits, run.unposed.names, set(names))))
+        names = tuple(run.images.names[k] for k in members.tolist())
+        located = replace(located, loops=tuple(_loops_of(visits, run.images.names, set(names))))
         models.append(MappedModel(located=located, averaging=averaging, names=names))
         for k in frames.tolist():
             del reasons[k]
@@ -103,25 +102,25 @@ def _first_adjusted(
     run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
 ) -> tuple[MatchSource, Told]:
     """Return the matches of a component at the rotations of its first placement, and what is told of it."""
-    image_ids = run.unposed.image_ids[members].tolist()
-    names = {run.unposed.names[k] for k in members.tolist()}
-    model = run.pose(image_ids, averaging.rotations)
-    inputs = run.inputs_of(model)
+    given, inputs = run.pose(members, averaging.rotations), run.inputs
+    names = set(given.names)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
         _, among = pairs_among(relative, members)
-        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(model, among, averaging))
-    rigid = find_rigid_parts(model, run.options.placement)
-    averaged = see_matches(run.matches, model, inputs, run.options)
+        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(given, among, averaging))
+    rigid = find_rigid_parts(given, run.options.placement)
+    averaged = see_matches(run.matches, given, inputs, run.options)
     source, first, intrinsics = averaged, None, run.intrinsics
     if run.options.freedom.adjust != "none":
         with run.clock("first placement"):
-            rule = GaugeRule(model, rigid, "unit")
+            rule = GaugeRule(given, rigid, "unit")
             first = adjust_first_placement(averaged, rule, run.options, run.clock, intrinsics.free)
         intrinsics = intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses)
-        source = averaged.at(run.pose_as(image_ids, first))
-        rigid = find_rigid_parts(source.model, run.options.placement)
+        source = averaged.at(run.pose(members, first.rotations, first.adjusted))
+        rigid = find_rigid_parts(source.images, run.options.placement)
     priors = None if run.priors is None else run.priors.of(members)
     told = Told(
+        run.read.template(given),
+        given,
         inputs,
         rigid,
         np.inf,
@@ -130,16 +129,15 @@ def _first_adjusted(
         control=None if run.control is None else run.control.of(members),
         gravity=None if run.gravity is None else run.gravity.among(members),
         intrinsics=intrinsics,
-        rigs=sensors_of(model.reconstruction),
         near=first,
     )
     return source, told
 
 
-def _false_pairs(model: PosedModel, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:
-    """Return the pairs of a model's images that its averaged rotations contradict, by name."""
+def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:
+    """Return the pairs of images that their averaged rotations contradict, by name."""
     false = among.pairs[~agreeing_pairs(among, averaging)].tolist()
-    names = ((model.names[i], model.names[j]) for i, j in false)
+    names = ((images.names[i], images.names[j]) for i, j in false)
     return frozenset((min(pair), max(pair)) for pair in names)
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
 from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
-from sfm_shapefit.files.colmap.model import PosedModel
-from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, off_by
 from sfm_shapefit.pipeline.seed import Seeded
 from sfm_shapefit.placement.control_points import (
@@ -16,10 +14,11 @@ from sfm_shapefit.placement.control_points import (
     triangulate_control_points,
 )
 from sfm_shapefit.scene.given import ControlPoints
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.tracks.options import StructureOptions
 
 
-def read_control(model: PosedModel, file: str) -> ControlPoints | None:
+def read_control(images: Images, file: str) -> ControlPoints | None:
     """Return the control points of a file, if one is given.
 
     Raises:
@@ -27,14 +26,14 @@ def read_control(model: PosedModel, file: str) -> ControlPoints | None:
     """
     if not file:
         return None
-    known = read_control_points(Path(file), model)
+    known = read_control_points(Path(file), images)
     if reason := known.why_too_few():
         raise InputError(f"{file}: {reason}")
     return known
 
 
 def bring_to_control_points(
-    seeded: Seeded, model: PosedModel, known: ControlPoints | None, options: StructureOptions, *, moves: bool
+    seeded: Seeded, known: ControlPoints | None, options: StructureOptions, *, moves: bool
 ) -> tuple[Seeded, list[ControlPoint], tuple[str, ...]]:
     """Return a model in scale and axes of control points, a row for each point, and what to warn of.
 
@@ -43,11 +42,9 @@ def bring_to_control_points(
     """
     if known is None:
         return seeded, [], ()
-    found = triangulate_control_points(
-        known, look_at_marks(seeded.reconstruction, model.names, known), options
-    )
+    found = triangulate_control_points(known, look_at_marks(seeded.images, known), options)
     fit = fit_control_points(known, found.positions)
-    warnings = tuple(control_warnings(known, found, fit, model.names))
+    warnings = tuple(control_warnings(known, found, fit, seeded.images.names))
     rows = control_rows(known, found, fit)
     if isinstance(fit, str):
         return seeded, rows, warnings
@@ -57,5 +54,4 @@ def bring_to_control_points(
         )
         checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
         return seeded, checks, (*warnings, f"{unused}; {off_by(fit.motion.scale)}")
-    turned = transform_model(seeded.reconstruction, fit.motion)
-    return seeded.moved(turned, control_gauge(seeded.gauge, known, fit)), rows, warnings
+    return seeded.moved(fit.motion, control_gauge(seeded.gauge, known, fit)), rows, warnings

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
 from sfm_shapefit.judgement.judged import Judged
@@ -22,6 +21,7 @@ from sfm_shapefit.pairs.essential import (
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, RayMatches, join_rays
 
 # A pair of so few matches is never sound, see `RelativeRotations.are_sound`.
@@ -61,7 +61,7 @@ def ask_pairs(
 
     Only pairs `among` some images are asked, by their index; None: all.
     """
-    chosen = _doubtful_pairs(directions, source.model.num_images)
+    chosen = _doubtful_pairs(directions, source.images.num_images)
     if not chosen.any():
         return concatenate_rotations([])
     num_pairs, parts = len(directions.pairs), []
@@ -69,31 +69,31 @@ def ask_pairs(
     without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
     for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
-        rays = _thin(source.model, batch, rows, _MOST_MATCHES)
+        rays = _thin(source.images, batch, rows, _MOST_MATCHES)
         likely = None
         if num_pairs > MANY_PAIRS:
             asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
-            likely = _poses_as_given(source.model, directions, np.array(asked, dtype=np.int64))
+            likely = _poses_as_given(source.images, directions, np.array(asked, dtype=np.int64))
         parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
     return concatenate_rotations(parts)
 
 
-def _poses_as_given(model: PosedModel, directions: PairDirections, rows: IntArray) -> LikelyPoses:
+def _poses_as_given(images: Images, directions: PairDirections, rows: IntArray) -> LikelyPoses:
     """Return the relative poses of pairs by the given rotations and the directions measured with them.
 
     Only of pairs most of whose matches fit that: a turned camera's would be drawn to how it is placed.
     """
     i, j = directions.pairs[rows].T
-    translations = np.einsum("kab,kb->ka", model.rotations[j], directions.directions[rows])
+    translations = np.einsum("kab,kb->ka", images.rotations[j], directions.directions[rows])
     translations[fit_as_placed(directions)[rows] < _LIKELY] = np.nan
-    return LikelyPoses(model.rotations[j] @ model.rotations[i].transpose(0, 2, 1), translations)
+    return LikelyPoses(images.rotations[j] @ images.rotations[i].transpose(0, 2, 1), translations)
 
 
 def doubt_cameras(
     placement: Judged,
     directions: PairDirections,
     relative: RelativeRotations | None,
-    model: PosedModel,
+    images: Images,
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
@@ -101,15 +101,15 @@ def doubt_cameras(
         placement: of some of the images.
         directions: of all pairs.
         relative: what `ask_pairs` returned; if None, the given rotations are believed.
-        model: that has the given rotations.
+        images: at the given rotations.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
-    place_of = np.full(model.num_images, -1)
+    place_of = np.full(images.num_images, -1)
     place_of[placement.cameras] = np.arange(len(placement.cameras))
-    pairs = weigh_pairs(directions, _agreements(placement, directions), relative, model.rotations)
+    pairs = weigh_pairs(directions, _agreements(placement, directions), relative, images.rotations)
     ends = place_of[pairs.pairs]
-    inside = np.flatnonzero((ends >= 0).all(axis=1) & _weighed(directions, model.num_images))
+    inside = np.flatnonzero((ends >= 0).all(axis=1) & _weighed(directions, images.num_images))
     pairs = pairs.subset(inside)._replace(pairs=ends[inside])
     labels = np.arange(len(placement.cameras))
     if placement.groups is not None:
@@ -123,12 +123,11 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
 
     As `doubt_cameras` judges them, but for the baselines, which are not known yet.
     """
-    model = source.model
+    images = source.images
     relative = ask_pairs(source, directions, threads)
-    pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
-    pairs = pairs.subset(_weighed(directions, model.num_images))
-    _, labels = np.unique(model.frame_ids, return_inverse=True)
-    kinds = find_turned(pairs, labels.ravel().astype(np.int64)).kinds
+    pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, images.rotations)
+    pairs = pairs.subset(_weighed(directions, images.num_images))
+    kinds = find_turned(pairs, images.frame_of).kinds
     return np.array([kind is Doubt.RIGHT for kind in kinds])
 
 
@@ -139,25 +138,19 @@ def question_focal_lengths(
 
     Only where several cameras took the images: a single one has nothing to be compared with.
     """
-    model = source.model
-    images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
-    ids, labels = np.unique([image.camera_id for image in images], return_inverse=True)
-    if not source.has_database or not 1 < len(ids) <= _MOST_CAMERAS:
+    images = source.images
+    if not source.has_database or not 1 < len(images.lenses) <= _MOST_CAMERAS:
         return ()
-    kinds = [model.camera(k).model_name for k in range(model.num_images)]
-    lenses = Lenses(
-        labels.ravel().astype(np.int64),
-        model.focal_lengths_px,
-        np.array(["FISHEYE" in kind or "EQUIRECTANGULAR" in kind for kind in kinds]),
-    )
+    is_wide = ["FISHEYE" in lens.model or "EQUIRECTANGULAR" in lens.model for lens in images.lenses]
+    lenses = Lenses(images.lens_of, images.focal_lengths_px, np.array(is_wide)[images.lens_of])
     chosen = _pairs_of_cameras(directions, lenses.camera_of)
     wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
     parts = []
     for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
-        parts.append(_thin(model, batch, rows, _FOCAL_MATCHES[1]))
-    found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, threads)
-    return tuple(doubt._replace(camera=int(ids[doubt.camera])) for doubt in found)
+        parts.append(_thin(images, batch, rows, _FOCAL_MATCHES[1]))
+    found = doubt_focal_lengths(join_rays(parts), images.rotations, lenses, threads)
+    return tuple(doubt._replace(camera=images.lenses[doubt.camera].id) for doubt in found)
 
 
 def _pairs_of_cameras(directions: PairDirections, camera_of: IntArray) -> IntArray:
@@ -217,7 +210,7 @@ def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
     return _strongest(directions, num_images)
 
 
-def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:
+def _thin(images: Images, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:
     """Return some pairs with at most so many matches, taken evenly, their rays in camera axes."""
     counts = np.diff(batch.offsets)[rows]
     taken = np.minimum(counts, most)
@@ -229,7 +222,7 @@ def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> Ra
     pairs = batch.pairs[rows]
     rays = []
     for side, own in ((0, batch.rays_i), (1, batch.rays_j)):
-        rotations = model.rotations[np.repeat(pairs[:, side], taken)]
+        rotations = images.rotations[np.repeat(pairs[:, side], taken)]
         rays.append(np.einsum("kab,kb->ka", rotations, own[chosen]))
     return RayMatches(
         pairs=pairs, offsets=offsets, rays_i=rays[0], rays_j=rays[1], pixel_angles=batch.pixel_angles[rows]

@@ -46,8 +46,8 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    models = read_model(reconstruction), read_model(reference)
-    poses, truth = (NamedPoses(model.names, model.rotations, model.centers) for model in models)
+    read = read_model(reconstruction).images, read_model(reference).images
+    poses, truth = (NamedPoses(images.names, images.rotations, images.centers) for images in read)
     return evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
 
 
@@ -77,7 +77,10 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
             raise InputError(f"{table}: {error}") from error
     known = (list(rows), positions)
     return evaluate_positions(
-        (posed.names, posed.centers), known, statement, as_they_stand=datum is not None or not geodetic
+        (posed.images.names, posed.images.centers),
+        known,
+        statement,
+        as_they_stand=datum is not None or not geodetic,
     )
 
 

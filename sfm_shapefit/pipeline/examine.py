@@ -35,8 +35,8 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, norm
 from sfm_shapefit.facts.model import ExaminedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, PairRow
-from sfm_shapefit.files.colmap.model import PosedModel, read_model
-from sfm_shapefit.files.colmap.points import ModelPictures, points_of
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -46,6 +46,7 @@ from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.options import SolverOptions
 
 _FAR_DEG, _FAR_LEVELS = 1.0, 6.0
@@ -86,8 +87,8 @@ def examine(
         model = read_model(folder)
         inputs = choose_inputs(folder, database)
     with open_source(model, inputs) as matches:
-        found = examine_source(matches, DirectionOptions(), clock)
-    poses = poses_of(model, [row.name for row in found.cameras])
+        found = examine_source(model, matches, DirectionOptions(), clock)
+    poses = poses_of(model.images, [row.name for row in found.cameras])
     # The input is what is shown; there is nothing to be compared with it.
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     drawing = build_drawing(found.cameras, found.pairs, poses=poses, points=model.reconstruction)
@@ -99,33 +100,37 @@ def examine(
     return replace(drawing, further=further, points=points), found.facts
 
 
-def examine_source(matches: MatchSource, options: DirectionOptions, clock: Clock) -> Examined:
+def examine_source(
+    model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
+) -> Examined:
     """Return what can be said of a model whose matches are open.
 
     Args:
-        matches: of the model, which is not changed.
+        model: not changed.
+        matches: of its images.
         options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
-    model = matches.model
+    images = model.images
     with clock("points"):
-        points = points_of(model.reconstruction, model.images)
-        quality = image_quality(points, model.images, ModelPictures(model.reconstruction, model.images))
+        points = points_of(model.reconstruction, images)
+        pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
+        quality = image_quality(points, images, pictures)
     with clock("directions"):
         try:
             directions = measure(matches, options, clock).directions
         except UnsolvableError:  # no pair shares anything
             directions = None
-    pairs, level_deg = _pair_rows(model, directions)
+    pairs, level_deg = _pair_rows(images, directions)
     cameras = _camera_rows(model, quality, pairs)
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
-    measures = (float(np.median(model.focal_lengths_px)), "of the model's units")
+    measures = (float(np.median(images.focal_lengths_px)), "of the model's units")
     facts = ExaminedFacts(
         inputs=matches.inputs.facts,
         options={},
         verdict=_judge(cameras, pairs),
         num_images=len(cameras),
-        num_placed=model.num_images,
+        num_placed=images.num_images,
         num_pairs=len(pairs),
         num_points=model.reconstruction.num_points3D(),
         figures=KeyFigures.of_cameras(cameras, error_deg, *measures),
@@ -152,12 +157,12 @@ def _mean(values: FloatArray) -> float:
     return float(known.mean()) if len(known) else np.nan
 
 
-def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[list[PairRow], float]:
+def _pair_rows(images: Images, directions: PairDirections | None) -> tuple[list[PairRow], float]:
     """Return a row per pair, and the level of the residuals in degrees."""
     if directions is None:
         return [], np.nan
     i, j = directions.pairs.T
-    usable, baselines = directions.usable(), model.centers[i] - model.centers[j]
+    usable, baselines = directions.usable(), images.centers[i] - images.centers[j]
     usable = usable[np.linalg.norm(baselines[usable], axis=1) > 0.0]
     residuals = np.full(len(i), np.nan)
     residuals[usable] = angle_between_deg(directions.directions[usable], normalized(baselines[usable]))
@@ -168,8 +173,8 @@ def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[li
         known = bool(np.isfinite(residuals[e]))
         rows.append(
             PairRow(
-                name1=model.names[i[e]],
-                name2=model.names[j[e]],
+                name1=images.names[i[e]],
+                name2=images.names[j[e]],
                 direction=tuple(directions.directions[e].tolist()) if known else (),
                 support=int(directions.num_inliers[e]),
                 residual_deg=float(residuals[e]),
@@ -180,14 +185,14 @@ def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[li
     return rows, level
 
 
-def _camera_rows(model: PosedModel, quality: ImageQuality, pairs: list[PairRow]) -> list[CameraRow]:
+def _camera_rows(model: ColmapModel, quality: ImageQuality, pairs: list[PairRow]) -> list[CameraRow]:
     """Return a row per image, those with a pose first."""
-    degrees, wrong = dict.fromkeys(model.names, 0), dict.fromkeys(model.names, 0)
+    degrees, wrong = dict.fromkeys(model.images.names, 0), dict.fromkeys(model.images.names, 0)
     for pair in pairs:
         for name in (pair.name1, pair.name2):
             degrees[name] += bool(pair.direction)
             wrong[name] += bool(pair.direction) and pair.verdict == Verdict.OUTLIER.value
-    shares = [wrong[name] / degrees[name] for name in model.names if degrees[name] >= _FEWEST_PAIRS]
+    shares = [wrong[name] / degrees[name] for name in model.images.names if degrees[name] >= _FEWEST_PAIRS]
     usual = _Usual(_median(quality.errors_px[np.isfinite(quality.errors_px)].tolist()), _median(shares))
     rows = [
         CameraRow(
@@ -195,12 +200,12 @@ def _camera_rows(model: PosedModel, quality: ImageQuality, pairs: list[PairRow])
             placed=True,
             reason="; ".join(_weaknesses(quality, k, usual, (wrong[name], degrees[name]))),
             piece=0,
-            center=tuple(model.centers[k].tolist()),
+            center=tuple(model.images.centers[k].tolist()),
             degree=degrees[name],
         )
-        for k, name in enumerate(model.names)
+        for k, name in enumerate(model.images.names)
     ]
-    others = {image.name for image in model.reconstruction.images.values()} - set(model.names)
+    others = set(model.image_names) - set(model.images.names)
     return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
 
 

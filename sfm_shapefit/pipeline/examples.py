@@ -171,7 +171,7 @@ def locate_rigs(folder: Path) -> None:
 def locate_around_fixed(folder: Path) -> None:
     """Locate cameras around others that stay, and by priors that pull."""
     model = _workspace(folder)
-    posed = read_model(model)
+    posed = read_model(model).images
     names = folder / "fixed.txt"
     names.write_text("\n".join(posed.names[:4]))
     locate(model, fix=str(names))

@@ -43,7 +43,7 @@ class PairWork(Generic[Answer]):
 
 
 def measure_with_workers(
-    view: View[Any], work: PairWork[Answer], executor: Executor, advance: Advance
+    view: View, work: PairWork[Answer], executor: Executor, advance: Advance
 ) -> list[Answer]:
     """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
 

@@ -38,11 +38,6 @@ class FirstPlacement(NamedTuple):
     stand: Near
     """Where the images stand."""
 
-    def parameters(self) -> dict[int, list[float]]:
-        """Return the parameters of the cameras that were free, or turned out to be left open, by their id."""
-        cameras = {*self.adjusted.lenses.sigmas, *self.adjusted.lenses.undetermined}
-        return {lens.id: [*lens.parameters] for lens in self.adjusted.images.lenses if lens.id in cameras}
-
 
 def adjust_first_placement(
     source: MatchSource,
@@ -67,9 +62,9 @@ def adjust_first_placement(
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    model, wanted = source.model, Wanted(tracks=wants_points(source, options.nodes))
+    images, wanted = source.images, Wanted(tracks=wants_points(source, options.nodes))
     measured = measure(source, options.directions, clock, wanted)
-    graph = rule.rigid.apply(build_graph(model, measured))
+    graph = rule.rigid.apply(build_graph(images, measured))
     del measured  # arrays of all pairs
     placement = next(place_cameras(graph, options.placement, options.nodes, clock))
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
@@ -78,15 +73,15 @@ def adjust_first_placement(
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
     del graph
-    posed = posed_part(pose_images(model, located))
+    posed = posed_part(pose_images(images, located))
     links = partial(read_links, source, located, posed, clock.advance)
-    freedom = Freedom(lenses=lenses, has_sensors=options.freedom.rigs == "free" and model.has_rigs)
+    freedom = Freedom(lenses=lenses, has_sensors=options.freedom.rigs == "free" and images.has_rigs)
     adjusted = adjust_thinly(posed.images, links, options.structure, freedom, thorough=thorough)
-    rotations, centers = model.rotations.copy(), np.full((model.num_images, 3), np.nan)
+    rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
-    is_posed = np.isin(np.arange(model.num_images), posed.rows)
+    is_posed = np.isin(np.arange(images.num_images), posed.rows)
     stand = Near(centers, placement.refined)
-    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, is_posed), stand)
+    return FirstPlacement(adjusted, _turn_the_others(images.rotations, rotations, is_posed), stand)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

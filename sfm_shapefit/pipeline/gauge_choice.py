@@ -10,7 +10,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.rigs import Rigid
@@ -27,6 +26,7 @@ from sfm_shapefit.placement.gauge import (
 )
 from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.images import Images
 
 SETS_SCALE: dict[ScaleKind, str] = {
     "fixed": "the fixed cameras",
@@ -43,10 +43,8 @@ PRIORS_OF_DATABASE = "database"
 """In place of a table or folder: the database's own pose priors."""
 
 
-def read_priors(
-    model: PosedModel, file: DatabaseFile | None, asked: Path | str | None
-) -> PositionPriors | None:
-    """Return the position priors of the model's images, if they are asked for.
+def read_priors(images: Images, file: DatabaseFile | None, asked: Path | str | None) -> PositionPriors | None:
+    """Return the position priors of images, if they are asked for.
 
     Raises:
         InputError: if they are asked for and there are none.
@@ -56,8 +54,8 @@ def read_priors(
     if str(asked) == PRIORS_OF_DATABASE:
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one with --database")
-        return database_priors(file, model)
-    return exif_priors(Path(asked), model) if Path(asked).is_dir() else table_priors(Path(asked), model)
+        return database_priors(file, images)
+    return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
 
 
 def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str], missing: str) -> None:
@@ -74,7 +72,8 @@ def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str],
 class GaugeRule(NamedTuple):
     """What sets scale, origin and axes of the output, by precedence."""
 
-    model: PosedModel
+    images: Images
+    """As given."""
     rigid: Rigid
     scale: Scale
     """Where nothing else is known."""
@@ -96,15 +95,15 @@ class GaugeRule(NamedTuple):
             InputError: if what is known does not determine the scale.
             UnsolvableError: if the only fixed image is not among the cameras.
         """
-        model, rigid = self.model, self.rigid
-        centers, fixed = model.centers[cameras], rigid.fixed[cameras]
-        has_centers = not coincide(model.centers - model.frame_offsets)
+        images, rigid = self.images, self.rigid
+        centers, fixed = images.centers[cameras], rigid.fixed[cameras]
+        has_centers = not coincide(images.frames.centers)
         if not has_centers:
             centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
         if unit is not None:
-            return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
+            return metric_gauge(locations, unit, centers, fixed, has_rigs=images.has_rigs)
         if self.distances:
-            names = [model.names[camera] for camera in cameras.tolist()]
+            names = [images.names[camera] for camera in cameras.tolist()]
             gauge = gauge_of_distances(names, locations, self.distances)
         elif self.priors is not None and not rigid.fixed.any():
             gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
@@ -112,7 +111,7 @@ class GaugeRule(NamedTuple):
             gauge = unit_gauge(locations) if self.scale == "unit" else input_gauge(locations, centers)
         if not rigid.fixed.any():
             return gauge
-        name = model.names[int(np.argmax(rigid.fixed))]
+        name = images.names[int(np.argmax(rigid.fixed))]
         if not fixed.any():
             raise UnsolvableError(
                 f"{name} is to stay where it is, but the matches do not tie it to the others"
@@ -127,7 +126,7 @@ class GaugeRule(NamedTuple):
             cameras: (k,) those in the output, ascending.
             centers: (k, 3) where they are in the output.
         """
-        names = [self.model.names[camera] for camera in cameras.tolist()]
+        names = [self.images.names[camera] for camera in cameras.tolist()]
         if self.distances and chosen.scale != "distance":
             found = partial(gauge_of_distances, names, centers, self.distances)
             yield say_unused("known distances were", chosen, found)
@@ -150,15 +149,9 @@ def off_by(scale: float) -> str:
     return f"they differ by {100.0 * abs(scale - 1.0):.3g} %"
 
 
-def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) -> FloatArray:
-    """Return the turn of the world (3, 3) that brings adjusted rotations closest to the input's on average.
-
-    Args:
-        model: the input.
-        cameras: (k,) of its images.
-        rotations: (k, 3, 3) of them, cam_from_world.
-    """
-    return mean_rotation_l1(model.rotations[cameras].transpose(0, 2, 1) @ rotations)
+def restore_axes(given: Images, adjusted: Images, cameras: IntArray) -> FloatArray:
+    """Return the turn of the world (3, 3) that brings some adjusted rotations closest to those given."""
+    return mean_rotation_l1(given.rotations[cameras].transpose(0, 2, 1) @ adjusted.rotations[cameras])
 
 
 def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Sequence[KnownDistance]) -> Gauge:

@@ -70,24 +70,25 @@ def inspect(
     with clock("read"):
         model = read_model(source)
         inputs = choose_inputs(source, database, options.source.directions)
-        inputs = read_left_out(inputs, model.names, options.directions.without)
+        inputs = read_left_out(inputs, model.images.names, options.directions.without)
+    images = model.images
     with open_source(model, inputs) as matches:
         with clock("directions"):
             wanted = Wanted(tracks=wants_points(matches, options.nodes))
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
         with clock("diagnosis"):
-            with_points = add_evidence(build_graph(model, measured), measured)
-            grouped = group_frames(model, with_points)
+            with_points = add_evidence(build_graph(images, measured), measured)
+            grouped = group_frames(images, with_points)
             work = count_work(matches, directions)
             work = describe_work(grouped, work, options.placement, options.freedom)
             confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
                 directions=inputs.statement,
-                num_images=len(model.reconstruction.images),
+                num_images=len(model.image_names),
                 statuses={status.value: count for status, count in directions.counts().items()},
-                points=options.nodes.points_statement(model.num_images, with_points.num_points),
+                points=options.nodes.points_statement(images.num_images, with_points.num_points),
                 diagnosis=diagnose(with_points, options.placement, confirmed),
                 expected=forecast(work, matches.economy),
-                rigs=rigs_statement(model, grouped),
+                rigs=rigs_statement(images, grouped),
             )

@@ -9,9 +9,9 @@ from sfm_shapefit.files.colmap.intrinsics import (
     find_uncalibrated,
     with_focal_lengths,
 )
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.freedom import IntrinsicsFreedom
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 
 # A view graph that wants a focal length further off says more about the graph than about the lens.
@@ -19,15 +19,15 @@ _MOST_OFF = 4.0
 
 
 def settle_intrinsics(
-    model: PosedModel,
+    images: Images,
     file: DatabaseFile | None,
     wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
-) -> tuple[PosedModel, DoubtedIntrinsics]:
-    """Return the model to start from, and which intrinsics the adjustments may change.
+) -> tuple[Images, DoubtedIntrinsics]:
+    """Return the images to start from, and which intrinsics the adjustments may change.
 
     Args:
-        model: as given, of which nothing changes.
+        images: as given.
         file: the database, if there is one, which says which intrinsics are guesses.
         wanted: intrinsics that may change.
         left_out: pairs that say nothing of focal lengths.
@@ -35,8 +35,8 @@ def settle_intrinsics(
     Raises:
         InputError: if the database cannot be read.
     """
-    guessed = {} if file is None else find_uncalibrated(file, model)
-    cameras = {i: model.reconstruction.camera(i) for i in _cameras_in_use(model)}
+    guessed = {} if file is None else find_uncalibrated(file, images)
+    cameras = {lens.id: lens for lens in images.lenses}
     origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
     origins |= {i: found.origin for i, found in guessed.items()}
     doubts = {} if wanted == "held" else doubt_lenses(cameras, origins)
@@ -52,9 +52,4 @@ def settle_intrinsics(
         free=FreeLenses(doubts, distortion=wanted != "focal"),
         view_graph=factors,
     )
-    return with_focal_lengths(model, factors), intrinsics
-
-
-def _cameras_in_use(model: PosedModel) -> list[int]:
-    """Return the ids of the cameras that took the posed images, ascending."""
-    return sorted({model.camera(k).camera_id for k in range(model.num_images)})
+    return with_focal_lengths(images, factors), intrinsics

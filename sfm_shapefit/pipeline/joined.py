@@ -31,7 +31,7 @@ from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
-from sfm_shapefit.pipeline.inputs import choose_inputs, see_matches
+from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.scene.given import PositionPriors
@@ -90,13 +90,12 @@ def tell_group(
     gauge, rescale = _choose_scale(group, located.gauge, known)
     group = _rescaled(group, rescale)
     model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
-    inputs = choose_inputs(group.reconstruction, database)
-    inputs = replace(inputs, left_out=told.left_out)
+    inputs = replace(inputs_from(database), left_out=told.left_out)
     own = Clock(clock.progress)
-    found = examine_source(see_matches(matches, model, inputs), located.options.directions, own)
+    found = examine_source(model, see_matches(matches, model.images, inputs), located.options.directions, own)
     weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
     cameras = list(_camera_rows(found.cameras, group, models))
-    seen, measures = found.facts, (float(np.median(model.focal_lengths_px)), UNITS[gauge.scale])
+    seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     first = next(iter(group.world_from))
     facts = JoinedFacts(
         inputs=inputs.facts,

@@ -12,9 +12,8 @@ from sfm_shapefit.base.geometry import METRIC_SIGMA, Similarity, compose
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
 from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.intrinsics import with_parameters
 from sfm_shapefit.files.colmap.merge import merge_models
-from sfm_shapefit.files.colmap.model import PosedModel, observed_points
+from sfm_shapefit.files.colmap.points import observed_points
 from sfm_shapefit.files.colmap.priors import MissingPriorsError, database_priors
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
@@ -28,6 +27,7 @@ from sfm_shapefit.placement.join import (
     place_by_priors,
 )
 from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, View
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class JoinedModels(NamedTuple):
 
 def join_models(
     models: Sequence[MappedModel],
-    unposed: PosedModel,
+    images: Images,
     matches: DatabaseMatches,
     told: ToldOfJoins,
     clock: Clock,
@@ -60,7 +60,7 @@ def join_models(
 
     Args:
         models: largest first.
-        unposed: all images of the database, by index.
+        images: all of the database.
         matches: of these.
         told: what is known of the images beside.
         clock: whose progress is told.
@@ -70,12 +70,12 @@ def join_models(
     priors, warnings = told.priors, []
     if priors is None:
         try:
-            priors = database_priors(matches.file, unposed)
+            priors = database_priors(matches.file, images)
         except MissingPriorsError:
             pass
         except InputError as error:
             warnings.append(f"the position priors of the database join no models: {error}")
-    evidence = _Evidence(models, unposed, priors, partial(matches.at, left_out=told.left_out))
+    evidence = _Evidence(models, images, priors, partial(matches.at, left_out=told.left_out))
     joins = [evidence.join(number) for number in range(1, len(models))]
     joined = [tell_group(group, models, matches, told, clock) for group in _merge(models, joins, evidence)]
     return JoinedModels(tuple(joins), tuple(joined), tuple(warnings))
@@ -105,34 +105,34 @@ class _Evidence:
     def __init__(
         self,
         models: Sequence[MappedModel],
-        unposed: PosedModel,
+        images: Images,
         priors: PositionPriors | None,
-        see: Callable[[PosedModel], View[PosedModel]],
+        see: Callable[[Images], View],
     ) -> None:
         parameters = {
             camera_id: camera.params.tolist()
             for model in reversed(models)
             for camera_id, camera in model.located.reconstruction.cameras.items()
         }
-        self.models, self.unposed, self.priors = models, with_parameters(unposed, parameters), priors
-        index = {image_id: k for k, image_id in enumerate(unposed.image_ids.tolist())}
-        self.model_of_image = np.full(unposed.num_images, -1, dtype=np.int64)
+        self.models, self.images, self.priors = models, images.with_parameters(parameters), priors
+        index = {image_id: k for k, image_id in enumerate(images.ids.tolist())}
+        self.model_of_image = np.full(images.num_images, -1, dtype=np.int64)
         for number, model in enumerate(models):
             for image_id in model.located.reconstruction.reg_image_ids():
                 self.model_of_image[index[image_id]] = number
-        self.centers = np.full((unposed.num_images, 3), np.nan)
-        self.rotations = np.full((unposed.num_images, 3, 3), np.nan)
+        self.centers = np.full((images.num_images, 3), np.nan)
+        self.rotations = np.full((images.num_images, 3, 3), np.nan)
         self.ids: list[IntArray] = []
         """Of each image, the id of the point that each keypoint observes; -1 for none."""
         for image, number in enumerate(self.model_of_image.tolist()):
             self.ids.append(self._observed(image, number) if number >= 0 else np.zeros(0, dtype=np.int64))
         self.by_priors: dict[int, PlacedByPriors | str | None] = {}
         """Of each model that was asked; fitted once, whatever the number of models it is compared with."""
-        self.matches = self._read_matches(see(self.unposed))
+        self.matches = self._read_matches(see(self.images.apart()))
 
     def _observed(self, image: int, number: int) -> IntArray:
         """Return what the keypoints of an image of a model observe, and note its pose."""
-        posed = self.models[number].located.reconstruction.image(int(self.unposed.image_ids[image]))
+        posed = self.models[number].located.reconstruction.image(int(self.images.ids[image]))
         self.centers[image] = posed.projection_center()
         self.rotations[image] = posed.cam_from_world().rotation.matrix()
         keypoints, points = observed_points(posed)
@@ -140,7 +140,7 @@ class _Evidence:
         found[keypoints] = points.astype(np.int64)
         return found
 
-    def _read_matches(self, view: View[PosedModel]) -> dict[tuple[int, int], "_Between"]:
+    def _read_matches(self, view: View) -> dict[tuple[int, int], "_Between"]:
         """Return the matches between models, by the two models, and what turns they suggest."""
         parts: dict[tuple[int, int], list[_Between]] = {}
         for batch in view.between(self.model_of_image):
@@ -212,7 +212,7 @@ class _Evidence:
                 they do not know their scale.
         """
         located = [self.models[k].located for k in (first, second)]
-        has_rigs = [one.model.has_rigs for one in located]
+        has_rigs = [one.images.has_rigs for one in located]
         if not any(has_rigs):
             return None
         if not all(has_rigs):
@@ -248,7 +248,7 @@ class _Evidence:
             points.append(np.full((len(ids), 3), np.nan))
             there = ids >= 0
             points[k][there] = np.reshape([structure.point3D(i).xyz for i in ids[there].tolist()], (-1, 3))
-        focal_px = self.unposed.focal_lengths_px[between.images].min(axis=1)
+        focal_px = self.images.focal_lengths_px[between.images].min(axis=1)
         return Ties(
             eyes_first=self.centers[between.images[:, 0]],
             eyes_second=self.centers[between.images[:, 1]],
@@ -256,7 +256,7 @@ class _Evidence:
             rays_second=between.rays[:, 1],
             points_first=points[0],
             points_second=points[1],
-            pairs=between.images[:, 0] * self.unposed.num_images + between.images[:, 1],
+            pairs=between.images[:, 0] * self.images.num_images + between.images[:, 1],
             tolerances=_WIDENING * options.max_reprojection_error_px / focal_px,
         )
 

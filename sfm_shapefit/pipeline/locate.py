@@ -14,6 +14,7 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
@@ -23,10 +24,9 @@ from sfm_shapefit.pipeline.inputs import (
     open_matches,
     read_left_out,
     see_matches,
-    without_structure,
 )
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.pipeline.rigs import find_rigid_parts
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
 from sfm_shapefit.pipeline.settle import Told, settle
 
 if TYPE_CHECKING:
@@ -80,20 +80,25 @@ def locate(
     with ExitStack() as stack:
         with clock("read"):
             model = read_model(reconstruction)
+            given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
-            inputs = read_left_out(inputs, model.names, options.directions.without)
-            refuse_unknown_names(options.gauge.known_distance, model.names, "the model has no posed image")
-            if options.freedom.rigs == "free" and not model.has_rigs:
+            inputs = read_left_out(inputs, given.names, options.directions.without)
+            refuse_unknown_names(options.gauge.known_distance, given.names, "the model has no posed image")
+            if options.freedom.rigs == "free" and not given.has_rigs:
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
             matches = stack.enter_context(closing(open_matches(model, inputs)))
             wanted = options.freedom.intrinsics
-            model, intrinsics = settle_intrinsics(model, matches.file, wanted, inputs.left_out)
-            known = read_priors(model, matches.file, priors)
-            control = read_control(model, options.gauge.control_points)
-            rigid = find_rigid_parts(model, options.placement, options.fix)
-            model, colors = without_structure(model, matches)
-            source = see_matches(matches, model, inputs, options)
+            images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out)
+            known = read_priors(images, matches.file, priors)
+            control = read_control(images, options.gauge.control_points)
+            rigid = find_rigid_parts(images, options.placement, read_fixed_images(model, options.fix))
+            has_database = matches.file is not None
+            template = template_of(model, matches.num_keypoints > 0 if has_database else None)
+            del model  # whose points and keypoints are large
+            source = see_matches(matches, images, inputs, options)
         told = Told(
+            template,
+            images,
             inputs,
             rigid,
             pull_of_rotations(options.rotations),
@@ -102,6 +107,5 @@ def locate(
             priors=known,
             control=control,
             intrinsics=intrinsics,
-            colors=colors,
         )
         return settle(source, told, options, clock)

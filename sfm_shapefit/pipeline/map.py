@@ -74,8 +74,8 @@ def _map_opened(run: MapRun) -> MapResult:
     relative = run.measure()
     if options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
-        if differ_in_rays(known, run.unposed):
-            run = run._replace(unposed=known)
+        if differ_in_rays(known, run.images):
+            run = run._replace(images=known)
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)
@@ -88,10 +88,10 @@ def _map_opened(run: MapRun) -> MapResult:
     if options.join == "safe":
         with clock("join"):
             told = ToldOfJoins(run.priors, options.gauge.known_distance, run.without)
-            found = join_models(models, run.unposed, run.matches, told, clock)
+            found = join_models(models, run.images, run.matches, told, clock)
     left_out = {
         name: reasons[frame]
-        for name, frame in zip(run.unposed.names, run.frame_of_image.tolist(), strict=True)
+        for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)
         if frame in reasons
     }
     result = MapResult(
@@ -100,13 +100,13 @@ def _map_opened(run: MapRun) -> MapResult:
         models=tuple(models),
         joins=found.joins,
         joined=found.joined,
-        num_images=run.unposed.num_images,
+        num_images=run.images.num_images,
         num_pairs=len(relative.pairs),
         num_video_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=(
-            *map_warnings(run.images.rigs.incomplete, models, left_out),
+            *map_warnings(run.read.rigs.incomplete, models, left_out),
             *found.warnings,
             *lost_distances(options.gauge.known_distance, models, found.joined),
         ),

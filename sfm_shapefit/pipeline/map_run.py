@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.database_images import UnposedImages, pose_at_origin, read_images
-from sfm_shapefit.files.colmap.intrinsics import with_parameters
-from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.database_images import UnposedImages, read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.missing_matches import count_partners, matched_shares
 from sfm_shapefit.pairs.options import LEAST_MATCHES
@@ -25,16 +24,16 @@ from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging
 from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
 from sfm_shapefit.pipeline.gravity import read_gravity
-from sfm_shapefit.pipeline.inputs import choose_inputs, read_left_out
+from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames, View
 
 # Pairs: the shares of more would cost more than they are worth, 0.2 ms a pair and 16 bytes a match.
@@ -49,27 +48,23 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
     """
     path = file.path
     with clock("read"):
-        images = read_images(file)
-        unposed = read_model(images.reconstruction)
-        frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-        if options.freedom.rigs == "free" and len(np.unique(frame_of_image)) == len(frame_of_image):
+        read = read_images(file)
+        images = read.images
+        if options.freedom.rigs == "free" and not images.has_rigs:
             raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
-        inputs = choose_inputs(images.reconstruction, path)
-        inputs = read_left_out(inputs, unposed.names, options.directions.without)
-        unposed, intrinsics = settle_intrinsics(unposed, file, options.freedom.intrinsics, inputs.left_out)
-        refuse_unknown_names(options.gauge.known_distance, unposed.names, "the database has no image")
-        positions = read_priors(unposed, file, priors)
-        control = read_control(unposed, options.gauge.control_points)
-        gravity = read_gravity(file, unposed, options.averaging.gravity)
-        matches = DatabaseMatches(file, unposed.names)
+        inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
+        images, intrinsics = settle_intrinsics(images, file, options.freedom.intrinsics, inputs.left_out)
+        refuse_unknown_names(options.gauge.known_distance, images.names, "the database has no image")
+        positions = read_priors(images, file, priors)
+        control = read_control(images, options.gauge.control_points)
+        gravity = read_gravity(file, images, options.averaging.gravity)
+        matches = DatabaseMatches(file, images.names)
     return MapRun(
         options=options,
         clock=clock,
         matches=matches,
+        read=read,
         images=images,
-        unposed=unposed,
-        frame_of_image=frame_of_image,
-        sensor_rotations=sensor_rotations,
         intrinsics=intrinsics,
         priors=positions,
         control=control,
@@ -84,13 +79,9 @@ class MapRun(NamedTuple):
     options: MapOptions
     clock: Clock
     matches: DatabaseMatches
-    images: UnposedImages
-    unposed: PosedModel
-    """The images as a model."""
-    frame_of_image: IntArray
-    """(n,)"""
-    sensor_rotations: FloatArray
-    """(n, 3, 3) sensor_from_rig of each image."""
+    read: UnposedImages
+    images: Images
+    """All of the database, at the origin."""
     intrinsics: DoubtedIntrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
@@ -107,15 +98,15 @@ class MapRun(NamedTuple):
             sharing = Sharing(self.clock.threads, self.clock.executor, self.clock.advance)
             return measure_rotations(self.view(), LEAST_MATCHES, sharing)
 
-    def view(self) -> View[PosedModel]:
-        """Return the matches of all images, but for the pairs that are left out."""
-        return self.matches.at(self.unposed, self.without)
+    def view(self) -> View:
+        """Return the matches of all images in axes of their cameras, but for the pairs that are left out."""
+        return self.matches.at(self.images.apart(), self.without)
 
     def find_videos(self, relative: RelativeRotations) -> Videos:
         """Return the videos among the images, as far as the options want to know of them."""
         asked = self.options.averaging.sequence
-        nothing = Videos(np.full(self.unposed.num_images, -1), np.full(self.unposed.num_images, -1))
-        videos = nothing if asked == "none" else find_videos(self.unposed.names)
+        nothing = Videos(np.full(self.images.num_images, -1), np.full(self.images.num_images, -1))
+        videos = nothing if asked == "none" else find_videos(self.images.names)
         return confirm_videos(videos, relative) if asked == "auto" else videos
 
     def judge_loops(
@@ -126,7 +117,7 @@ class MapRun(NamedTuple):
             return self, relative, ()
         with self.clock("rotation averaging"):
             loops = judge_loops(videos, relative, self.clock.threads)
-        names = self.unposed.names
+        names = self.images.names
         refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
         kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
@@ -135,13 +126,13 @@ class MapRun(NamedTuple):
     def score_pairs(self, relative: RelativeRotations) -> "MapRun":
         """Return the run with the scores by which pairs of repeated structure are told."""
         pairs = list(map(tuple, relative.pairs.tolist()))
-        triplets = score_triplets(self.unposed.num_images, relative).tolist()
+        triplets = score_triplets(self.images.num_images, relative).tolist()
         shares: dict[tuple[int, int], float] = {}
         if len(pairs) <= _MOST_SCORED_PAIRS:
             with self.clock("scores of pairs"):
                 view = self.view()
-                pixels = [view.keypoints(k) for k in range(self.unposed.num_images)]
-                sizes = self.unposed.image_sizes()
+                pixels = [view.keypoints(k) for k in range(self.images.num_images)]
+                sizes = self.images.sizes_px
                 batches = list(view.links(LEAST_MATCHES))  # both look at all of them
                 partners = count_partners([len(own) for own in pixels], batches)
                 for batch in batches:
@@ -152,14 +143,15 @@ class MapRun(NamedTuple):
 
     def share_of_doubted_lenses(self) -> float:
         """Return the share of images whose intrinsics are in doubt."""
-        cameras = map(self.unposed.camera, range(self.unposed.num_images))
-        return float(np.mean([camera.camera_id in self.intrinsics.free.doubts for camera in cameras]))
+        is_doubted = np.array([lens.id in self.intrinsics.free.doubts for lens in self.images.lenses])
+        return float(np.mean(is_doubted[self.images.lens_of]))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]
     ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
         """Yield the frames of each component, and its images with their rotations."""
-        of_image, sensors = self.frame_of_image, self.sensor_rotations
+        of_image, images = self.frame_of_image, self.images
+        sensors = images.sensors.rotations[images.lens_of]
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
         gravity = None if self.gravity is None else self.gravity.of_frames(of_image, sensors)
         averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, self.shares_of_frames())
@@ -168,27 +160,38 @@ class MapRun(NamedTuple):
             places = np.searchsorted(frames, of_image[members])
             yield frames, members, averaged.turned(places, sensors[members])
 
+    @property
+    def frame_of_image(self) -> IntArray:
+        """Frames of the images (n,), numbered as their first images stand."""
+        frame_of = self.images.frame_of
+        _, first = np.unique(frame_of, return_index=True)
+        return np.argsort(np.argsort(first))[frame_of]
+
     def shares_of_frames(self) -> dict[tuple[int, int], float]:
         """Return the matched shares by pairs of frames; none where frames are those of rigs."""
         if not np.array_equal(self.frame_of_image, np.arange(len(self.frame_of_image))):
             return {}
         return {pair: share for pair, (_, share) in self.scores.items()}
 
-    def inputs_of(self, model: PosedModel) -> Inputs:
-        """Return what the images of a component are located from."""
-        inputs = choose_inputs(model.reconstruction, self.matches.file.path)
-        return replace(inputs, left_out=self.without)
+    @property
+    def inputs(self) -> Inputs:
+        """What models are located from."""
+        return replace(inputs_from(self.matches.file.path), left_out=self.without)
 
-    def pose_as(self, image_ids: list[int], first: FirstPlacement) -> PosedModel:
-        """Return images with the rotations, intrinsics and rigs of a first placement, all centers 0."""
-        rigs = self.images.rigs.with_sensors_of(first.adjusted.images)
-        run = self._replace(images=replace(self.images, rigs=rigs)) if first.adjusted.sensors else self
-        return run.pose(image_ids, first.rotations, first.parameters())
+    def pose(self, members: IntArray, rotations: FloatArray, first: Estimate | None = None) -> Images:
+        """Return some images with these rotations (k, 3, 3), all frames at the origin.
 
-    def pose(
-        self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None
-    ) -> PosedModel:
-        """Return images with these rotations and all centers 0, and parameters that were found of cameras."""
-        known = with_parameters(self.unposed, found or {})
-        images = replace(self.images, reconstruction=known.reconstruction)
-        return read_model(pose_at_origin(images, image_ids, rotations))
+        An adjustment, if there was one, gives them the lenses that it was free to change, and its sensors.
+        """
+        images = self.images.part(members)
+        if first is not None:
+            images = images.with_parameters(changed_parameters(first))
+            if first.sensors:
+                images = images.with_sensors_of(first.images)
+        return images.turned_to(rotations)
+
+
+def changed_parameters(adjusted: Estimate) -> dict[int, tuple[float, ...]]:
+    """Return the parameters of the lenses that were free, or turned out to be left open, by their ids."""
+    free = {*adjusted.lenses.sigmas, *adjusted.lenses.undetermined}
+    return {lens.id: lens.parameters for lens in adjusted.images.lenses if lens.id in free}

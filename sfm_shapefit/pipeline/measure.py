@@ -9,7 +9,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
@@ -20,6 +19,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 from sfm_shapefit.tracks.options import NodeOptions
@@ -126,7 +126,7 @@ class _Beside:
         return None if self._joiner is None else self._joiner.tracks()
 
 
-def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
+def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
     """Return the graph of the usable directions; it has at least one edge."""
     usable = directions.usable()
     if len(usable) == 0:
@@ -137,27 +137,27 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
             f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
         )
     return ViewGraph(
-        model.num_images,
+        images.num_images,
         directions.pairs[usable],
         directions.directions[usable],
         directions.weights()[usable],
-        names=model.names,
+        names=images.names,
     )
 
 
 def wants_points(source: MatchSource, options: NodeOptions) -> bool:
     """Return whether 3D points join the view graph."""
-    return options.uses_points(source.model.num_images) and source.economy.points
+    return options.uses_points(source.images.num_images) and source.economy.points
 
 
-def build_graph(model: PosedModel, measured: Measured) -> MeasuredGraph:
+def build_graph(images: Images, measured: Measured) -> MeasuredGraph:
     """Return the graph of the usable directions, with 3D points as further nodes if there are tracks."""
     directions, tracks = measured.directions, measured.tracks
-    graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
+    graph, covariance = view_graph(images, directions), directions.covariance[directions.usable()]
     if tracks is None:
         return MeasuredGraph(graph, covariance=covariance)
-    chosen = tracks.subset(covering_set(tracks, model.num_images))
-    return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
+    chosen = tracks.subset(covering_set(tracks, images.num_images))
+    return join_points(graph, covariance, chosen, 1.0 / images.focal_lengths_px)
 
 
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:

@@ -10,7 +10,6 @@ from typing import NamedTuple, get_args
 from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
-from sfm_shapefit.files.colmap.model import PosedModel, read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
     RelativeSource,
@@ -85,26 +84,26 @@ def relative_rotations(
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
     clock = Clock.of(progress, SolverOptions(threads=threads), executor)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
-        model = read_model(read_images(file).reconstruction)
-        view = DatabaseMatches(file, model.names).at(model)
+        images = read_images(file).images
+        view = DatabaseMatches(file, images.names).at(images.apart())
         sharing = Sharing(clock.threads, executor, clock.advance)
         if source == "stored":
             found = stored_relative_rotations(view, min_matches)
         else:
             found = measure_rotations(view, min_matches, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
-    return DatabaseRotations(**columns, names=model.names)
+    return DatabaseRotations(**columns, names=images.names)
 
 
 def measure_rotations(
-    view: View[PosedModel],
+    view: View,
     min_matches: int = LEAST_MATCHES,
     sharing: Sharing | None = None,
 ) -> RelativeRotations:
-    """Return relative rotations estimated from matches; pairs are indices into the model's images.
+    """Return relative rotations estimated from matches; pairs are indices into the view's images.
 
     Args:
-        view: of images with the identity as their rotation (see `database_images`).
+        view: of images in axes of their cameras, see `Images.apart`.
         min_matches: pairs with fewer inlier matches are left out.
         sharing: one thread if None.
 
@@ -125,7 +124,7 @@ def measure_rotations(
     return concatenate_rotations(parts)
 
 
-def _estimate_here(view: View[PosedModel], min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
+def _estimate_here(view: View, min_matches: int, sharing: Sharing) -> list[RelativeRotations]:
     """Return the relative rotations of each batch."""
     parts, before, total = [], 0, view.num_pairs
     for batch in view.batches(min_matches):

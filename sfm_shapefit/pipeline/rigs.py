@@ -17,7 +17,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, hand_back_memory
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.facts.options import FIX_SOLVED
-from sfm_shapefit.files.colmap.model import PosedModel
+from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -26,6 +26,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.placement.tied_groups import is_scaled
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
@@ -52,52 +53,56 @@ class Rigid(NamedTuple):
         return replace(measured, groups=groups, fixed_group=self.fixed_group)
 
 
-def find_rigid_parts(model: PosedModel, options: PlacementOptions, fix: str = "") -> Rigid:
-    """Return what moves together and what not at all: the frames of rigs, and images that are to be fixed.
+def find_rigid_parts(images: Images, options: PlacementOptions, fixed: BoolArray | None = None) -> Rigid:
+    """Return what moves together and what not at all: the frames of rigs, and `fixed` images (n,).
 
     Raises:
-        InputError: if a name to be fixed is unknown, the fixed images stand at one place, or the options are
-            none that rigid groups go with.
+        InputError: if the fixed images stand at one place, or the options are none that rigid groups go with.
     """
-    rigid = rigid_parts(model, _read_fixed_images(model, fix))
+    rigid = rigid_parts(images, np.zeros(images.num_images, np.bool_) if fixed is None else fixed)
     if rigid.groups is not None:
         refuse_admm(options.solver)
     return rigid
 
 
-def rigid_parts(model: PosedModel, fixed: BoolArray) -> Rigid:
-    """Return what moves together in a model, of which some images (n,) are fixed.
+def rigid_parts(images: Images, fixed: BoolArray) -> Rigid:
+    """Return what moves together of images, of which some (n,) are fixed.
 
     Raises:
         InputError: if these stand at one place.
     """
     count = int(np.sum(fixed))
-    if not model.has_rigs and count < 2:
+    if not images.has_rigs and count < 2:
         return Rigid(fixed, None, None)
-    groups = model.groups if model.has_rigs else separate(model.num_images, 3)
+    groups = groups_of(images) if images.has_rigs else separate(images.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
-    centers = model.centers[fixed]
+    centers = images.centers[fixed]
     extent = float(np.ptp(centers, axis=0).max())
-    if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not model.has_rigs:
+    if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not images.has_rigs:
         raise InputError(
             f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )
-    return Rigid(fixed, groups.with_fixed(fixed, model.centers), 0)
+    return Rigid(fixed, groups.with_fixed(fixed, images.centers), 0)
 
 
-def group_frames(model: PosedModel, measured: MeasuredGraph) -> MeasuredGraph:
-    """Return the measured graph of a model's images with the frames of its rigs, if it has any."""
-    groups = model.groups if model.has_rigs else None
-    return Rigid(np.zeros(model.num_images, dtype=np.bool_), groups, None).apply(measured)
+def group_frames(images: Images, measured: MeasuredGraph) -> MeasuredGraph:
+    """Return the measured graph of images with the frames of their rigs, if they have any."""
+    groups = groups_of(images) if images.has_rigs else None
+    return Rigid(np.zeros(images.num_images, dtype=np.bool_), groups, None).apply(measured)
 
 
-def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
-    """Say how many frames a model has, and how many of them the pairs tie to one another."""
+def groups_of(images: Images) -> RigidGroups:
+    """Return the frames as rigid groups of images."""
+    return RigidGroups(group_of=images.frame_of, offsets=images.offsets)
+
+
+def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
+    """Say how many frames there are, and how many of them the pairs tie to one another."""
     groups, edges = measured.groups, measured.graph.edges
     if groups is None:
         return "none: every image is a frame of its own"
-    frames = f"{model.groups.num_groups} frames of {model.num_images} images"
+    frames = f"{len(images.frames.ids)} frames of {images.num_images} images"
     if not is_scaled(groups, edges):
         return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
     sizes = measured.cameras_per_group
@@ -146,20 +151,24 @@ def _count_held(placement: Placement, options: PlacementOptions) -> int:
     return len(placement.cameras) - loose
 
 
-def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
-    """Return which images are to stay where they are."""
+def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
+    """Return which images (n,) are to stay where they are.
+
+    Raises:
+        InputError: if the file of their names cannot be read, or a name is unknown.
+    """
     if not fix:
-        return np.zeros(model.num_images, dtype=np.bool_)
+        return np.zeros(model.images.num_images, dtype=np.bool_)
     if fix == FIX_SOLVED:
-        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
         solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
         if not solved.any():
             raise InputError(
                 "no image of the model observes a 3D point, so none is solved; name those to fix"
             )
         return solved
-    path, index = Path(fix), {name: k for k, name in enumerate(model.names)}
-    fixed = np.zeros(model.num_images, dtype=np.bool_)
+    path, index = Path(fix), {name: k for k, name in enumerate(model.images.names)}
+    fixed = np.zeros(model.images.num_images, dtype=np.bool_)
     for number, line in enumerate(text_of(path).splitlines(), start=1):
         name = line.strip()
         if not name or name.startswith("#"):

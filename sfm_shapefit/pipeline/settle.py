@@ -12,11 +12,11 @@ Each rigid piece goes through all that follows `place`. A further piece has a un
 told of positions says how large it is, and where.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +39,8 @@ from sfm_shapefit.facts.warnings import (
     support_warnings,
     trust_warnings,
 )
-from sfm_shapefit.files.colmap.model import PosedModel, sensors_of
-from sfm_shapefit.files.colmap.point_colors import PointColors
+from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.adjustment import (
@@ -66,7 +66,7 @@ from sfm_shapefit.pipeline.measure import (
 )
 from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import Rigid, place_cameras
-from sfm_shapefit.pipeline.seed import Located, build_seeded_model, select_trusted
+from sfm_shapefit.pipeline.seed import Located, seed_points, select_trusted
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
 from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.placement.place import Placement
@@ -74,9 +74,7 @@ from sfm_shapefit.placement.prior_pairs import compare_with_priors
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
-
-if TYPE_CHECKING:
-    import pycolmap
+from sfm_shapefit.scene.images import Images
 
 _SMALLEST_ADJUSTED = 8
 """Cameras of a further piece that is adjusted; smaller ones are placed and seeded only, for their seconds."""
@@ -85,6 +83,10 @@ _SMALLEST_ADJUSTED = 8
 class Told(NamedTuple):
     """What is known of the images beside their matches and the options."""
 
+    template: Template
+    """What the images were read from."""
+    given: Images
+    """The images as they were read."""
     inputs: Inputs
     rigid: Rigid
     pull_rad: float | None
@@ -98,10 +100,6 @@ class Told(NamedTuple):
     """Turns the model upright."""
     intrinsics: DoubtedIntrinsics = NO_DOUBTS
     """Which intrinsics are in doubt, and what became of them so far."""
-    rigs: Mapping[int, Any] | None = None
-    """The sensors' poses as they were given, by the ids of cameras; None: those of the model."""
-    colors: PointColors | None = None
-    """Colors of the points that the input had."""
     near: FirstPlacement | None = None
     """Where an adjustment has the images already; None if there was none."""
 
@@ -152,11 +150,11 @@ def settle(opened: MatchSource, told: Told, options: PlacingOptions, clock: Cloc
         measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions
     with clock("solve"):
-        graph = told.rigid.apply(build_graph(opened.model, measured))
+        graph = told.rigid.apply(build_graph(opened.images, measured))
         work = count_work(opened, directions)
         describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
-        source = opened.at(opened.model, economy)
+        source = opened.at(opened.images, economy)
         graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
         near = None if told.near is None else told.near.stand
@@ -188,7 +186,7 @@ def finish_piece(
         options: settings.
         clock: of the run.
     """
-    given = source.model
+    before = source.images
     started = _start(source, directions, placement, told, options)
     stand = _adjust(started, told, options, clock)
     with clock("trust"):
@@ -198,54 +196,60 @@ def finish_piece(
         focal_doubts = (
             question_focal_lengths(asked.source, asked.directions, clock.threads) if is_main else ()
         )
-        judged = _judge(stand, told, options, given, clock)
+        judged = _judge(stand, told, options, before, clock)
         located = _choose(stand.located, judged, options.trust.min_trust)
     del started, placement  # with their samples of errors
-    seeded = build_seeded_model(stand.source, located, options, clock, told.colors)
+    seeded = seed_points(stand.source, located, options, clock)
     moves = located.placement.unit is None and not told.rigid.fixed.any()
     seeded, control_points, of_control = bring_to_control_points(
-        seeded, given, told.control, options.structure, moves=moves
+        seeded, told.control, options.structure, moves=moves
     )
-    seeded, of_gravity = turn_model_upright(seeded, given, told.gravity)
+    seeded, of_gravity = turn_model_upright(seeded, told.gravity)
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        judged = with_uncertainty(judged, given, seeded.adjusted, scale)
+        judged = with_uncertainty(judged, before, seeded.adjusted, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses, seeded.adjusted.freedom.lenses)
     sensors = _refined_sensors(stand, told, seeded.adjusted)
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
-    model, directions = stand.source.model, stand.directions
-    named = zip(model.names, model.image_ids.tolist(), strict=True)
-    unsupported = [name for name, image_id in named if image_id in seeded.unsupported]
-    centers = _centers_of(model, seeded.reconstruction)
+    images, directions = seeded.images, stand.directions
+    unsupported = [images.names[k] for k in np.flatnonzero(seeded.unsupported).tolist()]
+    centers = images.centers
+    with clock("model"):
+        keypoints = stand.source.view.keypoints if stand.source.has_database else None
+        reconstruction = build_seed(told.template, images, seeded.points, keypoints)
     prior_angles = None
     if told.priors is not None and gauge.scale == "prior" and gauge.axes is not None:
         prior_angles = compare_with_priors(
             directions.pairs, directions.directions, told.priors, gauge, centers
         )
     return LocateResult(
-        reconstruction=seeded.reconstruction,
+        reconstruction=reconstruction,
         inputs=told.inputs,
         options=options,
-        model=model,
+        images=stand.source.images,
+        placed=images,
+        image_names=told.template.image_names,
         directions=directions,
         placement=judged,
-        kept=located.kept & ~np.isin(model.image_ids[judged.cameras], list(seeded.poor)),
-        poor=seeded.poor,
+        kept=located.kept & images.is_posed[judged.cameras],
+        num_seen=seeded.num_seen,
         unsupported=seeded.unsupported,
         agreeing_observations=seeded.observations.agreeing,
         contradicting_observations=seeded.observations.contradicting,
         gauge=gauge,
         adjusted=seeded.adjusted,
         adjustment=stand.adjustment,
-        turned_deg=None if stand.adjustment is None else turned_deg(given.rotations, model.rotations),
+        turned_deg=None
+        if stand.adjustment is None
+        else turned_deg(before.rotations, stand.source.images.rotations),
         timings_s=clock.seconds,
         warnings=(
-            *focal_warnings(model, focal_doubts, intrinsics.refined.undetermined),
-            *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
-            *_collect_warnings(stand, judged, located, seeded.reconstruction.num_points3D()),
-            *prior_warnings(prior_angles, directions.pairs, model.names),
+            *focal_warnings(stand.source.images, focal_doubts, intrinsics.refined.undetermined),
+            *intrinsics_warnings(intrinsics, intrinsics.rows(images)),
+            *_collect_warnings(stand, judged, located, seeded.points.num_points),
+            *prior_warnings(prior_angles, directions.pairs, images.names),
             *_gauge_warnings(located, gauge, centers, options.gauge.scale),
             *of_control,
             *of_gravity,
@@ -256,9 +260,7 @@ def finish_piece(
         prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
-        rigs=refined_rigs(
-            told.rigs or sensors_of(given.reconstruction), sensors_of(seeded.reconstruction), sensors
-        ),
+        rigs=refined_rigs(told.given, images, sensors),
         control_points=tuple(control_points),
     )
 
@@ -270,13 +272,12 @@ def _start(
 
     That frame is the gauge of all placed cameras, or that of priors that pull, which then stays.
     """
-    model = source.model
-    rule = GaugeRule(model, told.rigid, told.scale, told.priors, told.distances)
+    rule = GaugeRule(told.given, told.rigid, told.scale, told.priors, told.distances)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     freedom = Freedom(lenses=told.intrinsics.free, has_sensors=told.frees_rigs(options.freedom.rigs))
     located = Located(placement, everyone, gauge, told.rigid.fixed, rule, freedom=freedom)
-    located = _pull(model, located, told, source.economy.limit(options.placement))
+    located = _pull(source.images, located, told, source.economy.limit(options.placement))
     stand = Stand(source, directions, located, told.intrinsics)
     if told.near is None:
         return stand
@@ -285,7 +286,7 @@ def _start(
     return stand._replace(estimate=told.near.adjusted, scale=scale)
 
 
-def _pull(model: PosedModel, located: Located, told: Told, options: PlacementOptions) -> Located:
+def _pull(images: Images, located: Located, told: Told, options: PlacementOptions) -> Located:
     """Return the cameras pulled by the priors that have set the gauge, each by its standard deviation.
 
     Priors without one do not pull, nor do those whose axes are not known.
@@ -296,7 +297,7 @@ def _pull(model: PosedModel, located: Located, told: Told, options: PlacementOpt
     if not len(priors.of(located.placement.cameras)) or located.gauge.axes is None:
         return located
     with suppress(UnsolvableError):  # too large a factor
-        return pull_cameras(model, located, priors, options)
+        return pull_cameras(images, located, priors, options)
     return located
 
 
@@ -311,7 +312,7 @@ def _adjust(stand: Stand, told: Told, options: PlacingOptions, clock: Clock) -> 
         return stand
     with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
         after = adjust_placed(stand.source, stand.directions, located, options, clock, told.pull_rad)
-        frames, freedom = stand.source.model.images.frames, after.adjusted.freedom
+        frames, freedom = stand.source.images.frames, after.adjusted.freedom
         intrinsics = stand.intrinsics.after(after.adjusted.lenses, freedom.lenses)
         given = located.given._replace(rotations=frames.rotations)
         freedom = freedom.among(after.part.frames, len(frames.ids))
@@ -327,7 +328,7 @@ def _adjust(stand: Stand, told: Told, options: PlacingOptions, clock: Clock) -> 
     return stand
 
 
-def _judge(stand: Stand, told: Told, options: PlacingOptions, given: PosedModel, clock: Clock) -> Judged:
+def _judge(stand: Stand, told: Told, options: PlacingOptions, before: Images, clock: Clock) -> Judged:
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
     placement, relative = stand.located.placement, None
     if not told.believes_rotations:
@@ -335,8 +336,8 @@ def _judge(stand: Stand, told: Told, options: PlacingOptions, given: PosedModel,
         relative = ask_pairs(stand.source, stand.directions, clock.threads, among)
     judged = judge(placement, stand.source.economy.limit(options.placement))
     if stand.estimate is not None:
-        judged = with_uncertainty(judged, given, stand.estimate, stand.scale)
-    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.model)
+        judged = with_uncertainty(judged, before, stand.estimate, stand.scale)
+    return doubt_cameras(judged.without_error_samples(), stand.directions, relative, stand.source.images)
 
 
 def _choose(located: Located, judged: Judged, min_trust: float) -> Located:
@@ -374,15 +375,6 @@ def _gauge_warnings(located: Located, gauge: Gauge, centers: FloatArray, asked: 
         yield from located.rule.check(gauge, there, centers[there])
     if asked == "unit" and gauge.scale != "unit":
         yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
-
-
-def _centers_of(model: PosedModel, output: "pycolmap.Reconstruction") -> FloatArray:
-    """Return where the images of a model (n, 3) are in the output, NaN where they are not."""
-    centers = np.full((model.num_images, 3), np.nan)
-    for image, image_id in enumerate(model.image_ids.tolist()):
-        if output.image(image_id).has_pose:
-            centers[image] = output.image(image_id).projection_center()
-    return centers
 
 
 def _collect_warnings(stand: Stand, judged: Judged, located: Located, num_points: int) -> Iterator[str]:

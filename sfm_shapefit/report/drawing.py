@@ -19,11 +19,11 @@ from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, nor
 from sfm_shapefit.facts.rows import covariance_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.files.colmap.model import PosedModel
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
@@ -237,25 +237,18 @@ def build_drawing(
     )
 
 
-def poses_of(model: "PosedModel | None", names: Sequence[str]) -> Poses:
-    """Return rotations, centers and pictures of a model's images, by name; NaN for those it does not have."""
+def poses_of(images: Images | None, names: Sequence[str]) -> Poses:
+    """Return rotations, centers and pictures of images, by name; NaN for names that none has."""
     found = _unknown_poses(len(names))
-    if model is None:
+    if images is None:
         return found
     row_of = {name: row for row, name in enumerate(names)}
-    sizes: dict[int, tuple[float, float]] = {}
-    for k, (image_id, name) in enumerate(zip(model.image_ids.tolist(), model.names, strict=True)):
-        row = row_of.get(name)
-        if row is None:
-            continue
-        camera_id = model.reconstruction.image(image_id).camera_id
-        if camera_id not in sizes:
-            camera = model.reconstruction.camera(camera_id)
-            focal_length = 2.0 * float(model.focal_lengths_px[k])
-            sizes[camera_id] = camera.width / focal_length, camera.height / focal_length
-        found.rotations[row], found.centers[row] = model.rotations[k], model.centers[k]
-        found.half_sizes[row] = np.clip(sizes[camera_id], *_HALF_SIZES)
-        found.focal_lengths_px[row] = model.focal_lengths_px[k]
+    rows = [k for k, name in enumerate(images.names) if name in row_of]
+    own = [row_of[images.names[k]] for k in rows]
+    focal_lengths_px = images.focal_lengths_px[rows]
+    found.rotations[own], found.centers[own] = images.rotations[rows], images.centers[rows]
+    found.half_sizes[own] = np.clip(images.sizes_px[rows] / (2.0 * focal_lengths_px[:, None]), *_HALF_SIZES)
+    found.focal_lengths_px[own] = focal_lengths_px
     return found
 
 

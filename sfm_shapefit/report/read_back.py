@@ -14,7 +14,7 @@ from sfm_shapefit.facts.model import FactsOfModel, read_facts
 from sfm_shapefit.facts.placed import Facts, GraphFacts
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, read_rows
-from sfm_shapefit.files.colmap.model import PosedModel, read_model
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.report.drawing import Drawing, build_drawing, poses_of
 
 
@@ -22,7 +22,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
     """Return the drawing of a placed model or bare graph."""
     placement, poses, points = found.placement, None, None
     if isinstance(found, LocateResult):
-        poses, points = poses_of(found.model, [row.name for row in found.cameras]), found.reconstruction
+        poses, points = poses_of(found.images, [row.name for row in found.cameras]), found.reconstruction
         if found.gauge.axes is not None:
             poses = replace(poses, rotations=poses.rotations @ found.gauge.axes.T)
     # NaN stands for the cameras that the certified optimum does not place.
@@ -36,11 +36,13 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
     )
 
 
-def draw_model(model: PosedModel) -> Drawing:
+def draw_model(model: ColmapModel) -> Drawing:
     """Return the drawing of a model's posed images and points, without pairs and trust."""
-    centers = zip(model.names, model.centers.tolist(), strict=True)
+    centers = zip(model.images.names, model.images.centers.tolist(), strict=True)
     rows = [CameraRow(name=name, placed=True, center=tuple(center)) for name, center in centers]
-    return build_drawing(rows, [], poses=poses_of(model, model.names), points=model.reconstruction)
+    return build_drawing(
+        rows, [], poses=poses_of(model.images, model.images.names), points=model.reconstruction
+    )
 
 
 def read_output(folder: Path) -> tuple[Drawing, Facts]:
@@ -68,8 +70,8 @@ def read_output(folder: Path) -> tuple[Drawing, Facts]:
             model, names = read_model(folder), [row.name for row in cameras]
             points, given, before = model.reconstruction, Path(facts.inputs.path), None
             with suppress(InputError):
-                before = read_model(given) if given.is_dir() else None
-            poses = replace(poses_of(model, names), centers=poses_of(before, names).centers)
+                before = read_model(given).images if given.is_dir() else None
+            poses = replace(poses_of(model.images, names), centers=poses_of(before, names).centers)
         drawing = replace(
             build_drawing(cameras, pairs, poses=poses, points=points),
             input_is_aligned=isinstance(facts, FactsOfModel) and facts.scale.startswith("input:"),

@@ -13,13 +13,14 @@ an image of frame f through lens l, the coordinates
     x = R_l R_f (X - C_f) + t_l,        (R_l, t_l) = sensor_from_rig of the lens, the identity of a reference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, frozen
+from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.scene.lens import Lens
 
 
@@ -129,6 +130,12 @@ class Images:
         return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
 
     @property
+    def sizes_px(self) -> FloatArray:
+        """Widths and heights, (i, 2)."""
+        sizes = [(lens.width, lens.height) for lens in self.lenses]
+        return np.array(sizes, dtype=np.float64)[self.lens_of]
+
+    @property
     def is_posed(self) -> BoolArray:
         """Images whose frame has a pose, (i,)."""
         return self.frames.is_posed[self.frame_of]
@@ -166,6 +173,16 @@ class Images:
         moved[frames] = (centers - self.offsets[rows])[first]
         return self.posed(self.frames.rotations, moved)
 
+    def transformed(self, motion: Similarity, fixed: BoolArray) -> "Images":
+        """Return the images after a similarity of the world, with their sensors; `fixed` frames (f,) stay."""
+        own = self.frames
+        rotations = np.where(fixed[:, None, None], own.rotations, own.rotations @ motion.rotation.T)
+        centers = np.where(fixed[:, None], own.centers, motion.apply(own.centers))
+        sensors = self.sensors
+        return self.posed(rotations, centers).with_sensors(
+            sensors.rotations, motion.scale * sensors.translations
+        )
+
     def without(self, gone: BoolArray) -> "Images":
         """Return the images with the frames of some (i,) not placed."""
         centers = self.frames.centers.copy()
@@ -186,9 +203,51 @@ class Images:
             found[k] = lens
         return self.posed(*moved).with_sensors(*turned).with_lenses(found)
 
+    def turned(self, part: "Images") -> "Images":
+        """Return the images with rotations, lenses and sensors of a part of them; frames stay in place."""
+        rows = np.searchsorted(self.frames.ids, part.frames.ids)
+        return self.updated(part.posed(part.frames.rotations, self.frames.centers[rows]))
+
+    def apart(self) -> "Images":
+        """Return the images each in a frame of its own, at the origin, in axes of its camera."""
+        ids, frame_of = np.unique(self.ids, return_inverse=True)
+        turns, places = np.tile(np.eye(3), (len(ids), 1, 1)), np.zeros((len(ids), 3))
+        count = len(self.lenses)
+        return replace(
+            self,
+            frame_of=frame_of.ravel(),
+            frames=Frames(ids=ids, rotations=turns, centers=places),
+            sensors=Sensors(
+                rotations=np.tile(np.eye(3), (count, 1, 1)),
+                translations=np.zeros((count, 3)),
+                rig_of=np.arange(count),
+                is_reference=np.ones(count, dtype=np.bool_),
+            ),
+        )
+
+    def turned_to(self, rotations: FloatArray) -> "Images":
+        """Return the images with rotations (i, 3, 3) cam_from_world, all frames at the origin.
+
+        A frame turns with its first image.
+        """
+        _, first = np.unique(self.frame_of, return_index=True)
+        sensors = self.sensors.rotations[self.lens_of[first]]
+        turns = sensors.transpose(0, 2, 1) @ rotations[first]
+        return self.posed(turns, np.zeros((len(first), 3)))
+
+    def with_parameters(self, found: Mapping[int, Sequence[float]]) -> "Images":
+        """Return the images with other parameters of some lenses, by their ids."""
+        return self.with_lenses(
+            [replace(lens, parameters=tuple(found.get(lens.id, lens.parameters))) for lens in self.lenses]
+        )
+
     def with_lenses(self, lenses: Sequence[Lens]) -> "Images":
         """Return the images with other parameters of their lenses."""
         return replace(self, lenses=tuple(lenses))
+
+    def with_sensors_of(self, part: "Images") -> "Images":
+        """Return the images with their sensors where a part of them has them."""
+        return self.updated(part).posed(self.frames.rotations, self.frames.centers).with_lenses(self.lenses)
 
     def with_sensors(self, rotations: FloatArray, translations: FloatArray) -> "Images":
         """Return the images with other poses of their sensors, (l, 3, 3) and (l, 3)."""

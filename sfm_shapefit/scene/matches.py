@@ -13,13 +13,16 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 from weakref import WeakSet
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, hand_back_memory
 from sfm_shapefit.base.executors import Advance, nobody
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
@@ -128,22 +131,6 @@ PLENTY = Reading()
 """Where memory is no concern."""
 
 
-class SeeingImages(Protocol):
-    """What matches need to know of n images, which stand in the order of their names."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """All different, ascending."""
-
-    @property
-    def focal_lengths_px(self) -> FloatArray:
-        """(n,)"""
-
-    def world_rays(self, image: int, xy: FloatArray) -> FloatArray:
-        """Return the unit rays (k, 3) of an image's pixels (k, 2) in world axes; NaN for those without."""
-
-
-Seeing = TypeVar("Seeing", bound=SeeingImages)
 AnyMatches = TypeVar("AnyMatches", KeypointMatches, MatchBatch)
 
 
@@ -164,15 +151,13 @@ class Matches(ABC):
     """Number of keypoints of all images of the file."""
 
     def __init__(self) -> None:
-        self._views: WeakSet[View[Any]] = WeakSet()
+        self._views: WeakSet[View] = WeakSet()
 
-    def at(
-        self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
-    ) -> "View[Seeing]":
+    def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> "View":
         """Return the matches as other images see them, which is cheap.
 
         Args:
-            images: some of these, by name, and maybe others.
+            images: some of these, by name, and maybe others, in the order of their names.
             left_out: pairs that are taken for unmatched.
             reading: how much memory may be taken; where nothing is kept, what earlier views keep goes, too.
         """
@@ -191,6 +176,10 @@ class Matches(ABC):
         Raises:
             InputError: if they are damaged, or a coordinate is not finite.
         """
+
+    @abstractmethod
+    def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
+        """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
 
     def matched(self, name: str) -> FloatArray:
         """Return the pixels (m, 2) of those keypoints of an image to which matches may refer."""
@@ -213,7 +202,7 @@ class Matches(ABC):
     def forget(self) -> None:  # noqa: B027  that is all where none is kept
         """Give back the memory of all matches that were read; they are read again where they are needed."""
 
-    def parts(self, view: "View[Any]", ranges: Sequence[slice]) -> "Sequence[MatchPart]":  # noqa: ARG002
+    def parts(self, view: "View", ranges: Sequence[slice]) -> "Sequence[MatchPart]":  # noqa: ARG002
         """Return ranges of a view's pairs for other processes; nothing where only this one has the file."""
         return ()
 
@@ -228,17 +217,17 @@ class MatchPart(Protocol):
     def num_pairs(self) -> int:
         """Number of pairs."""
 
-    def open(self) -> AbstractContextManager["View[Any]"]:
+    def open(self) -> AbstractContextManager["View"]:
         """Open the file again, for a view of the same images and these pairs, which are read once."""
 
 
-class View(Generic[Seeing]):
+class View:
     """Matches between some images, whose indices all that is returned refers to; made by `Matches.at`.
 
     A pass yields the pairs (i, j), i < j, in their order, and of each those matches whose pixels have rays.
     """
 
-    def __init__(self, matches: Matches, images: Seeing, left_out: PairNames, reading: Reading) -> None:
+    def __init__(self, matches: Matches, images: Images, left_out: PairNames, reading: Reading) -> None:
         self.matches, self.images, self.reading = matches, images, reading
         index = {name: k for k, name in enumerate(images.names)}
         index_of = np.array([index.get(name, -1) for name in matches.names], dtype=np.int64)
@@ -252,6 +241,7 @@ class View(Generic[Seeing]):
         count_of = dict(zip(matches.names, matches.num_keypoints.tolist(), strict=True))
         self.num_keypoints = np.array([count_of.get(name, 0) for name in images.names], dtype=np.int64)
         """(n,) of each image."""
+        self._rotations, self._focal_lengths_px = images.rotations, images.focal_lengths_px
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._rays_bytes = 0
         self._kept: dict[int, list[MatchBatch]] = {}
@@ -365,7 +355,7 @@ class View(Generic[Seeing]):
                 keypoints=found.keypoints,
                 rays_i=rays[0],
                 rays_j=rays[1],
-                pixel_angles=1.0 / self.images.focal_lengths_px[found.pairs].min(axis=1),
+                pixel_angles=1.0 / self._focal_lengths_px[found.pairs].min(axis=1),
             )
 
     def _links(self, chosen: IntArray, min_matches: int) -> Iterator[KeypointMatches]:
@@ -409,7 +399,9 @@ class View(Generic[Seeing]):
         if image in self._rays:
             self._rays.move_to_end(image)
             return self._rays[image]
-        rays = self.images.world_rays(image, self.matches.matched(self.images.names[image]))
+        images, pixels = self.images, self.matches.matched(self.images.names[image])
+        rays = self.matches.rays(images.lenses[int(images.lens_of[image])], pixels)
+        rays = normalized(rays @ self._rotations[image])
         self._rays[image] = rays
         self._rays_bytes += rays.nbytes
         while self._rays_bytes > self.reading.rays_bytes:

@@ -1,11 +1,12 @@
 """The 3D points of a model, and the keypoints of images that observe them, as arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import Similarity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,6 +65,10 @@ class Points:
             errors_px=None if self.errors_px is None else self.errors_px[kept],
         )
 
+    def transformed(self, motion: Similarity) -> "Points":
+        """Return the points after a similarity of the world."""
+        return replace(self, xyz=motion.apply(self.xyz))
+
     def _count(self, chosen: BoolArray) -> IntArray:
         """Return how many observations of each point are chosen, (x,)."""
         return np.diff(np.append(0, np.cumsum(chosen))[self.offsets])
@@ -71,11 +76,17 @@ class Points:
 
 def number_points(parts: Sequence[Points]) -> Points:
     """Return the points of all parts one after the other, with ids from 1 on."""
+    points = concatenate_points(parts)
+    return replace(points, ids=np.arange(1, points.num_points + 1))
+
+
+def concatenate_points(parts: Sequence[Points]) -> Points:
+    """Return the points of all parts one after the other, with the ids that they have."""
     lengths = np.concatenate([np.zeros(0, dtype=np.int64), *(part.lengths() for part in parts)])
     return Points(
         xyz=np.concatenate([np.zeros((0, 3)), *(part.xyz for part in parts)]),
         offsets=np.append(0, np.cumsum(lengths)),
         images=np.concatenate([np.zeros(0, dtype=np.int64), *(part.images for part in parts)]),
         keypoints=np.concatenate([np.zeros(0, dtype=np.int64), *(part.keypoints for part in parts)]),
-        ids=np.arange(1, len(lengths) + 1),
+        ids=np.concatenate([np.zeros(0, dtype=np.int64), *(part.ids for part in parts)]),
     )

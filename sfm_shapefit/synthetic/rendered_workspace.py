@@ -100,10 +100,10 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
         database: made from its images, by whatever detector and matcher; image k is named as by this module.
         min_matches: pairs with fewer are left out.
     """
-    model = read_model(_parts(scene, None).model(scene.rotations))
-    with closing(open_database(database, model.names)) as matches:
+    images = read_model(_parts(scene, None).model(scene.rotations)).images
+    with closing(open_database(database, images.names)) as matches:
         in_one = Reading(batch=int(matches.num_matches.sum()))
-        view = matches.at(model, reading=in_one)
+        view = matches.at(images, reading=in_one)
         keypoints = [view.keypoints(k) for k in range(scene.num_images)]
         joined = next(view.batches(min_matches), _NO_MATCHES)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]

@@ -52,7 +52,7 @@ def test_locate_counts_pairs_and_images():
         "trust",
         "structure",
         "triangulation",
-        "colors",
+        "model",
     ]
     assert_counted_up(stages["directions"], 16)  # verified pairs of the 8 images
     assert_counted_up(stages["structure"], 16)

@@ -6,11 +6,10 @@ import pytest
 
 from sfm_shapefit.files.colmap.images import images_of, put_images
 from sfm_shapefit.files.colmap.lenses import lens_of
-from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.points import ModelPictures, add_points, move_model, points_of
-from sfm_shapefit.files.colmap.seed import copy_without_points
+from sfm_shapefit.files.colmap.points import add_points, move_model, points_of
 from tests.adjustment.test_views import DISTORTIONS, scene
 from tests.files.test_colmap_writing import dump
+from tests.structures import colored, copy_without_points, pictures_of
 
 
 def with_rigs():
@@ -33,14 +32,19 @@ def test_images_stand_and_look_as_pycolmap_says():
     model = with_rigs()
     images = images_of(model)
     assert list(images.names) == sorted(image.name for image in model.images.values())
-    posed = read_model(model)
-    assert [images.names[k] for k in np.flatnonzero(images.is_posed)] == list(posed.names)
     own = images.part(np.flatnonzero(images.is_posed))
-    np.testing.assert_allclose(own.rotations, posed.rotations, atol=1e-14)
-    np.testing.assert_allclose(own.centers, posed.centers, atol=1e-12)
-    np.testing.assert_allclose(own.offsets, posed.frame_offsets, atol=1e-12)
-    np.testing.assert_array_equal(own.focal_lengths_px, posed.focal_lengths_px)
-    np.testing.assert_array_equal(own.frames.ids[own.frame_of], posed.frame_ids)
+    theirs = [model.image(i) for i in own.ids.tolist()]
+    assert own.num_images == sum(image.has_pose for image in model.images.values())
+    poses, centers = (
+        [image.cam_from_world() for image in theirs],
+        [image.projection_center() for image in theirs],
+    )
+    np.testing.assert_allclose(own.rotations, [pose.rotation.matrix() for pose in poses], atol=1e-14)
+    np.testing.assert_allclose(own.centers, centers, atol=1e-12)
+    origins = [image.frame.rig_from_world.inverse().translation for image in theirs]
+    np.testing.assert_allclose(own.offsets, np.subtract(centers, origins), atol=1e-12)
+    np.testing.assert_allclose(own.focal_lengths_px, [i.camera.mean_focal_length() for i in theirs])
+    assert own.frames.ids[own.frame_of].tolist() == [image.frame_id for image in theirs]
     for k, image_id in enumerate(images.ids.tolist()):
         camera = model.image(image_id).camera
         assert images.lenses[images.lens_of[k]] == lens_of(camera)
@@ -110,8 +114,8 @@ def test_points_read_and_added_again_are_the_same():
     images = images_of(model)
     points, bare = points_of(model, images), copy_without_points(model)
     assert points.lengths().tolist() == [model.point3D(i).track.length() for i in points.ids.tolist()]
-    add_points(bare, images, points, model)
-    bare = move_model(bare, images, points)
+    add_points(bare, images, points)
+    bare = colored(move_model(bare, images, points), model)
     errors = [[p.error for _, p in sorted(one.points3D.items())] for one in (bare, model)]
     np.testing.assert_allclose(*errors, rtol=1e-12)  # sums in the order of tracks
     for one in (bare, model):
@@ -126,7 +130,7 @@ def test_points_read_and_added_again_are_the_same():
 def test_rays_of_pictures_lead_back_to_their_pixels(name):
     model = scene(name)
     images = images_of(model)
-    pictures, camera = ModelPictures(model, images), model.camera(1)
+    pictures, camera = pictures_of(model, images), model.camera(1)
     chosen = np.arange(0, pictures.count(2), 3)
     pixels = pictures.pixels(2, chosen)
     rays = pictures.rays(2, pixels)

@@ -18,7 +18,8 @@ from sfm_shapefit.files.colmap import sqlite_file
 from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.database import find_database, relative_poses
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.model import PosedModel, camera_rays, read_model
+from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
@@ -46,7 +47,7 @@ def scene() -> pycolmap.Reconstruction:
 
 
 @pytest.fixture(scope="module")
-def model(scene: pycolmap.Reconstruction) -> PosedModel:
+def model(scene: pycolmap.Reconstruction) -> ColmapModel:
     return read_model(scene)
 
 
@@ -119,27 +120,27 @@ def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_pa
     models = [read_model(source) for source in (scene, folder, str(text), legacy)]
 
     for model in models:
-        assert model.image_ids.tolist() == sorted(scene.images)
-        assert model.names == tuple(scene.image(i).name for i in sorted(scene.images))
-        for k, i in enumerate(model.image_ids.tolist()):
+        assert model.images.ids.tolist() == sorted(scene.images)
+        assert model.images.names == tuple(scene.image(i).name for i in sorted(scene.images))
+        for k, i in enumerate(model.images.ids.tolist()):
             pose = scene.image(i).cam_from_world()
-            np.testing.assert_allclose(model.rotations[k], pose.rotation.matrix(), atol=8 * EPS)
+            np.testing.assert_allclose(model.images.rotations[k], pose.rotation.matrix(), atol=8 * EPS)
             np.testing.assert_allclose(
-                model.centers[k], scene.image(i).projection_center(), atol=64 * EPS * 5.0
+                model.images.centers[k], scene.image(i).projection_center(), atol=64 * EPS * 5.0
             )
-            assert model.focal_lengths_px[k] == 1280.0
+            assert model.images.focal_lengths_px[k] == 1280.0
 
 
 def test_the_tiny_model_of_these_tests_is_sound_and_needs_no_points(tmp_path):
     records = tiny_model()
     model = read_model(write_tiny(tmp_path / "m", records))
-    assert model.names == ("a.jpg", "b.jpg")
-    assert not model.centers.any()  # all centers at the origin are fine
+    assert model.images.names == ("a.jpg", "b.jpg")
+    assert not model.images.centers.any()  # all centers at the origin are fine
     records["points3D"] = []
     for image in records["images"]:
         image[4] = []
     model = read_model(write_tiny(tmp_path / "m", records))
-    assert model.num_images == 2
+    assert model.images.num_images == 2
     assert track_batches(model) == []
 
 
@@ -149,16 +150,16 @@ def test_binary_files_win_over_text_files_and_poses_in_frames_over_those_in_imag
     records = tiny_model()
     records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
     model = read_model(write_tiny(tmp_path, records))
-    np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
+    np.testing.assert_array_equal(model.images.rotations[0], np.diag([1.0, -1.0, -1.0]))
 
 
 def test_images_without_a_pose_are_left_out_and_arrays_are_read_only(scene):
     copy = pycolmap.Reconstruction(scene)
     copy.deregister_frame(copy.image(3).frame_id)
     model = read_model(copy)
-    assert 3 not in model.image_ids
+    assert 3 not in model.images.ids
     with pytest.raises(ValueError, match="read-only"):
-        model.rotations[0, 0, 0] = 2.0
+        model.images.frames.rotations[0, 0, 0] = 2.0
 
 
 def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
@@ -307,7 +308,7 @@ def write_text_model(folder: Path, **changed: str) -> Path:
 @pytest.mark.parametrize("case", BROKEN_LINES)
 def test_a_broken_line_of_a_text_model_is_named_and_windows_line_ends_are_read(tmp_path, case):
     windows = {name: text.replace("\n", "\r\n") for name, text in TEXT_MODEL.items()}
-    assert read_model(write_text_model(tmp_path / "m", **windows)).names == ("a.jpg", "b.jpg")
+    assert read_model(write_text_model(tmp_path / "m", **windows)).images.names == ("a.jpg", "b.jpg")
     name, old, new, message = BROKEN_LINES[case]
     assert old in TEXT_MODEL[name]
     changed = new.join(TEXT_MODEL[name].rsplit(old, 1))
@@ -386,13 +387,12 @@ def test_a_rig_of_two_cameras_is_read_with_the_poses_of_its_images(tmp_path):
     rig = synthesize(2, num_rigs=1, num_cameras_per_rig=2, num_frames_per_rig=3, num_points3D=5)
     rig.write(tmp_path)
     model = read_model(tmp_path)
-    images = [rig.image(i) for i in model.image_ids.tolist()]
+    images = [rig.image(i) for i in model.images.ids.tolist()]
     assert len(images) == 6
     assert any(not image.is_ref_in_frame() for image in images)
-    groups = (model.frame_ids.tolist(), model.groups.group_of.tolist())
-    assert [len(set(group)) for group in groups] == [3, 3]
+    assert len(set(model.images.frame_of.tolist())) == len(model.images.frames.ids) == 3
     # roundings of unit rotations times distances of a few units
-    np.testing.assert_allclose(model.centers, [i.projection_center() for i in images], atol=1e-12)
+    np.testing.assert_allclose(model.images.centers, [i.projection_center() for i in images], atol=1e-12)
     errors = evaluate(rig, tmp_path)
     assert len(errors.names) == 6
     assert errors.position.max == pytest.approx(0.0, abs=1e-9)
@@ -417,14 +417,14 @@ def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
     model = read_model(reconstruction)
     xy = rng.uniform([20.0, 20.0], [620.0, 460.0], size=(50, 2))
 
-    rays = model.world_rays(1, xy)
+    rays = rays_of(model.images.lenses[0], xy)
 
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=8 * EPS)
-    back = np.array([camera.img_from_cam(model.rotations[1] @ ray) for ray in rays])
+    back = np.array([camera.img_from_cam(ray) for ray in rays])
     np.testing.assert_allclose(back, xy, atol=1e-6)  # undistortion iterates to about 1e-10 of f
     focal_px = 640 / (2 * np.pi) if camera_model == "EQUIRECTANGULAR" else 500.0
-    assert model.focal_lengths_px[1] == pytest.approx(focal_px)
-    assert model.world_rays(0, np.zeros((0, 2))).shape == (0, 3)
+    assert model.images.focal_lengths_px[1] == pytest.approx(focal_px)
+    assert rays_of(model.images.lenses[0], np.zeros((0, 2))).shape == (0, 3)
 
 
 def test_rays_that_a_fisheye_folds_back_are_none():
@@ -439,12 +439,12 @@ def test_rays_that_a_fisheye_folds_back_are_none():
     )
     xy = np.array([[240.0 + radius, 240.0] for radius in (100.0, 205.0, 218.0, 230.0)])
     assert np.isfinite(camera.cam_ray_from_img(xy)[:3]).all()  # wrong ones among them
-    assert np.isfinite(camera_rays(camera, xy)).all(axis=1).tolist() == [True, True, False, False]
+    assert np.isfinite(rays_of(lens_of(camera), xy)).all(axis=1).tolist() == [True, True, False, False]
 
 
 def track_batches(model, limit=PLENTY.batch):
     """Read all matches of a model's own tracks."""
-    return list(TrackMatches(model).at(model, reading=Reading(batch=limit)).batches())
+    return list(TrackMatches(model).at(model.images, reading=Reading(batch=limit)).batches())
 
 
 def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], set[tuple[int, int]]]:
@@ -503,9 +503,9 @@ def test_track_matches_carry_the_rays_of_their_keypoints(scene, model):
     for p, (i, j) in enumerate(batch.pairs.tolist()):
         rows = slice(batch.offsets[p], batch.offsets[p + 1])
         for side, (image, rays) in enumerate(((i, batch.rays_i), (j, batch.rays_j))):
-            points = scene.image(int(model.image_ids[image])).points2D
+            points = scene.image(int(model.images.ids[image])).points2D
             ids = [points[int(k)].point3D_id for k in batch.keypoints[rows, side]]
-            truth = normalized(np.array([scene.point3D(q).xyz for q in ids]) - model.centers[image])
+            truth = normalized(np.array([scene.point3D(q).xyz for q in ids]) - model.images.centers[image])
             # exact projections; undistorting the pixel iterates to about 1e-10
             assert angle_between_deg(rays[rows], truth).max() < 1e-6
 
@@ -566,7 +566,7 @@ def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=Non
 
 def read_all(path: Path, model):
     """Read everything a database offers."""
-    with view_of(path, model) as view:
+    with view_of(path, model.images) as view:
         return as_sets(view.batches()), relative_poses(view)
 
 
@@ -579,11 +579,11 @@ def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols
     thin = thinned(scene)
     model = read_model(thin)
     path = write_database(tmp_path / "d.db", thin, ID_ORDERS[order], cols)
-    with view_of(path, model) as view:
+    with view_of(path, model.images) as view:
         found = as_sets(view.batches())
         assert view.matches.missing_names == ()
         assert view.num_pairs == len(found)
-        for k, i in enumerate(model.image_ids.tolist()):
+        for k, i in enumerate(model.images.ids.tolist()):
             xy = np.array([p.xy for p in thin.image(i).points2D])
             np.testing.assert_array_equal(view.keypoints(k), xy.astype(np.float32))
     twice = {(i, j) for i, j in found if i == 0}  # image 1 sees one point twice, which a database may say
@@ -601,7 +601,7 @@ def test_relative_poses_point_from_camera_j_to_camera_i(scene, model, tmp_path, 
     assert poses.pairs.tolist() == [list(pair) for pair in itertools.combinations(range(6), 2)]
     assert_poses_point_to_the_first_camera(poses, model)
     i, j = poses.pairs.T
-    relative = model.rotations[j] @ model.rotations[i].transpose(0, 2, 1)
+    relative = model.images.rotations[j] @ model.images.rotations[i].transpose(0, 2, 1)
     np.testing.assert_allclose(poses.rotations, relative, atol=64 * EPS)
     assert poses.configs.tolist() == [2] * 15
     assert poses.num_inliers.tolist() == [12] * 15
@@ -612,7 +612,7 @@ def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
         add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
         add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
 
-    with view_of(edit_database(path, change), model) as view:
+    with view_of(edit_database(path, change), model.images) as view:
         batch = next(view.batches(3))
     assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
     assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
@@ -680,21 +680,23 @@ def test_a_database_of_pycolmap_is_read(tmp_path):
 def assert_poses_point_to_the_first_camera(poses, model):
     """R_j^T t_ij is the direction of C_i - C_j."""
     i, j = poses.pairs.T
-    directions = np.einsum("nji,nj->ni", model.rotations[j], poses.translations)
-    np.testing.assert_allclose(directions, normalized(model.centers[i] - model.centers[j]), atol=256 * EPS)
+    directions = np.einsum("nji,nj->ni", model.images.rotations[j], poses.translations)
+    np.testing.assert_allclose(
+        directions, normalized(model.images.centers[i] - model.images.centers[j]), atol=256 * EPS
+    )
 
 
 def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
     edit_database(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
-    with view_of(path, model) as view:
-        assert view.matches.missing_names == (model.names[1],)
+    with view_of(path, model.images) as view:
+        assert view.matches.missing_names == (model.images.names[1],)
         assert view.keypoints(1).shape == (0, 2)
         assert not any(1 in pair for pair in as_sets(view.batches()))
         assert view.num_pairs == 10
     edit_database(path, "UPDATE images SET name = 'other/' || name")
-    first = model.names[0]
+    first = model.images.names[0]
     message = rf"has 0 of the model's 6 images: the model's {first} .*database's other/.*not in the model"
-    with pytest.raises(InputError, match=message), view_of(path, model):
+    with pytest.raises(InputError, match=message), view_of(path, model.images):
         pass
 
 
@@ -747,7 +749,7 @@ def test_files_that_are_no_database_are_refused(model, tmp_path):
         ("garbage", "is not a COLMAP database"),
         ("other", "is not a COLMAP database: it has no table images"),
     ):
-        with pytest.raises(InputError, match=message), view_of(tmp_path / name, model):
+        with pytest.raises(InputError, match=message), view_of(tmp_path / name, model.images):
             pass
     assert sorted(os.listdir(tmp_path)) == ["empty", "garbage", "other"]
 
@@ -764,7 +766,7 @@ def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
     assert 1.0 <= sqlite_file._LOCK_TIMEOUT_S <= 5.0
     monkeypatch.setattr(sqlite_file, "_LOCK_TIMEOUT_S", 0.1)
     writer = begin_writing(path, "BEGIN EXCLUSIVE")
-    with pytest.raises(InputError, match="locked by another program"), view_of(path, model):
+    with pytest.raises(InputError, match="locked by another program"), view_of(path, model.images):
         pass
     writer.close()
 
@@ -851,12 +853,12 @@ def test_a_real_scene_is_read_in_well_under_ten_seconds():
     folder = real_scene("castle-P30") / "sparse" / "0"
     start = time.process_time()
     model = read_model(folder)
-    with view_of(find_database(folder), model) as view:
+    with view_of(find_database(folder), model.images) as view:
         (batch,) = view.batches()
     own = track_batches(model)
     # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
     assert time.process_time() - start < 10.0
-    assert model.num_images == 30
+    assert model.images.num_images == 30
     assert len(batch.pairs) == 378
     assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
     assert sum(np.sum(np.diff(batch.offsets) >= 15) for batch in own) == 273

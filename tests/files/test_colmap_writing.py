@@ -20,15 +20,16 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
 from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.point_colors import color_points, read_colors
 from sfm_shapefit.files.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.files.colmap.seed import build_seed, write_model
+from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.problems import all_pairs
 from tests.scenes import real_scene
-from tests.structures import bundle_adjusted, filtered, matches_between, triangulated
+from tests.structures import bundle_adjusted, colored, filtered, matches_between, triangulated
 
 NUM_IMAGES = 8
 RADIUS = 6.0
@@ -92,13 +93,15 @@ def batch_of(pairs, num_points):
 def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=None):
     """The seed of a reconstruction at the given centers, or its own, and its matches."""
     model = read_model(reconstruction)
-    placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
-    centers = model.centers if centers is None else centers
+    placed = np.ones(model.images.num_images, dtype=bool) if placed is None else placed
+    centers = model.images.centers if centers is None else centers
     rows = np.flatnonzero(placed)
     images = model.images.placed(rows, centers[rows])
-    seed = build_seed(model, images, None if keypoints is None else keypoints.get)
+    seed = build_seed(
+        template_of(model), images, number_points([]), None if keypoints is None else keypoints.get
+    )
     batches = all_matches() if batches is None else batches
-    return seed, matches_between(seed, model.image_ids, batches)
+    return seed, matches_between(seed, model.images.ids, batches)
 
 
 SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])
@@ -156,7 +159,7 @@ def test_the_input_of_every_stage_stays_as_it_was():
     for tracks in (matches, original):
         structure = triangulated(seed, tracks)
         structure_before = dump(structure)
-        color_points(structure, read_colors(original))
+        colored(structure, original)
         filtered(structure, StructureOptions(max_reprojection_error_px=0.1))
         assert dump(structure) == structure_before
         bundle_adjusted(seed, tracks)
@@ -172,7 +175,7 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
     structure = triangulated(seed, matches)
     write_model(structure, tmp_path)
     written = read_model(tmp_path)
-    assert written.names == tuple(f"view{k}.jpg" for k in range(NUM_IMAGES) if k != 2)
+    assert written.images.names == tuple(f"view{k}.jpg" for k in range(NUM_IMAGES) if k != 2)
     assert structure.num_points3D() == 120
     assert all(p.track.length() == NUM_IMAGES - 1 for p in structure.points3D.values())
     assert triangulated(seed, original).num_points3D() == 120
@@ -204,7 +207,7 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
 @SOURCES
 def test_exact_data_give_every_point_back_with_its_color(source):
     original, points = ring_model()
-    structure = color_points(triangulated(*seeded_with(source, original)), read_colors(original))
+    structure = colored(triangulated(*seeded_with(source, original)), original)
     assert structure.num_points3D() == len(points)
     for point in structure.points3D.values():
         truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
@@ -239,7 +242,7 @@ class Copying(ThreadPoolExecutor):
 
 
 def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.files.colmap.own_tracks._TRACKS_A_TASK", 7)
+    monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
     original, points = ring_model(noise_px=3.0)
     seed, seen = seeded(original, ring_centers() + 0.01)[0], []
     with Copying(2) as executor:
@@ -270,7 +273,7 @@ def test_the_same_gives_the_same_bits_again(source):
     def run():
         seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
         adjusted = dump(bundle_adjusted(seed, tracks).reconstruction)
-        return dump(color_points(triangulated(seed, tracks), read_colors(original))), adjusted
+        return dump(colored(triangulated(seed, tracks), original)), adjusted
 
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
@@ -409,10 +412,8 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
     seed, matches = seeded(original)
     black = triangulated(seed, matches)
-    structure = color_points(black, read_colors(original))
+    structure = colored(black, original)
     assert not any(point.color.any() for point in black.points3D.values())
-    assert color_points(black, read_colors(original), in_place=True) is black
-    assert all((p.color == structure.point3D(k).color).all() for k, p in black.points3D.items())
     assert structure.num_points3D() == 120
     for point in structure.points3D.values():
         # means 15, 20 and 31.5; a half is rounded to even
@@ -424,12 +425,12 @@ def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_the
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
         seed_and_matches = seeded(original, keypoints={k: moved[k] for k in changed})
-        structure = color_points(triangulated(*seed_and_matches), read_colors(original))
+        structure = colored(triangulated(*seed_and_matches), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
     for point in original.points3D.values():
         point.color = np.zeros(3, dtype=np.uint8)
-    assert color_points(structure, read_colors(original)) is structure  # which costs no copy
+    structure = colored(structure, original)
     assert all(point.color.any() for point in structure.points3D.values())
 
 
@@ -605,7 +606,7 @@ def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
     placed = np.arange(NUM_IMAGES) != unplaced
     seed, matches = seeded(original, ring_centers() + 0.01, placed)
     with atomic_folder(tmp_path / "out") as partial:
-        write_model(color_points(triangulated(seed, matches), read_colors(original)), partial)
+        write_model(colored(triangulated(seed, matches), original), partial)
     (tmp_path / "adjusted").mkdir()
 
     analysis = colmap("model_analyzer", "--path", tmp_path / "out")

@@ -39,12 +39,12 @@ def database_with(folder, model, params, prior):
 )
 def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, prior, origin):
     path = database_with(tmp_path, model, params, prior)
-    images = read_model(read_from(path, read_images).reconstruction)
+    images = read_from(path, read_images).images
     found = {camera: one.origin for camera, one in read_from(path, find_uncalibrated, images).items()}
     assert found == ({} if origin is None else {1: origin})
     # A model whose intrinsics are not the database's got them elsewhere.
-    assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0")) == {}
-    doubts = doubt_lenses(images.reconstruction.cameras, found)
+    assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0").images) == {}
+    doubts = doubt_lenses({lens.id: lens for lens in images.lenses}, found)
     assert set(doubts) == (set() if model == "OPENCV_FISHEYE" else set(found))
 
 
@@ -62,7 +62,7 @@ def test_a_calibrated_database_is_one_though_some_of_its_cameras_have_no_distort
         "DELETE FROM frame_data",
         f"UPDATE cameras SET params = x'{calibrated}' WHERE camera_id <= {num_calibrated}",
     )
-    found = read_from(path, find_uncalibrated, read_model(read_from(path, read_images).reconstruction))
+    found = read_from(path, find_uncalibrated, read_from(path, read_images).images)
     assert [one.origin for one in found.values()] == [Origin.EXIF] * doubted
 
 
@@ -72,10 +72,10 @@ def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
     factors = read_from(path, calibrate_view_graph, [1])
     assert all(read_from(path, calibrate_view_graph, [1]) == factors for _ in range(5))  # to the bit
     assert fingerprint(tmp_path) == before
-    model = read_model(read_from(path, read_images).reconstruction)
-    found = with_focal_lengths(model, factors).reconstruction.camera(1).params
+    images = read_from(path, read_images).images
+    found = with_focal_lengths(images, factors).lenses[0].parameters
     np.testing.assert_allclose(found, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
-    assert model.reconstruction.camera(1).params[0] == 1150.0
+    assert images.lenses[0].parameters[0] == 1150.0
 
 
 def test_pairs_without_depth_say_nothing_of_focal_lengths(tmp_path):

@@ -68,15 +68,16 @@ def read_foreign(file):
 
 def test_a_hand_made_scene_is_read_with_the_right_axes_and_units(tmp_path):
     model = read_foreign(opensfm_file(tmp_path))
-    assert model.names == NAMES
-    np.testing.assert_allclose(model.rotations, [R, R], atol=1e-15)
-    np.testing.assert_allclose(model.centers, CENTERS, atol=1e-14)
-    np.testing.assert_allclose(model.focal_lengths_px, 100.0)
+    images = model.images
+    assert images.names == NAMES
+    np.testing.assert_allclose(images.rotations, [R, R], atol=1e-15)
+    np.testing.assert_allclose(images.centers, CENTERS, atol=1e-14)
+    np.testing.assert_allclose(images.focal_lengths_px, 100.0)
     (point,) = model.reconstruction.points3D.values()
     np.testing.assert_array_equal(point.xyz, POINT)
     # The point projects onto its observations: poses, intrinsics and pixels share one convention.
     assert point.error < 1e-9
-    for k, image_id in enumerate(model.image_ids.tolist()):
+    for k, image_id in enumerate(images.ids.tolist()):
         np.testing.assert_allclose(model.reconstruction.image(image_id).points2D[0].xy, PIXELS[k])
 
 
@@ -181,7 +182,7 @@ def test_a_relative_pose_has_its_second_camera_where_the_first_sees_it(tmp_path)
 
 
 def relative_poses_of_ring():
-    model = read_model(RING / "sparse" / "0")
+    model = read_model(RING / "sparse" / "0").images
     i, j = np.triu_indices(model.num_images, 1)
     rotations = model.rotations[j] @ model.rotations[i].transpose(0, 2, 1)
     towards = np.einsum("kab,kb->ka", model.rotations[i], model.centers[j] - model.centers[i])
@@ -253,7 +254,7 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
     truth = read_model(source)
     for name in ("bin", "text"):
         copy = read_model(tmp_path / name)
-        np.testing.assert_array_equal(copy.centers, truth.centers)
+        np.testing.assert_array_equal(copy.images.centers, truth.images.centers)
         assert copy.reconstruction.num_points3D() == truth.reconstruction.num_points3D()
     run("convert", source, tmp_path / "t.csv", "--overwrite", code=0)
     run("convert", source, tmp_path / "t.xyz", code=3)
@@ -262,7 +263,7 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
 def test_a_foreign_model_becomes_a_colmap_model_and_a_scene_survives_the_way(tmp_path, courtyard):
     sfm_shapefit.convert(opensfm_file(tmp_path), tmp_path / "model")
     model = read_model(tmp_path / "model")
-    np.testing.assert_allclose(model.centers, CENTERS, atol=1e-14)
+    np.testing.assert_allclose(model.images.centers, CENTERS, atol=1e-14)
     assert model.reconstruction.num_points3D() == 1
     back = posed_model_of(reconstruction_of(courtyard, "test"))
     assert (back.names, back.cameras) == (courtyard.names, courtyard.cameras)

@@ -45,7 +45,7 @@ def test_right_cameras_of_a_symmetric_scene_are_kept_and_the_group_is_named():
     assert found.kept.all()
     doubts = found.placement.assessment.doubts
     ambiguous = [k for k, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
-    assert [found.model.names[k] for k in ambiguous] == ["0003.jpg", "0004.jpg", "0005.jpg"]
+    assert [found.images.names[k] for k in ambiguous] == ["0003.jpg", "0004.jpg", "0005.jpg"]
     assert any("turning 0003.jpg, 0004.jpg, 0005.jpg by 90 degrees" in w for w in found.warnings)
     assert found.verdict.cameras[:1] != ()
 
@@ -93,7 +93,7 @@ def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, 
     found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
     assert 0 < len(asked) <= 6 * 25
     assert {row.name for row in found.cameras if not row.placed} == wrong
-    kinds = dict(zip(found.model.names, found.placement.assessment.doubts.kinds, strict=True))
+    kinds = dict(zip(found.images.names, found.placement.assessment.doubts.kinds, strict=True))
     assert {name for name, kind in kinds.items() if kind is not Doubt.RIGHT} == wrong
 
 
@@ -111,7 +111,7 @@ def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch
     model, wrong = turned(COURTYARD, chosen, angle_deg)
     found = sfm_shapefit.locate(model, COURTYARD / "database.db", adjust="none")
     assert {row.name for row in found.cameras if not row.placed} == wrong
-    touching = [any(found.model.names[k] in wrong for k in pair) for pair in tried]
+    touching = [any(found.images.names[k] in wrong for k in pair) for pair in tried]
     assert np.mean(touching) > 0.9
 
 
@@ -120,10 +120,12 @@ def test_a_camera_that_is_turned_a_little_is_put_right():
     found = sfm_shapefit.locate(model, COURTYARD / "database.db")
     assert all(row.placed for row in found.cameras)
     assert found.cameras[7].trust > 0.9
-    truth = read_model(COURTYARD / "sparse" / "0").rotations
+    truth = read_model(COURTYARD / "sparse" / "0").images.rotations
 
     def left_deg(result):
-        return rotation_angles_deg(read_model(result.reconstruction).rotations @ truth.transpose(0, 2, 1))
+        return rotation_angles_deg(
+            read_model(result.reconstruction).images.rotations @ truth.transpose(0, 2, 1)
+        )
 
     # Its matches tell it as well as they tell others where all are free: within four times what is usual.
     right = COURTYARD / "sparse" / "0"

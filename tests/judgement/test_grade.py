@@ -46,7 +46,7 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
     kept = np.ones(len(found.kept), dtype=bool)
     kept[5] = False
     verdict = altered(with_assessment(found, trust=trust), kept=kept).verdict
-    names = found.model.names
+    names = found.images.names
     assert verdict.grade is Grade.LOOK
     assert verdict.cameras == (names[5], names[2], names[1])
     assert verdict.statement == f"look at 3 cameras ({names[5]}, {names[2]}, {names[1]})"

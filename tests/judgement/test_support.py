@@ -33,7 +33,7 @@ def judge(images, points):
         view = source.view
         limit_px = options.structure.max_reprojection_error_px
         counts = count_observations(
-            points, images, view.num_keypoints, view.batches(), model.rotations, limit_px
+            points, images, view.num_keypoints, view.batches(), model.images.rotations, limit_px
         )
     return counts.shares(images.is_posed)
 
@@ -103,7 +103,7 @@ def test_it_is_named_and_can_be_kept(monkeypatch):
 
     monkeypatch.setattr(seed, "count_observations", count)
     found = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
-    name = found.model.names[2]
+    name = found.images.names[2]
     row = next(row for row in found.cameras if row.name == name)
     assert not row.placed
     assert "hardly any of its matches makes a point" in row.reason

@@ -26,7 +26,7 @@ MOVE, FORWARD = np.array([1.0, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def unposed(path):
-    return read_model(read_from(path, read_images).reconstruction)
+    return read_from(path, read_images).images.apart()
 
 
 def batches(path, max_matches=2_000_000):
@@ -61,7 +61,7 @@ def batch_of(rays_i, rays_j, pixel_angle=1e-3):
 
 def test_rotations_of_the_courtyard_are_right():
     model, (batch,) = batches(COURTYARD / "database.db")
-    truth = read_model(COURTYARD / "sparse" / "0")
+    truth = read_model(COURTYARD / "sparse" / "0").images
     assert truth.names == model.names
     found = estimate_relative_rotations(batch)
     np.testing.assert_array_equal(found.pairs, batch.pairs)
@@ -89,7 +89,7 @@ def test_neither_threads_nor_batches_change_a_bit():
 
 
 def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():
-    truth = read_model(COURTYARD / "sparse" / "0")
+    truth = read_model(COURTYARD / "sparse" / "0").images
     _, (batch,) = batches(COURTYARD / "database.db")
     rng = np.random.default_rng(0)
     wrong = np.flatnonzero(rng.random(len(batch.rays_j)) < 0.3)  # 0.7^5: a trial in six is without
@@ -103,7 +103,7 @@ def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():
 
 
 def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_changes_no_bit(monkeypatch):
-    truth = read_model(COURTYARD / "truth")
+    truth = read_model(COURTYARD / "truth").images
     _, (batch,) = batches(COURTYARD / "database.db")
     i, j = batch.pairs.T
     offsets = truth.centers[i] - truth.centers[j]
@@ -195,7 +195,7 @@ def test_pairs_of_real_scenes_are_right(scene, least_right):
     """Measured: 230 and 727 pairs within 5 degrees of the truth."""
     folder = real_scene(scene)
     model, (batch,) = batches(folder / "database.db")
-    truth = read_model(folder / "gt")
+    truth = read_model(folder / "gt").images
     assert truth.names == model.names
     errors = errors_deg(estimate_relative_rotations(batch), truth.rotations)
     assert (errors < 5.0).sum() >= least_right

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit.files.colmap.images import images_of
-from sfm_shapefit.files.colmap.model import read_model, turned_model
+from sfm_shapefit.files.colmap.model import read_model
 from tests.scenes import COURTYARD, RING, copied, edit_database, real_scene
 
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
@@ -124,13 +124,13 @@ def test_an_optimum_that_was_asked_for_is_delivered_as_it_is():
 def test_frames_turn_about_their_centers_and_the_input_stays_as_it_is():
     model = read_model(RING / "sparse" / "0")
     other = turned(model.reconstruction, 1.0)
-    found = turned_model(model, images_of(other))
-    theirs = [other.image(i).cam_from_world().rotation.matrix() for i in model.image_ids.tolist()]
+    found = model.images.turned(images_of(other))
+    theirs = [other.image(i).cam_from_world().rotation.matrix() for i in model.images.ids.tolist()]
     np.testing.assert_allclose(found.rotations, theirs, atol=1e-14)
-    np.testing.assert_allclose(found.centers, model.centers, atol=1e-13)
-    np.testing.assert_array_equal(found.rotations[0], model.rotations[0])
+    np.testing.assert_allclose(found.centers, model.images.centers, atol=1e-13)
+    np.testing.assert_array_equal(found.rotations[0], model.images.rotations[0])
     again = read_model(RING / "sparse" / "0")
-    np.testing.assert_array_equal(model.rotations, again.rotations)
+    np.testing.assert_array_equal(model.images.rotations, again.images.rotations)
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def in_utm(points):
 )
 def test_coordinates_on_earth_become_east_north_and_up_of_their_median(ring, tmp_path, projection, world):
     known = read_control_points(
-        tmp_path / written(tmp_path, marks_of(ring, CORNERS, world), projection), read_model(ring)
+        tmp_path / written(tmp_path, marks_of(ring, CORNERS, world), projection), read_model(ring).images
     )
     assert known.datum == pytest.approx(np.median(on_earth(CORNERS), axis=0), abs=1e-5)
     apart = known.positions - known.positions[0]
@@ -166,14 +166,14 @@ TWICE = [line(k, image) for k in range(4) for image in ("0001.jpg", "0002.jpg")]
 def test_a_file_that_cannot_serve_is_refused(ring, tmp_path, projection, lines, said):
     path = written(tmp_path, lines, projection)
     with pytest.raises(InputError, match=path.replace(".", r"\.")) as refused:
-        read_control(read_model(ring), path)
+        read_control(read_model(ring).images, path)
     assert said in str(refused.value)
 
 
 def test_an_empty_file_is_refused(ring, tmp_path):
     (tmp_path / "empty.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match=r"is empty; its first line is the projection"):
-        read_control_points(tmp_path / "empty.txt", read_model(ring))
+        read_control_points(tmp_path / "empty.txt", read_model(ring).images)
 
 
 def test_points_that_cannot_be_triangulated_leave_the_model_as_it_is(ring, tmp_path):

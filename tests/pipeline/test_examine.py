@@ -5,28 +5,29 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.points import ModelPictures, points_of
+from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.pipeline.examine import examine
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.program import run, run_refused
 from tests.scenes import COURTYARD, RING, fingerprint
+from tests.structures import pictures_of
 
 
 def test_quality_is_that_of_the_models_own_observations():
     model = read_model(RING / "sparse" / "0")
     reconstruction, images = model.reconstruction, model.images
-    pictures = ModelPictures(reconstruction, images)
+    pictures = pictures_of(reconstruction, images)
     quality = image_quality(points_of(reconstruction, images), images, pictures)
     mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
     assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
-    image = reconstruction.image(int(model.image_ids[3]))
+    image = reconstruction.image(int(model.images.ids[3]))
     seen = [point for point in image.points2D if point.has_point3D()]
     lengths = [reconstruction.points3D[point.point3D_id].track.length() for point in seen]
     assert quality.num_points[3] == len(seen)
     assert quality.track_lengths[3] == np.median(lengths)
-    camera = model.camera(3)
+    camera = image.camera
     cells = {(int(8 * p.xy[0] / camera.width), int(8 * p.xy[1] / camera.height)) for p in seen}
     assert quality.coverage[3] == pytest.approx(len(cells) / 64)
 

@@ -47,7 +47,7 @@ WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()
 
 
 def serial(workspace, model):
-    with view_of(workspace / "database.db", model) as view:
+    with view_of(workspace / "database.db", model.images) as view:
         (part,) = view.parts(10**9)
     (found,) = measure_part(WORK, part)
     return found
@@ -55,7 +55,7 @@ def serial(workspace, model):
 
 def shared(workspace, model, executor):
     seen = []
-    with view_of(workspace / "database.db", model) as view:
+    with view_of(workspace / "database.db", model.images) as view:
         parts = measure_with_workers(view, WORK, executor, lambda *done: seen.append(done))
     return concatenate(parts), seen
 

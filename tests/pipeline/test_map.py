@@ -57,7 +57,7 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     assert errors.position.max < 0.005 * errors.extent  # measured 0.0007; a quarter of the pairs is false
     assert errors.rotation_deg.max < 0.2
     sfm_shapefit.write_map_result(found, tmp_path / "out")
-    assert read_model(tmp_path / "out" / "0").num_images == 25
+    assert read_model(tmp_path / "out" / "0").images.num_images == 25
     assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
     facts = json.loads((tmp_path / "out" / "map.json").read_text())
     assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
@@ -83,8 +83,8 @@ def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
 
 
 def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
-    truth = read_model(RING / "sparse" / "0")
-    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    truth = read_model(RING / "sparse" / "0").images
+    ids = ", ".join(map(str, truth.ids[:4].tolist()))
     across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
     positions = dict(zip(truth.names, 2.0 * truth.centers @ turn.T + 100.0, strict=True))
@@ -110,8 +110,8 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
 
 
 def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path, monkeypatch):
-    truth = read_model(RING / "sparse" / "0")
-    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    truth = read_model(RING / "sparse" / "0").images
+    ids = ", ".join(map(str, truth.ids[:4].tolist()))
     across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
     # The receiver of the first four said the same place all the time.
     positions = np.where(np.arange(8)[:, None] < 4, truth.centers[0], truth.centers)
@@ -255,8 +255,8 @@ def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, wor
 
 @pytest.mark.parametrize("executor", [None, "processes"])
 def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor):
-    truth = read_model(RING / "sparse" / "0")
-    listed, ids = [(0, 1), (4, 3)], truth.image_ids.tolist()
+    truth = read_model(RING / "sparse" / "0").images
+    listed, ids = [(0, 1), (4, 3)], truth.ids.tolist()
     gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
     without = tmp_path / "without.csv"
     without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
@@ -427,7 +427,7 @@ def test_inlier_matches_are_enough(tmp_path):
         "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL",
     )
     images = read_from(path, read_images)
-    unposed, truth = read_model(images.reconstruction), read_model(RING / "sparse" / "0")
+    unposed, truth = images.images, read_model(RING / "sparse" / "0").images
     found = sfm_shapefit.relative_rotations(path)
     i, j = found.pairs.T
     true = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
@@ -658,7 +658,7 @@ def check_joined_folder(folder, found):
 
 
 def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
-    truth = read_model(RING / "sparse" / "0")
+    truth = read_model(RING / "sparse" / "0").images
     across = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
     database = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {across}")
     table = tmp_path / "priors.txt"

@@ -39,7 +39,7 @@ def test_pairs_are_positions_in_the_sorted_names(found):
     i, j = found.pairs.T
     assert (i < j).all()
     assert (np.diff(i * len(found.names) + j) > 0).all()
-    truth = read_model(COURTYARD / "sparse" / "0")
+    truth = read_model(COURTYARD / "sparse" / "0").images
     worst = found.subset(np.argsort(found.num_matches)[-1:])
     assert worst.names == found.names
     i, j = (truth.names.index(found.names[k]) for k in worst.pairs[0])

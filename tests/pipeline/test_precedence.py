@@ -13,7 +13,7 @@ NAMES = ("0001.jpg", "0003.jpg")
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
     """What may be told of the ring, by its name; each says another scale."""
-    folder, model = tmp_path_factory.mktemp("told"), read_model(RING / "sparse" / "0")
+    folder, model = tmp_path_factory.mktemp("told"), read_model(RING / "sparse" / "0").images
     place = dict(zip(model.names, model.centers, strict=True))
     (folder / "one.txt").write_text(model.names[4])
     (folder / "five.txt").write_text("\n".join(model.names[:5]))
@@ -64,7 +64,7 @@ def test_the_first_by_precedence_sets_the_scale_and_the_others_are_told_as_check
 
 @pytest.mark.parametrize("fixed", [False, True])
 def test_control_points_come_before_distances_and_priors_and_only_check_what_is_fixed(tmp_path, fixed):
-    truth = read_model(COURTYARD / "truth")
+    truth = read_model(COURTYARD / "truth").images
     apart = float(np.linalg.norm(truth.centers[0] - truth.centers[9]))
     told = {
         "control_points": str(BUNDLED / "gcp_list.txt"),

@@ -17,10 +17,12 @@ from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.synthetic import (
     SceneOptions,
     WorkspaceOptions,
@@ -70,10 +72,10 @@ def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_wor
         assert (database.num_rigs(), database.num_frames()) == (2, 12)
     first = rigs.sensor_of_image == 0
     expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
-    np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
-    assert not model.frame_offsets[first].any()
-    np.testing.assert_array_equal(model.groups.group_of, rigs.frame_of_image)
-    assert model.has_rigs
+    np.testing.assert_allclose(model.images.offsets, expected, atol=1e-12)
+    assert not model.images.offsets[first].any()
+    np.testing.assert_array_equal(model.images.frame_of, rigs.frame_of_image)
+    assert model.images.has_rigs
 
 
 def test_a_sensor_without_a_pose_in_its_rig_is_refused_by_name(workspace):
@@ -87,14 +89,14 @@ def test_a_sensor_without_a_pose_in_its_rig_is_refused_by_name(workspace):
 def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     model = read_model(workspace / "truth")
     before = [model.reconstruction.frame(f).rig_from_world.matrix() for f in range(1, 13)]
-    centers = 2.0 * (model.centers - model.frame_offsets) + [1.0, 2.0, 3.0] + model.frame_offsets
-    placed = model.frame_ids != 5
+    centers = 2.0 * (model.images.centers - model.images.offsets) + [1.0, 2.0, 3.0] + model.images.offsets
+    placed = model.images.frame_of != 4
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
     rows = np.flatnonzero(placed)
-    seed = build_seed(model, model.images.placed(rows, centers[rows]))
+    seed = build_seed(template_of(model), model.images.placed(rows, centers[rows]), number_points([]))
     ids, found = centers_of(seed)
-    expected = model.frame_ids != 5
-    assert ids == model.image_ids[expected].tolist()
+    expected = model.images.frame_of != 4
+    assert ids == model.images.ids[expected].tolist()
     np.testing.assert_allclose(found, centers[expected], atol=1e-12)
     assert_rigs_equal(seed, model.reconstruction)
     for frame, matrix in enumerate(before, start=1):  # the input is not touched
@@ -110,7 +112,7 @@ def assert_rigs_equal(a, b, atol=0.0):
             np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
 
 
-def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
+def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, workspace, found):
     ids, own = centers_of(found.reconstruction)
     assert ids == list(range(1, 37))
     fit = fit_similarity(own, rigs.scene.centers, rotate=False)
@@ -119,10 +121,12 @@ def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wro
     assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
     assert found.certified.gap <= 1e-8
     assert found.gauge.statement.startswith("rig: ")
-    assert_rigs_equal(found.reconstruction, found.model.reconstruction)
+    assert_rigs_equal(found.reconstruction, pycolmap.Reconstruction(workspace / "sparse" / "0"))
 
 
-def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_moved_together(found, tmp_path):
+def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_moved_together(
+    workspace, found, tmp_path
+):
     for image in found.reconstruction.images.values():
         frame = found.reconstruction.frame(image.frame_id)
         rig = found.reconstruction.rig(frame.rig_id)
@@ -138,7 +142,7 @@ def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_move
     assert sum("inside a frame" in row.reason for row in found.pairs) == inner
     assert facts["num_placed"] == 36
     again = pycolmap.Reconstruction(tmp_path / "out")
-    assert_rigs_equal(again, found.model.reconstruction)
+    assert_rigs_equal(again, pycolmap.Reconstruction(workspace / "sparse" / "0"))
     assert found.summary()["num_placed"] == again.num_reg_images()
 
 
@@ -164,7 +168,8 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
 
 def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
     located = sfm_shapefit.locate(workspace / "sparse" / "0", adjust="full", points="never")
-    assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
+    given = pycolmap.Reconstruction(workspace / "sparse" / "0")
+    assert_rigs_equal(located.reconstruction, given, atol=1e-12)
     fit = fit_similarity(centers_of(located.reconstruction)[1], rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
 
@@ -181,10 +186,10 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
 
 def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, rigs, tmp_path):
     model = read_model(workspace / "truth")
-    apart = float(np.linalg.norm(model.centers[0] - model.centers[20]))
-    rows = zip(model.names, (3.0 * model.centers).tolist(), strict=True)
+    apart = float(np.linalg.norm(model.images.centers[0] - model.images.centers[20]))
+    rows = zip(model.images.names, (3.0 * model.images.centers).tolist(), strict=True)
     (tmp_path / "priors.txt").write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
-    known = (model.names[0], model.names[20], 2.0 * apart)
+    known = (model.images.names[0], model.images.names[20], 2.0 * apart)
     told = {"known_distance": known, "priors": tmp_path / "priors.txt", "scale": "unit"}
     found = sfm_shapefit.locate(workspace / "sparse" / "0", points="never", **told)
     assert found.gauge.scale == "rig"
@@ -213,15 +218,15 @@ def moved_ring(tmp_path):
     """The ring with true centers of five cameras, in a unit of 0.37 m, and the others at the origin."""
     truth = read_model(RING / "sparse" / "0")
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
-    centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]
-    for k, image_id in enumerate(truth.image_ids.tolist()):
+    centers = truth.images.centers / 0.37 + [100.0, -50.0, 7.0]
+    for k, image_id in enumerate(truth.images.ids.tolist()):
         frame = model.frame(model.image(image_id).frame_id)
         rotation = frame.rig_from_world.rotation
         center = centers[k] if k < 5 else np.zeros(3)
         frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
     names = tmp_path / "names.txt"
-    names.write_text("# solved last week\n" + "\n".join(truth.names[:5]) + "\n\n")
-    return model, centers, names, truth.names
+    names.write_text("# solved last week\n" + "\n".join(truth.images.names[:5]) + "\n\n")
+    return model, centers, names, truth.images.names
 
 
 def poses(reconstruction):
@@ -509,9 +514,9 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
     (joined,) = found.joined
     whole = read_model(joined.reconstruction)
-    assert (whole.num_images, whole.groups.num_groups, whole.has_rigs) == (32, 8, True)
+    assert (whole.images.num_images, len(whole.images.frames.ids), whole.images.has_rigs) == (32, 8, True)
     assert (joined.reconstruction.num_rigs(), joined.reconstruction.num_cameras()) == (1, 4)
-    own, truth = whole.centers, scene.centers[whole.image_ids - 1]
+    own, truth = whole.images.centers, scene.centers[whole.images.ids - 1]
     fit = fit_similarity(own, truth)
     errors = np.linalg.norm(fit.apply(own) - truth, axis=1)
     assert errors.max() < 4.0 * told.join.center_sigma + 0.005

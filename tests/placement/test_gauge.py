@@ -98,7 +98,7 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
 
 
 def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
-    model = read_model(RING_MODEL)
+    model = read_model(RING_MODEL).images
     t, names = model.centers[:6], model.names
 
     def placed(*known):
@@ -207,7 +207,7 @@ def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_wa
 
 @pytest.fixture(scope="module")
 def ring():
-    return read_model(RING_MODEL)
+    return read_model(RING_MODEL).images
 
 
 def write_table(path, model, positions, lines=(), sep=" "):
@@ -331,9 +331,9 @@ def test_locate_turns_the_whole_model_with_its_directions_and_deviations_onto_pr
     truth = 2.0 * ring.centers @ quarter.T + [1000.0, 0.0, -50.0]
     table = write_table(tmp_path / "priors.txt", ring, truth)
     plain, found = locate(RING_MODEL), locate(RING_MODEL, priors=table)
-    for image_id, center in zip(ring.image_ids.tolist(), truth, strict=True):
+    for image_id, center in zip(ring.ids.tolist(), truth, strict=True):
         image, before = found.reconstruction.image(image_id), plain.reconstruction.image(image_id)
-        apart = np.linalg.norm(before.projection_center() - ring.centers[ring.image_ids == image_id][0])
+        apart = np.linalg.norm(before.projection_center() - ring.centers[ring.ids == image_id][0])
         assert np.linalg.norm(image.projection_center() - center) <= 2.0 * apart + 0.05
         # A turn of the world by the axes A: cam_from_world becomes R A^T.
         expected = before.cam_from_world().rotation.matrix() @ found.gauge.axes.T

@@ -64,7 +64,7 @@ def test_convert_writes_a_model_in_its_own_axes_and_an_output_with_its_trust(tmp
         run("locate", source, tmp_path / "out", "--no-report", "-q", code=0)
         source = tmp_path / "out"
     assert convert(source, tmp_path / "scene.ply") == "ply"
-    model = read_model(source)
+    model = read_model(source).images
     mesh = trimesh.load(tmp_path / "scene.ply", process=False)
     assert len(mesh.faces) == 6 * model.num_images
     apexes, colors = mesh.vertices[: 5 * model.num_images : 5], mesh.visual.vertex_colors

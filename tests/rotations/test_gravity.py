@@ -101,7 +101,7 @@ def test_gravities_of_a_rig_are_those_of_its_frames():
 
 def up_in(model):
     """The z axis of the true world in a model of the ring."""
-    truth = read_model(RING / "sparse" / "0")
+    truth = read_model(RING / "sparse" / "0").images
     ours = [model.find_image_with_name(name).cam_from_world().rotation.matrix() for name in truth.names]
     turn = mean_rotation_l1(np.array(ours).transpose(0, 2, 1) @ truth.rotations)
     return turn[:, 2]
@@ -125,20 +125,20 @@ def test_map_delivers_an_upright_model_and_names_a_wrong_gravity():
 def test_the_gravity_of_pose_priors_is_read(tmp_path):
     path = tmp_path / "database.db"
     path.write_bytes((RING / "database.db").read_bytes())
-    model = read_model(RING / "sparse" / "0")
+    images = read_model(RING / "sparse" / "0").images
     with pytest.raises(InputError, match="has no gravity of its images; give a table with --gravity"):
-        read_from(path, database_gravity, model)
+        read_from(path, database_gravity, images)
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
             prior = pycolmap.PosePrior(gravity=[0.0, 2.0, 0.0], corr_data_id=image.data_id)
             database.write_pose_prior(prior)
-    found = read_from(path, database_gravity, model)
+    found = read_from(path, database_gravity, images)
     np.testing.assert_array_equal(found.indices, np.arange(8))
     np.testing.assert_array_equal(found.directions, np.tile([0.0, 1.0, 0.0], (8, 1)))
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE pose_priors SET gravity = x'00'")
     with pytest.raises(InputError, match=r"the gravity of image .* is damaged"):
-        read_from(path, database_gravity, model)
+        read_from(path, database_gravity, images)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_the_gravity_of_pose_priors_is_read(tmp_path):
 def test_a_bad_table_is_refused(tmp_path, text, said):
     (tmp_path / "gravity.txt").write_text(text)
     with pytest.raises(InputError) as refused:
-        table_gravity(tmp_path / "gravity.txt", read_model(RING / "sparse" / "0"))
+        table_gravity(tmp_path / "gravity.txt", read_model(RING / "sparse" / "0").images)
     assert said in str(refused.value)
 
 
@@ -165,6 +165,6 @@ def test_a_table_may_have_a_header_and_sigmas(tmp_path):
     (tmp_path / "gravity.csv").write_text(
         "name,x,y,z,sigma\n0002.jpg,0,3,0,2\n0001.jpg,0,0,1\nno.jpg,1,0,0\n"
     )
-    found = table_gravity(tmp_path / "gravity.csv", read_model(RING / "sparse" / "0"))
+    found = table_gravity(tmp_path / "gravity.csv", read_model(RING / "sparse" / "0").images)
     np.testing.assert_array_equal(found.directions, [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
     np.testing.assert_allclose(np.degrees(found.sigmas), [1.0, 2.0])

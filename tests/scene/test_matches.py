@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database import DatabaseMatches, open_database
+from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.scene import matches as scene_matches
@@ -46,7 +47,7 @@ def model(folder):
 def matches(request, folder, model):
     """The matches of the ring, which were not read yet."""
     of_database = request.param == "database"
-    found = open_database(folder / "database.db", model.names) if of_database else TrackMatches(model)
+    found = open_database(folder / "database.db", model.images.names) if of_database else TrackMatches(model)
     with closing(found):
         yield found
 
@@ -54,8 +55,8 @@ def matches(request, folder, model):
 def part_of(model, chosen):
     """Return some of a model's images as a model of their own."""
     copy = pycolmap.Reconstruction(model.reconstruction)
-    for k in set(range(model.num_images)) - set(chosen):
-        copy.deregister_frame(int(model.frame_ids[k]))
+    for k in set(range(model.images.num_images)) - set(chosen):
+        copy.deregister_frame(int(model.images.frames.ids[model.images.frame_of[k]]))
     return read_model(copy)
 
 
@@ -81,11 +82,11 @@ def assert_same_bits(found, expected):
 
 @pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
 def test_neither_memory_nor_the_order_of_reading_changes_a_bit(matches, model, reading):
-    expected = columns(matches.at(model).batches())
+    expected = columns(matches.at(model.images).batches())
     enough = expected["counts"] >= np.median(expected["counts"])
     least = int(expected["counts"][enough].min())
     without = expected["pairs"][::3, ::-1]
-    labels = np.arange(model.num_images) % 3 - 1
+    labels = np.arange(model.images.num_images) % 3 - 1
     ends = labels[expected["pairs"]]
     asked = {
         "all": (lambda view: view.batches(), np.ones_like(enough)),
@@ -101,7 +102,7 @@ def test_neither_memory_nor_the_order_of_reading_changes_a_bit(matches, model, r
         "between": (lambda view: view.between(labels), (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])),
     }
     rng = np.random.default_rng(0)
-    view = matches.at(model, reading=reading)
+    view = matches.at(model.images, reading=reading)
     for name in rng.permutation(list(asked) * 2).tolist():
         ask, kept = asked[name]
         assert kept.sum() > 0
@@ -109,19 +110,19 @@ def test_neither_memory_nor_the_order_of_reading_changes_a_bit(matches, model, r
 
 
 def test_what_is_known_before_any_match_is_read_bounds_what_is_read(matches, model):
-    view = matches.at(model)
+    view = matches.at(model.images)
     found = columns(view.batches())
     np.testing.assert_array_equal(matches.pairs, found["pairs"])
     assert (matches.num_matches >= found["counts"]).all()
     assert (view.num_pairs, view.num_matches) == (len(matches.pairs), matches.num_matches.sum())
-    sizes = [len(view.keypoints(k)) for k in range(model.num_images)]
+    sizes = [len(view.keypoints(k)) for k in range(model.images.num_images)]
     assert sizes == matches.num_keypoints.tolist() == view.num_keypoints.tolist()
     assert matches.total_keypoints == sum(sizes)
-    assert matches.names == model.names
+    assert matches.names == model.images.names
 
 
 def test_progress_ends_where_all_pairs_are_done(matches, model):
-    view = matches.at(model, reading=Reading(batch=100))
+    view = matches.at(model.images, reading=Reading(batch=100))
     told = {"batches": [], "links": []}
     list(view.batches(advance=lambda *done: told["batches"].append(done)))
     list(view.links(advance=lambda *done: told["links"].append(done)))
@@ -132,55 +133,57 @@ def test_progress_ends_where_all_pairs_are_done(matches, model):
 
 
 def test_a_part_of_a_part_has_the_pairs_between_its_images_and_their_bits(matches, model):
-    whole = columns(matches.at(model).batches())
+    whole = columns(matches.at(model.images).batches())
     some, fewer = [0, 2, 3, 4, 7, 9], [1, 3, 4]
     part = part_of(model, some)
     part_of_part = part_of(part, fewer)
-    for images, chosen in ((part, some), (part_of_part, np.array(some)[fewer])):
+    for own, chosen in ((part, some), (part_of_part, np.array(some)[fewer])):
         kept = np.isin(whole["pairs"], chosen).all(axis=1)
         expected = pairs_in(whole, kept)
         expected["pairs"] = np.searchsorted(chosen, expected["pairs"])
         assert 0 < kept.sum() < len(kept)
-        assert_same_bits(columns(matches.at(images).batches()), expected)
-        view = matches.at(images)
-        np.testing.assert_array_equal(view.keypoints(1), matches.at(model).keypoints(chosen[1]))
+        assert_same_bits(columns(matches.at(own.images).batches()), expected)
+        view = matches.at(own.images)
+        np.testing.assert_array_equal(view.keypoints(1), matches.at(model.images).keypoints(chosen[1]))
         np.testing.assert_array_equal(view.num_keypoints, matches.num_keypoints[chosen])
 
 
 def test_pairs_that_are_left_out_are_unmatched(matches, model):
-    whole = columns(matches.at(model).batches())
+    whole = columns(matches.at(model.images).batches())
     gone = whole["pairs"][1::4].tolist()
-    names = [tuple(sorted((model.names[i], model.names[j]))) for i, j in gone]
-    left_out = frozenset([*names, ("another.jpg", model.names[0])])
-    view = matches.at(model, left_out)
+    names = [tuple(sorted((model.images.names[i], model.images.names[j]))) for i, j in gone]
+    left_out = frozenset([*names, ("another.jpg", model.images.names[0])])
+    view = matches.at(model.images, left_out)
     assert view.num_pairs == len(whole["pairs"]) - len(gone)
     assert_same_bits(columns(view.batches()), pairs_in(whole, np.arange(len(whole["pairs"])) % 4 != 1))
-    assert not matches.at(part_of(model, gone[0]), left_out).num_pairs
+    assert not matches.at(part_of(model, gone[0]).images, left_out).num_pairs
 
 
 def turned(model):
-    axis = np.linspace(0.1, 0.3, 3 * model.num_images).reshape(-1, 3)
-    return dataclasses.replace(model, rotations=Rotation.from_rotvec(axis).as_matrix() @ model.rotations)
+    frames = model.images.frames
+    axis = np.linspace(0.1, 0.3, frames.centers.size).reshape(-1, 3)
+    rotations = Rotation.from_rotvec(axis).as_matrix() @ frames.rotations
+    return dataclasses.replace(model, images=model.images.posed(rotations, frames.centers))
 
 
 def test_other_rotations_have_the_rays_of_matches_that_are_opened_for_them(folder, matches, model):
     other = turned(model)
-    before = columns(matches.at(model).batches())
-    found = columns(matches.at(other).batches())
+    before = columns(matches.at(model.images).batches())
+    found = columns(matches.at(other.images).batches())
     again = (
         TrackMatches(other)
         if isinstance(matches, TrackMatches)
-        else open_database(folder / "database.db", other.names)
+        else open_database(folder / "database.db", other.images.names)
     )
     with closing(again):
-        assert_same_bits(found, columns(again.at(other).batches()))
-    assert_same_bits(columns(matches.at(model).batches()), before)
+        assert_same_bits(found, columns(again.at(other.images).batches()))
+    assert_same_bits(columns(matches.at(model.images).batches()), before)
     assert not np.array_equal(found["rays_i"], before["rays_i"])
 
 
 def test_parts_are_read_elsewhere_to_the_same_bits(folder, model):
-    with closing(open_database(folder / "database.db", model.names)) as matches:
-        whole = matches.at(model, frozenset([model.names[:2]]))
+    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+        whole = matches.at(model.images, frozenset([model.images.names[:2]]))
         expected = columns(whole.batches())
         for size in (1, 700, 10**9):
             parts = pickle.loads(pickle.dumps(whole.parts(size)))
@@ -193,28 +196,28 @@ def test_parts_are_read_elsewhere_to_the_same_bits(folder, model):
         assert len(whole.parts(1)) == whole.num_pairs
         assert len(whole.parts(700)) > 3
         assert len(whole.parts(10**9)) == 1
-    assert len(TrackMatches(model).at(model).parts(700)) == 0  # only this process has the model
+    assert len(TrackMatches(model).at(model.images).parts(700)) == 0  # only this process has the model
 
 
 def test_a_part_does_not_read_the_table_of_all_pairs(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.names)) as matches:
-        (part,) = matches.at(model).parts(10**9)
+    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+        (part,) = matches.at(model.images).parts(10**9)
     monkeypatch.delattr("sfm_shapefit.files.colmap.database.read_pairs")
     with part.open() as view:
         assert sum(len(batch.pairs) for batch in view.batches()) == part.num_pairs
 
 
 def test_what_was_read_once_is_read_again_by_no_view(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.names)) as matches:
-        expected = columns(matches.at(model).batches())
+    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+        expected = columns(matches.at(model.images).batches())
         monkeypatch.setattr(DatabaseMatches, "_read_matches", None)  # nothing may be read from here on
-        again = columns(matches.at(turned(model)).links())
+        again = columns(matches.at(turned(model).images).links())
     assert_same_bits(again, expected)
 
 
 def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.names)) as matches:
-        view, other = matches.at(model), matches.at(turned(model))
+    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+        view, other = matches.at(model.images), matches.at(turned(model).images)
         (whole,) = view.links()
         reads, read = [], DatabaseMatches._read_matches
         monkeypatch.setattr(
@@ -229,7 +232,7 @@ def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(f
         np.testing.assert_array_equal(whole.keypoints, before)
         (again,), (shared,) = view.links(), other.links()
         assert len(reads) == 1
-        matches.at(model, reading=Reading(keeps=False))  # which takes the memory of all
+        matches.at(model.images, reading=Reading(keeps=False))  # which takes the memory of all
         list(other.links())
         assert len(reads) == 2
     for found in (again, shared):
@@ -239,26 +242,23 @@ def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(f
 
 
 def test_a_closed_database_is_read_no_more(folder, model):
-    matches = open_database(folder / "database.db", model.names)
+    matches = open_database(folder / "database.db", model.images.names)
     matches.close()
     matches.close()
     with pytest.raises(InputError, match="cannot be read"):
-        list(matches.at(model).batches())
+        list(matches.at(model.images).batches())
 
 
 def test_a_keypoint_without_a_ray_has_no_match(folder, model):
-    class Blinkered:
-        """The images, whose left halves have no rays."""
+    def blinkered(lens, xy):
+        """The left halves of images have no rays."""
+        return np.where(xy[:, :1] < 600.0, np.nan, rays_of(lens, xy))
 
-        names, focal_lengths_px = model.names, model.focal_lengths_px
-
-        def world_rays(self, image, xy):
-            return np.where(xy[:, :1] < 600.0, np.nan, model.world_rays(image, xy))
-
-    for matches in (TrackMatches(model), open_database(folder / "database.db", model.names)):
+    for matches in (TrackMatches(model), open_database(folder / "database.db", model.images.names)):
         with closing(matches):
-            whole, view = columns(matches.at(model).batches()), matches.at(Blinkered())
-            pixels = [view.keypoints(k)[:, 0] for k in range(model.num_images)]
+            whole = columns(matches.at(model.images).batches())
+            matches.rays, view = blinkered, matches.at(model.images)
+            pixels = [view.keypoints(k)[:, 0] for k in range(model.images.num_images)]
             of_match = np.repeat(whole["pairs"], whole["counts"], axis=0)
             seen = np.array(
                 [

@@ -22,10 +22,11 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel, camera_rays
+from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.priors import enu_of
 from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.given import ControlPoints, Datum, MarkedViews
+from sfm_shapefit.scene.images import Images
 
 _LARGEST = 1e30
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
@@ -50,7 +51,7 @@ class _Mark(NamedTuple):
     is_check: bool
 
 
-def read_control_points(path: Path, model: PosedModel) -> ControlPoints:
+def read_control_points(path: Path, images: Images) -> ControlPoints:
     """Read a gcp_list.txt: a line that names the projection, then one line per mark of a point in an image.
 
     The projection is WGS84 (longitude, latitude, altitude), one of its zones of UTM, or "local" for axes that
@@ -72,10 +73,10 @@ def read_control_points(path: Path, model: PosedModel) -> ControlPoints:
     convert = _projection(path, *lines[0])
     marks = [_parse(path, number, line) for number, line in lines[1:]]
     _refuse_contradictions(path, marks)
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_name = {name: index for index, name in enumerate(images.names)}
     used = [mark for mark in marks if mark.image in index_of_name]
     if not used:
-        raise InputError(f"{path} has no mark in an image of the model, such as {model.names[0]}")
+        raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}")
     names = sorted({mark.point for mark in used})
     place = {name: k for k, name in enumerate(names)}
     used.sort(key=lambda mark: (place[mark.point], index_of_name[mark.image]))
@@ -102,33 +103,22 @@ def read_control_points(path: Path, model: PosedModel) -> ControlPoints:
     )
 
 
-def look_at_marks(
-    reconstruction: pycolmap.Reconstruction, names: tuple[str, ...], known: ControlPoints
-) -> MarkedViews:
-    """Return the placed images of a model, and their views of the marks of control points.
-
-    Args:
-        reconstruction: not changed.
-        names: (n,) of the images that the marks index.
-        known: the points and their marks.
-    """
-    ids = {image.name: image_id for image_id, image in reconstruction.images.items()}
-    placed = [k for k, name in enumerate(names) if name in ids and reconstruction.image(ids[name]).has_pose]
-    images = [reconstruction.image(ids[names[k]]) for k in placed]
-    poses = [image.cam_from_world() for image in images]
-    place = np.full(len(names), -1)
+def look_at_marks(images: Images, known: ControlPoints) -> MarkedViews:
+    """Return the placed ones of images, and their views of the marks of control points."""
+    placed = np.flatnonzero(images.is_posed)
+    place = np.full(images.num_images, -1)
     place[placed] = np.arange(len(placed))
     rows = np.flatnonzero(place[known.images] >= 0)
-    cameras = [reconstruction.camera(image.camera_id) for image in images]
     on_plane = np.full((len(rows), 2), np.nan)
     for k, row in enumerate(rows.tolist()):
-        ray = camera_rays(cameras[place[known.images[row]]], known.pixels[row : row + 1])[0]
+        lens = images.lenses[images.lens_of[known.images[row]]]
+        ray = rays_of(lens, known.pixels[row : row + 1])[0]
         if ray[2] > 0.0:
             on_plane[k] = ray[:2] / ray[2]
     return MarkedViews(
-        rotations=np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3),
-        centers=np.array([image.projection_center() for image in images]).reshape(-1, 3),
-        focal_lengths_px=np.array([camera.mean_focal_length() for camera in cameras]),
+        rotations=images.rotations[placed],
+        centers=images.centers[placed],
+        focal_lengths_px=images.focal_lengths_px[placed],
         rows=rows,
         views=place[known.images[rows]],
         on_plane=on_plane,

@@ -16,16 +16,13 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database_pairs import PairRows, check_schema, match_names, read_pairs
-from sfm_shapefit.files.colmap.model import (
-    PosedModel,
-    from_posed_cameras,
-    posed_cameras,
-    rotation_matrices,
-)
+from sfm_shapefit.files.colmap.images import rotation_matrices
+from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_blob
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, RelativePoses, View
-from sfm_shapefit.scene.posed_model import PosedModelFile
 
 _KEYPOINT_BITS = np.uint64(32)
 _KEYPOINT_MASK = np.uint64(2**32 - 1)
@@ -118,6 +115,10 @@ class DatabaseMatches(Matches):
             f"{self.file.path}: image {name} has a keypoint that is not finite; extract them again"
         )
 
+    def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
+        """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
+        return rays_of(lens, pixels)
+
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
         """Return the matches of pairs, from the file only if they were not read, or not to be kept."""
         if keep and self._sorted is not None:
@@ -162,9 +163,9 @@ class DatabaseMatches(Matches):
             parts.append(data)
         return b"".join(parts)
 
-    def parts(self, view: View[Any], ranges: Sequence[slice]) -> "list[DatabasePart]":
+    def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""
-        path, images = Path(os.path.abspath(self.file.path)), posed_cameras(view.images)
+        path, images = Path(os.path.abspath(self.file.path)), view.images
         return [
             DatabasePart(
                 path=path,
@@ -185,7 +186,7 @@ class DatabaseMatches(Matches):
         return InputError(f"{self.file.path}: the pair {names} has {what}; match the images again")
 
 
-def relative_poses(view: View[Any]) -> RelativePoses:
+def relative_poses(view: View) -> RelativePoses:
     """Return the relative poses that the database of a view stores, most often none.
 
     Left out are pairs whose configuration has no pose with a direction, and poses that are NULL, not
@@ -233,7 +234,7 @@ class DatabasePart:
     """Of the database, absolute, the same for all workers."""
     rows: PairRows
     """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
-    images: PosedModelFile
+    images: Images
     """All images of the view, to which pairs refer: without rotations and cameras matches are no rays."""
 
     @property
@@ -242,8 +243,7 @@ class DatabasePart:
         return len(self.rows.pairs)
 
     @contextmanager
-    def open(self) -> Iterator[View[PosedModel]]:
+    def open(self) -> Iterator[View]:
         """Open the database again, for these pairs alone, nothing of which is kept."""
-        images = from_posed_cameras(self.images)
-        with closing(open_database(self.path, images.names, self.rows)) as matches:
-            yield matches.at(images, reading=Reading(keeps=False))
+        with closing(open_database(self.path, self.images.names, self.rows)) as matches:
+            yield matches.at(self.images, reading=Reading(keeps=False))

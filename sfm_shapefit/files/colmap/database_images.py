@@ -1,23 +1,24 @@
-"""The images of a COLMAP database as a model without rotations: what `map` starts from.
+"""The images of a COLMAP database: what `map` starts from.
 
-Every image stands in a frame of its own, at the origin with the identity as its rotation, so that rays of
-its keypoints in "world" axes are rays in camera axes. Intrinsics are those of the database: calibrated, or
-COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
+Every frame stands at the origin, its axes those of the world. Intrinsics are those of the database:
+calibrated, or COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
 """
 
 import itertools
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
+from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
+from sfm_shapefit.files.colmap.template import FrameHead, Template
+from sfm_shapefit.scene.images import Frames, Images
 
 # No image has a side of so many pixels.
 _LARGEST_SIDE = 2**31
@@ -27,21 +28,35 @@ _LARGEST_SIDE = 2**31
 class UnposedImages:
     """What a database says of its images."""
 
+    images: Images
+    """All of them, those of rigs in frames together, all frames at the origin and in its axes."""
     reconstruction: pycolmap.Reconstruction
-    """All cameras and images; every rotation is the identity, every center the origin."""
+    """All cameras and images; each image in a frame of its own."""
     rigs: DatabaseRigs
-    """Which of the images were taken together; the model here does not have them."""
+    """Which of the images were taken together."""
 
-    def frames(self, image_ids: list[int]) -> tuple[IntArray, FloatArray]:
-        """Return the frame of each image (n,) and the sensor_from_rig of its camera (n, 3, 3).
-
-        Frames are numbered as their first images stand: without rigs each image is its own frame.
-        """
+    def template(self, images: Images) -> Template:
+        """Return the template of a model of some images, all frames at the origin."""
         known, places = self.reconstruction, self.rigs.place_of_image
-        frame_ids = [places[i].frame_id if i in places else i for i in image_ids]
-        sensors = [self.rigs.sensor_from_rig(known.image(i)).rotation.matrix() for i in image_ids]
-        number = {frame_id: k for k, frame_id in enumerate(dict.fromkeys(frame_ids))}
-        return np.array([number[i] for i in frame_ids], dtype=np.int64), np.array(sensors)
+        own = [known.image(image_id) for image_id in images.ids.tolist()]
+        used = {places[image.image_id].rig_id for image in own if image.image_id in places}
+        in_rigs = {camera_id for rig_id in used for camera_id in self.rigs.camera_ids(rig_id)}
+        alone = sorted({image.camera_id for image in own} - in_rigs)
+        rig_ids = _free_ids(used, alone)
+        rigs = [trivial_rig(known.camera(camera_id)) for camera_id in alone]
+        frames: dict[int, FrameHead] = {}
+        for image in own:
+            place = places.get(image.image_id)
+            frame_id = image.image_id if place is None else place.frame_id
+            rig_id = image.camera_id if place is None else rig_ids[place.rig_id]
+            frame = frames.setdefault(frame_id, FrameHead(frame_id, rig_id, (), pycolmap.Rigid3d()))
+            frames[frame_id] = frame._replace(data_ids=(*frame.data_ids, image.data_id))
+        return Template(
+            cameras=tuple(known.camera(camera_id) for camera_id in (*alone, *sorted(in_rigs))),
+            rigs=(*rigs, *(self.rigs.renumbered(rig_id, rig_ids[rig_id]) for rig_id in sorted(used))),
+            frames=tuple(frames.values()),
+            images=tuple(own),
+        )
 
 
 def read_images(file: DatabaseFile) -> UnposedImages:
@@ -79,86 +94,30 @@ def read_images(file: DatabaseFile) -> UnposedImages:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    return UnposedImages(reconstruction=model, rigs=read_rigs(file, model))
+    rigs = read_rigs(file, model)
+    return UnposedImages(images=_put_in_rigs(images_of(model), rigs), reconstruction=model, rigs=rigs)
 
 
-def pose_at_origin(
-    images: UnposedImages, image_ids: list[int], rotations: FloatArray
-) -> pycolmap.Reconstruction:
-    """Return a new model of k images with rotations (k, 3, 3) cam_from_world, all frames at the origin.
-
-    Images of a rig are in the frames of that rig, whose rotation is that of their first image.
-    """
-    known, rigs = images.reconstruction, images.rigs
-    model = pycolmap.Reconstruction()
-    rig_ids = _add_cameras(model, images, image_ids)
-    members: dict[int, list[pycolmap.Image]] = {}
-    for image_id in image_ids:
-        image = known.image(image_id)
-        bare = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
-        place = rigs.place_of_image.get(image_id)
-        members.setdefault(image_id if place is None else place.frame_id, []).append(bare)
-    rotation_of = dict(zip(image_ids, rotations, strict=True))
-    for frame_id, together in members.items():
-        first = together[0]
-        rig_from_sensor = rigs.sensor_from_rig(first).rotation.inverse()
-        rotation = rig_from_sensor * pycolmap.Rotation3d(rotation_of[first.image_id])
-        pose = pycolmap.Rigid3d(rotation, np.zeros(3))
-        place = rigs.place_of_image.get(first.image_id)
-        if place is None:
-            model.add_image_with_trivial_frame(first, pose)
-        else:
-            _add_frame(model, pycolmap.Frame(frame_id=frame_id, rig_id=rig_ids[place.rig_id]), together, pose)
-    return model
+def _put_in_rigs(alone: Images, rigs: DatabaseRigs) -> Images:
+    """Return images in the frames of their rigs."""
+    places = rigs.place_of_image
+    frame_ids = [places[i].frame_id if i in places else i for i in alone.ids.tolist()]
+    ids, frame_of = np.unique(frame_ids, return_inverse=True)
+    frames = Frames(ids=ids, rotations=np.tile(np.eye(3), (len(ids), 1, 1)), centers=np.zeros((len(ids), 3)))
+    return replace(alone, frame_of=frame_of.ravel(), frames=frames, sensors=rigs.sensors_of(alone.lenses))
 
 
-def _add_cameras(
-    model: pycolmap.Reconstruction, images: UnposedImages, image_ids: list[int]
-) -> dict[int, int]:
-    """Add the cameras of some images and their rigs; return the ids that these got."""
-    known, rigs = images.reconstruction, images.rigs
-    used = {rigs.place_of_image[i].rig_id for i in image_ids if i in rigs.place_of_image}
-    in_rigs = {camera_id for rig_id in used for camera_id in rigs.camera_ids(rig_id)}
-    for camera_id in sorted({known.image(i).camera_id for i in image_ids} - in_rigs):
-        model.add_camera_with_trivial_rig(known.camera(camera_id))
-    for camera_id in sorted(in_rigs):
-        model.add_camera(known.camera(camera_id))
-    rig_ids = _free_ids(used, model.rigs)
-    for rig_id in sorted(used):
-        model.add_rig(rigs.renumbered(rig_id, rig_ids[rig_id]))
-    return rig_ids
-
-
-def _add_frame(
-    model: pycolmap.Reconstruction,
-    frame: pycolmap.Frame,
-    images: list[pycolmap.Image],
-    pose: pycolmap.Rigid3d,
-) -> None:
-    """Add a frame of a rig at a pose, and its images."""
-    for image in images:
-        frame.add_data_id(image.data_id)
-        image.frame_id = frame.frame_id
-    frame.rig_from_world = pose
-    model.add_frame(frame)
-    for image in images:
-        model.add_image(image)
-    model.register_frame(frame.frame_id)
+def trivial_rig(camera: pycolmap.Camera) -> pycolmap.Rig:
+    """Return the rig of a camera alone, which has its id."""
+    rig = pycolmap.Rig(rig_id=camera.camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    return rig
 
 
 def _free_ids(wanted: set[int], taken: Collection[int]) -> dict[int, int]:
     """Return an id for each of the wanted ones: itself unless it is taken."""
     free = (i for i in itertools.count(1) if i not in taken and i not in wanted)
     return {i: next(free) if i in taken else i for i in sorted(wanted)}
-
-
-def rotations_of(model: pycolmap.Reconstruction, image_ids: list[int]) -> tuple[FloatArray, BoolArray]:
-    """Return (k, 3, 3) cam_from_world of some images, the identity without a pose, and (k,) who has one."""
-    rotations, posed = np.tile(np.eye(3), (len(image_ids), 1, 1)), np.zeros(len(image_ids), dtype=np.bool_)
-    for k, image_id in enumerate(image_ids):
-        if model.exists_image(image_id) and model.image(image_id).has_pose:
-            rotations[k], posed[k] = model.image(image_id).cam_from_world().rotation.matrix(), True
-    return rotations, posed
 
 
 def _camera(path: Path, row: tuple[object, ...]) -> pycolmap.Camera:

@@ -7,8 +7,8 @@ Source: https://colmap.github.io/database.html, tables rigs, rig_sensors, frames
 and later); `sensor_from_rig` is a quaternion w x y z and a translation, eight bytes each.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,8 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
-from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.images import Sensors
+from sfm_shapefit.scene.lens import Lens
 
 _CAMERA = 0
 _POSE_BYTES = 7 * 8
@@ -57,26 +58,25 @@ class DatabaseRigs:
             copy.add_sensor(sensor, pose)
         return copy
 
-    def with_sensors_of(self, images: Images) -> "DatabaseRigs":
-        """Return the same with the poses that the sensors of images have, all others as they are."""
-        own, row_of = images.sensors, {lens.id: k for k, lens in enumerate(images.lenses)}
-        rigs = {rig_id: self.renumbered(rig_id, rig_id) for rig_id in self.rigs}
-        for rig in rigs.values():
-            for sensor in rig.non_ref_sensors:
-                if sensor.id in row_of:
-                    k = row_of[sensor.id]
-                    turn = pycolmap.Rotation3d(own.rotations[k])
-                    rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(turn, own.translations[k]))
-        return replace(self, rigs=rigs)
-
-    def sensor_from_rig(self, image: pycolmap.Image) -> pycolmap.Rigid3d:
-        """Return the pose of an image's camera in its rig; the identity without rig."""
-        place = self.place_of_image.get(image.image_id)
-        if place is None or self.rigs[place.rig_id].is_ref_sensor(_sensor(image.camera_id)):
-            return pycolmap.Rigid3d()
-        pose = self.rigs[place.rig_id].sensor_from_rig(_sensor(image.camera_id))
-        assert pose is not None  # the rig is calibrated
-        return pose
+    def sensors_of(self, lenses: Sequence[Lens]) -> Sensors:
+        """Return where lenses are in their rigs; one without a rig is the reference of its own."""
+        rig_of = {sensor.id: i for i, rig in self.rigs.items() for sensor in rig.sensor_ids()}
+        rotations, translations = np.tile(np.eye(3), (len(lenses), 1, 1)), np.zeros((len(lenses), 3))
+        is_reference = np.ones(len(lenses), dtype=np.bool_)
+        for k, lens in enumerate(lenses):
+            rig, sensor = self.rigs.get(rig_of.get(lens.id, -1)), _sensor(lens.id)
+            if rig is not None and not rig.is_ref_sensor(sensor):
+                pose = rig.sensor_from_rig(sensor)
+                assert pose is not None  # the rig is calibrated
+                rotations[k], translations[k] = pose.rotation.matrix(), pose.translation
+                is_reference[k] = False
+        numbers = [rig_of.get(lens.id, -1 - lens.id) for lens in lenses]
+        return Sensors(
+            rotations=rotations,
+            translations=translations,
+            rig_of=np.unique(numbers, return_inverse=True)[1].ravel(),
+            is_reference=is_reference,
+        )
 
 
 def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRigs:

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.priors import PRIORS_OF_IMAGES
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Gravity
+from sfm_shapefit.scene.images import Images
 
 _SIGMA_DEG = 1.0
 # No instrument is as exact, and beside a gravity that is, the pairs' share of the system drowns in rounding.
@@ -23,7 +23,7 @@ _LARGEST = 1e30
 _FORM = "the name of an image, three components of its gravity and at most a standard deviation in degrees"
 
 
-def table_gravity(path: Path, model: PosedModel) -> Gravity:
+def table_gravity(path: Path, images: Images) -> Gravity:
     """Read a text table `name x y z [sigma_deg]`, by commas or white space; sigma is 1 degree if not given.
 
     A first line that names the columns is optional. Lines that begin with # are comments; images that the
@@ -49,21 +49,21 @@ def table_gravity(path: Path, model: PosedModel) -> Gravity:
         if cells[0] in rows:
             raise InputError(f"{where}{cells[0]} stands twice; keep one of its gravities")
         rows[cells[0]] = [*values[:3], sigma]
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_name = {name: index for index, name in enumerate(images.names)}
     found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
     if not found:
-        raise InputError(f"{path} has no gravity of the model's images, such as {model.names[0]}")
+        raise InputError(f"{path} has no gravity of the model's images, such as {images.names[0]}")
     return _gravity(found)
 
 
-def database_gravity(file: DatabaseFile, model: PosedModel) -> Gravity:
+def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
     """Read the gravity of the pose priors of the model's images, each to 1 degree.
 
     Raises:
         InputError: if the database has none of these images, or a damaged one.
     """
     query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {PRIORS_OF_IMAGES}"
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_name = {name: index for index, name in enumerate(images.names)}
     found: dict[int, list[float]] = {}
     columns = ("corr_data_id", "corr_sensor_type", "gravity")
     for name, blob in file.rows("pose_priors", {columns: query}):

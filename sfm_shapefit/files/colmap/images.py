@@ -56,6 +56,7 @@ def put_images(reconstruction: pycolmap.Reconstruction, images: Images) -> None:
                 reconstruction.register_frame(frame_id)
     camera_ids = [lens.id for lens in images.lenses]
     before, after = _sensors(reconstruction, camera_ids), images.sensors
+    _scale_other_sensors(reconstruction, camera_ids, before, after)
     for k, lens in enumerate(images.lenses):
         camera, rotation, translation = (
             reconstruction.camera(lens.id),
@@ -70,19 +71,51 @@ def put_images(reconstruction: pycolmap.Reconstruction, images: Images) -> None:
             camera.params = list(lens.parameters)
 
 
+def _scale_other_sensors(
+    reconstruction: pycolmap.Reconstruction, camera_ids: list[int], before: Sensors, after: Sensors
+) -> None:
+    """Let sensors through which no image of ours was taken scale with those of their rig that are ours."""
+    for rig in reconstruction.rigs.values():
+        own = [k for k, camera_id in enumerate(camera_ids) if rig.has_sensor(_sensor_id(camera_id))]
+        lengths = [np.linalg.norm(sensors.translations[own], axis=1).sum() for sensors in (before, after)]
+        if not (lengths[0] > 0.0 and lengths[1] > 0.0 and lengths[0] != lengths[1]):
+            continue
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None and sensor.id not in camera_ids:
+                moved = pycolmap.Rigid3d(pose.rotation, lengths[1] / lengths[0] * pose.translation)
+                rig.set_sensor_from_rig(sensor, moved)
+
+
+def _sensor_id(camera_id: int) -> pycolmap.sensor_t:
+    """Return the id of a camera as a sensor."""
+    return pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera_id)
+
+
 def _poses(reconstruction: pycolmap.Reconstruction, frame_ids: list[int]) -> tuple[FloatArray, FloatArray]:
     """Return rotations (f, 3, 3) and centers (f, 3) of frames; NaN of those without a pose."""
-    rotations, translations = np.full((len(frame_ids), 3, 3), np.nan), np.full((len(frame_ids), 3), np.nan)
+    quaternions, translations = np.full((len(frame_ids), 4), np.nan), np.full((len(frame_ids), 3), np.nan)
     for k, frame_id in enumerate(frame_ids):
         pose = reconstruction.frame(frame_id).rig_from_world
         if pose is not None:
-            rotations[k], translations[k] = _matrix(pose.rotation), pose.translation
+            quaternions[k], translations[k] = pose.rotation.quat, pose.translation
+    rotations = rotation_matrices(quaternions[:, [3, 0, 1, 2]])
     return rotations, -np.einsum("nba,nb->na", rotations, translations)
 
 
 def _matrix(rotation: pycolmap.Rotation3d) -> FloatArray:
     """Return the matrix of a rotation; the quaternion of a model in text need not be of length 1."""
-    return np.asarray(pycolmap.Rotation3d(normalized(rotation.quat)).matrix())
+    return np.asarray(rotation_matrices(rotation.quat[None, [3, 0, 1, 2]])[0])
+
+
+def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
+    """Return the (n, 3, 3) rotations of quaternions (n, 4) in the order w, x, y, z; none may be zero."""
+    w, x, y, z = normalized(quaternions_wxyz).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
 
 
 def _sensors(reconstruction: pycolmap.Reconstruction, camera_ids: list[int]) -> Sensors:

@@ -14,7 +14,7 @@ nothing else of the user's. Pairs whose matches fit a homography say nothing, so
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import closing
 from enum import Enum
 from pathlib import Path
@@ -24,11 +24,12 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.lenses import lens_of
-from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS, PosedModel, read_model
+from sfm_shapefit.files.colmap.lenses import camera_of
+from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.scene.lens import LensDoubt
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens, LensDoubt
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 
 
@@ -64,12 +65,12 @@ class Uncalibrated(NamedTuple):
     """Its id in the database."""
 
 
-def find_uncalibrated(database: DatabaseFile, model: PosedModel) -> dict[int, Uncalibrated]:
-    """Return the cameras of a model that have the very intrinsics which a database guessed, by their id.
+def find_uncalibrated(database: DatabaseFile, images: Images) -> dict[int, Uncalibrated]:
+    """Return the lenses of images that are the very ones which a database guessed, by their id.
 
     Args:
         database: has them.
-        model: whose images are those of the database by name.
+        images: those of the database by name.
 
     Raises:
         InputError: if the database cannot be read.
@@ -78,12 +79,12 @@ def find_uncalibrated(database: DatabaseFile, model: PosedModel) -> dict[int, Un
     query = f"SELECT images.name, {', '.join(columns)} FROM images JOIN cameras USING (camera_id)"
     rows = {name: row for name, *row in database.rows("cameras", {columns: query})}
     found: dict[int, Uncalibrated] = {}
-    for image_id, name in zip(model.image_ids.tolist(), model.names, strict=True):
-        camera = model.reconstruction.camera(model.reconstruction.image(image_id).camera_id)
-        if camera.camera_id not in found and name in rows:
+    for number, name in zip(images.lens_of.tolist(), images.names, strict=True):
+        lens = images.lenses[number]
+        if lens.id not in found and name in rows:
             database_id, width, height, params, prior = rows[name]
-            if camera.params.astype("<f8").tobytes() == params:
-                found[camera.camera_id] = Uncalibrated(_origin(camera, width, height, prior), database_id)
+            if np.array(lens.parameters, dtype="<f8").tobytes() == params:
+                found[lens.id] = Uncalibrated(_origin(camera_of(lens), width, height, prior), database_id)
     origins = [one.origin for one in found.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
@@ -102,47 +103,34 @@ def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Ori
     return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
 
 
-def doubt_lenses(
-    cameras: Mapping[int, pycolmap.Camera], origins: Mapping[int, Origin]
-) -> dict[int, LensDoubt]:
-    """Return how far intrinsics may be off, of those cameras whose model can be adjusted."""
+def doubt_lenses(lenses: Mapping[int, Lens], origins: Mapping[int, Origin]) -> dict[int, LensDoubt]:
+    """Return how far lenses may be off, by their ids, of those whose model can be adjusted."""
     return {
-        camera_id: LensDoubt(lens_of(cameras[camera_id]), _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
-        for camera_id, origin in sorted(origins.items())
-        if lens_of(cameras[camera_id]).is_adjustable
+        lens_id: LensDoubt(lenses[lens_id], _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
+        for lens_id, origin in sorted(origins.items())
+        if lenses[lens_id].is_adjustable
     }
 
 
-def with_focal_lengths(model: PosedModel, factors: Mapping[int, float]) -> PosedModel:
-    """Return a model whose focal lengths are some factor larger, by camera; the input is not touched."""
+def with_focal_lengths(images: Images, factors: Mapping[int, float]) -> Images:
+    """Return images whose focal lengths are some factor larger, by the ids of their lenses."""
     found = {}
-    for camera_id, factor in factors.items():
-        camera = model.reconstruction.camera(camera_id)
-        params = camera.params.copy()
-        params[camera.focal_length_idxs()] *= factor
-        found[camera_id] = params.tolist()
-    return with_parameters(model, found)
+    for lens in images.lenses:
+        if lens.id in factors:
+            params = np.array(lens.parameters)
+            params[camera_of(lens).focal_length_idxs()] *= factors[lens.id]
+            found[lens.id] = params.tolist()
+    return images.with_parameters(found)
 
 
-def with_parameters(model: PosedModel, found: Mapping[int, Sequence[float]]) -> PosedModel:
-    """Return a model with other parameters of some cameras, by their id; the input is not touched."""
-    if not found:
-        return model
-    copy = pycolmap.Reconstruction(model.reconstruction)
-    for camera_id, params in found.items():
-        copy.camera(camera_id).params = list(params)
-    return read_model(copy)
-
-
-def differ_in_rays(one: PosedModel, other: PosedModel) -> bool:
-    """Return whether the rays of a camera's corner or edges differ by a hundredth between two models."""
-    for camera_id, camera in one.reconstruction.cameras.items():
-        against = other.reconstruction.camera(camera_id)
-        if camera.params.tolist() == against.params.tolist():
+def differ_in_rays(one: Images, other: Images) -> bool:
+    """Return whether the rays of a lens's corner or edges differ by a hundredth between the same images."""
+    for lens, against in zip(one.lenses, other.lenses, strict=True):
+        if lens.parameters == against.parameters:
             continue
-        w, h = camera.width, camera.height
+        w, h = lens.width, lens.height
         xy = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
-        rays, those = (np.asarray(through.cam_ray_from_img(xy)) for through in (camera, against))
+        rays, those = (np.asarray(camera_of(through).cam_ray_from_img(xy)) for through in (lens, against))
         if not np.abs(rays - those).max() <= _SAME_RAYS:  # NaN differs too
             return True
     return False

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.files.colmap.model import points2d_xy
+from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.files.colmap.seed import transform_model
 
 

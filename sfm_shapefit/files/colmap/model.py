@@ -1,4 +1,4 @@
-"""Models with known rotations: what is read of a COLMAP reconstruction, and the rays of its pixels.
+"""Models with known rotations: what is read of a COLMAP reconstruction.
 
 COLMAP's convention is x_cam = R x_world + t with center C = -R^T t. Only R and the intrinsics are
 trusted: the centers of the input are carried along for comparison and never place a camera.
@@ -12,148 +12,45 @@ Source of the conventions: https://colmap.github.io/format.html and `colmap/scen
 """
 
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt64Array, frozen
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
-from sfm_shapefit.files.colmap.images import images_of, put_images
-from sfm_shapefit.files.colmap.other_programs import intrinsics_of, make_camera
+from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.posed_model import PosedModelFile
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
-_ONE_TO_ONE = ("SIMPLE_PINHOLE", "PINHOLE")
-# By how much a pixel may miss itself over its ray and back; solving for the ray leaves 1e-8.
-_ROUND_TRIP_PX = 0.01
 # Sums of squares of larger coordinates overflow; these count as not finite.
 _LARGEST_COORDINATE = 1e100
-_POINT3D_ID = attrgetter("point3D_id")
-# For this camera, pixel coordinates and normalized coordinates are the same numbers.
-_IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PosedModel:
-    """The posed images of a COLMAP model, in the order of their names. Arrays are read-only.
-
-    The answer's sums depend on the order of images, so it is that of the user's names, not of ids.
-    """
+class ColmapModel:
+    """A COLMAP model: its posed images as arrays, and the rest, into which `files` alone looks."""
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
     images: Images
-    """The same n images as arrays, in the same order."""
-    image_ids: IntArray
-    """(n,) ids of the images that have a pose."""
-    names: tuple[str, ...]
-    """The names of those images, all different."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world."""
-    centers: FloatArray
-    """(n, 3) the input's camera centers; they never place a camera, and may all be 0."""
-    focal_lengths_px: FloatArray
-    """(n,) mean focal length; for a camera without one (equirectangular) its pixels per radian."""
-    frame_ids: IntArray
-    """(n,) id of the frame of each image."""
-    frame_offsets: FloatArray
-    """(n, 3) C - C_frame in world axes and the unit of the rigs, exactly 0 for a rig's reference sensor."""
+    """Its posed images, in the order of their names.
+
+    The answer's sums depend on the order of images, so it is that of the user's names, not of ids.
+    """
 
     @property
-    def groups(self) -> RigidGroups:
-        """The frames as rigid groups of images."""
-        _, labels = np.unique(self.frame_ids, return_inverse=True)
-        return RigidGroups(group_of=labels.ravel(), offsets=self.frame_offsets)
-
-    @property
-    def has_rigs(self) -> bool:
-        """Whether any frame has several posed images."""
-        return len(np.unique(self.frame_ids)) < self.num_images
-
-    @property
-    def num_images(self) -> int:
-        """Number of posed images, n."""
-        return len(self.image_ids)
-
-    def camera(self, index: int) -> pycolmap.Camera:
-        """Return the camera of an image by its index."""
-        return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
-
-    def world_rays(self, image: int, xy: FloatArray) -> FloatArray:
-        """Return the unit rays R^T f(xy) of pixels in world axes.
-
-        Args:
-            image: its index.
-            xy: (k, 2) pixels in COLMAP's convention: the center of the first pixel is (0.5, 0.5).
-
-        Returns:
-            (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
-        """
-        rays = camera_rays(self.camera(image), np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2))
-        return normalized(rays @ self.rotations[image])
-
-    def image_sizes(self) -> FloatArray:
-        """Return width and height of each image in pixels, (n, 2)."""
-        cameras = map(self.camera, range(self.num_images))
-        return np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    def image_names(self) -> tuple[str, ...]:
+        """Names of all images, posed or not."""
+        return tuple(image.name for image in self.reconstruction.images.values())
 
 
-def sensors_of(reconstruction: pycolmap.Reconstruction) -> dict[int, pycolmap.Rigid3d]:
-    """Return the poses of all sensors in their rigs but the references, by the ids of their cameras."""
-    rigs = reconstruction.rigs.values()
-    return {
-        sensor.id: pose for rig in rigs for sensor, pose in rig.non_ref_sensors.items() if pose is not None
-    }
-
-
-def posed_cameras(model: PosedModel) -> PosedModelFile:
-    """Return what rays in world axes need as plain values for other processes: no points, no centers."""
-    cameras = [model.camera(index) for index in range(model.num_images)]
-    different, index_of = np.unique([camera.camera_id for camera in cameras], return_inverse=True)
-    return PosedModelFile(
-        cameras=tuple(intrinsics_of(model.reconstruction.camera(i)) for i in different.tolist()),
-        names=model.names,
-        camera_of=index_of.astype(np.int64),
-        rotations=np.array(model.rotations),
-        centers=np.zeros((model.num_images, 3)),
-    )
-
-
-def from_posed_cameras(scene: PosedModelFile) -> PosedModel:
-    """Return a model of these images: the same rotations to the bit, no poses in frames, no points."""
-    reconstruction = pycolmap.Reconstruction()
-    cameras = [make_camera(camera, k) for k, camera in enumerate(scene.cameras, start=1)]
-    for camera in cameras:
-        reconstruction.add_camera_with_trivial_rig(camera)
-    camera_of_image = [cameras[k] for k in scene.camera_of.tolist()]
-    image_ids = np.arange(1, len(scene.names) + 1)
-    for image_id, name, camera in zip(image_ids.tolist(), scene.names, camera_of_image, strict=True):
-        image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
-        reconstruction.add_image_with_trivial_frame(image)
-    return PosedModel(
-        reconstruction=reconstruction,
-        images=images_of(reconstruction),
-        image_ids=image_ids,
-        names=scene.names,
-        rotations=scene.rotations,
-        centers=scene.centers,
-        focal_lengths_px=_focal_lengths_px("the model", camera_of_image),
-        frame_ids=image_ids,
-        frame_offsets=np.zeros_like(scene.centers),
-    )
-
-
-def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
+def read_model(source: Path | str | pycolmap.Reconstruction) -> ColmapModel:
     """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
 
     Args:
@@ -177,39 +74,6 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
             return _posed_model(label, reconstruction)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
-
-
-def turned_model(model: PosedModel, turned: Images) -> PosedModel:
-    """Return the model with the frames' rotations, the sensors and the lenses of images; no input changes.
-
-    Args:
-        model: the posed images.
-        turned: some of them. Frames turn about their own centers; what is the same keeps its bits.
-    """
-    own, copy = model.images.frames, pycolmap.Reconstruction(model.reconstruction)
-    rows = np.searchsorted(own.ids, turned.frames.ids)
-    put_images(copy, turned.posed(turned.frames.rotations, own.centers[rows]))
-    return read_model(copy)
-
-
-def camera_rays(camera: pycolmap.Camera, xy: FloatArray) -> FloatArray:
-    """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those that are no image of a ray.
-
-    pycolmap folds rays of a fisheye beyond 90 degrees back: 58 degrees where 90.3 is right. Such a ray has
-    its image elsewhere, by which it is told.
-    """
-    rays = np.asarray(camera.cam_ray_from_img(xy), dtype=np.float64).reshape(-1, 3)
-    if len(rays) == 0 or camera.model_name in _ONE_TO_ONE:
-        return rays
-    with np.errstate(invalid="ignore"):
-        ahead = rays[:, 2] > 0.0
-        back = np.asarray(camera.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
-        false = ahead & ~(np.abs(back - xy).max(axis=1) <= _ROUND_TRIP_PX)
-    rays[false] = np.nan
-    return rays
-
-
-# --- reading ---------------------------------------------------------------------------------------
 
 
 def _load(folder: Path) -> pycolmap.Reconstruction:
@@ -257,110 +121,46 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
         raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
 
 
-def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedModel:
+def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> ColmapModel:
     """Collect the posed images of a reconstruction."""
-    posed = {i: image.name for i, image in reconstruction.images.items() if image.has_pose}
-    image_ids = sorted(posed, key=lambda i: (posed[i], i))
-    if len(image_ids) < 2:
-        few = "only one image" if image_ids else "no image"
+    every = images_of(reconstruction)
+    has_pose = [reconstruction.image(image_id).has_pose for image_id in every.ids.tolist()]
+    images = every.part(np.flatnonzero(has_pose))
+    if images.num_images < 2:
+        few = "only one image" if images.num_images else "no image"
         raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
-    images = [reconstruction.image(i) for i in image_ids]
-    frame_offsets = [_frame_offset(label, image, reconstruction) for image in images]
-    names = tuple(image.name for image in images)
+    _refuse_unplaced_sensors(label, reconstruction, images)
+    names = images.names
     if len(set(names)) < len(names):
         repeated = next(name for k, name in enumerate(names) if name in names[:k])
         raise InputError(f"{label} has two images of the name {repeated}; rename one")
-
-    cameras = [reconstruction.camera(image.camera_id) for image in images]
-    poses = [image.cam_from_world() for image in images]
-    quaternions_xyzw = np.array([pose.rotation.quat for pose in poses], dtype=np.float64)
+    ids = images.ids.tolist()
+    poses = [reconstruction.image(image_id).cam_from_world() for image_id in ids]
+    quaternions = np.array([pose.rotation.quat for pose in poses], dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         # Quaternions are unit up to rounding in a file.
-        sound = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
     if not sound.all():
-        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
-    rotations = rotation_matrices(quaternions_xyzw[:, [3, 0, 1, 2]])
+        raise InputError(f"{label}: image {ids[int(np.argmin(sound))]} has no valid rotation")
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
-    _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
-    images_as_arrays = images_of(reconstruction)
-    return PosedModel(
-        reconstruction=reconstruction,
-        images=images_as_arrays.part(np.flatnonzero(np.isin(images_as_arrays.ids, image_ids))),
-        image_ids=frozen(np.array(image_ids, dtype=np.int64)),
-        names=names,
-        rotations=frozen(rotations),
-        centers=frozen(-np.einsum("nji,nj->ni", rotations, translations)),
-        focal_lengths_px=frozen(_focal_lengths_px(label, cameras)),
-        frame_ids=frozen(np.array([image.frame_id for image in images], dtype=np.int64)),
-        frame_offsets=frozen(np.array(frame_offsets)),
-    )
-
-
-def _frame_offset(label: str, image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> FloatArray:
-    """Return C - C_frame of a posed image in world axes, exactly 0 for the reference sensor.
-
-    Nothing says where a sensor without a pose in its rig stands: its image is refused.
-    """
-    frame = reconstruction.frame(image.frame_id)
-    sensor, rig = reconstruction.camera(image.camera_id).sensor_id, reconstruction.rig(frame.rig_id)
-    if rig.is_ref_sensor(sensor):
-        return np.zeros(3)
-    if not rig.has_sensor_from_rig(sensor):
-        raise InputError(
-            f"{label}: camera {image.camera_id} has no pose in rig {rig.rig_id} (sensor_from_rig), so that "
-            f"image {image.name} has none; calibrate the rig, or give a trivial rig to each camera"
-        )
-    sensor_from_rig, rig_from_world = rig.sensor_from_rig(sensor), frame.rig_from_world
-    assert sensor_from_rig is not None
-    assert rig_from_world is not None
-    in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
-    return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
-
-
-def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
-    """Return the (n, 3, 3) rotations of quaternions (n, 4) in the order w, x, y, z; none may be zero."""
-    w, x, y, z = normalized(quaternions_wxyz).T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
-
-
-def _focal_lengths_px(label: str, cameras: list[pycolmap.Camera]) -> FloatArray:
-    """Return the focal length of each camera, or refuse one that is not positive."""
-    focals = [
-        camera.params[0] / (2.0 * np.pi)  # its width covers a full turn
-        if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR
-        else camera.mean_focal_length()
-        for camera in cameras
-    ]
-    for camera, focal in zip(cameras, focals, strict=True):
-        if not (np.isfinite(focal) and focal > 0.0):
+    _refuse_not_finite(label, "the position of image", ids, np.where(absurd, np.inf, translations))
+    for lens in images.lenses:
+        if not (np.isfinite(lens.focal_px) and lens.focal_px > 0.0):
             raise InputError(
-                f"{label}: camera {camera.camera_id} has focal length {focal:g} px; it must be > 0"
+                f"{label}: camera {lens.id} has focal length {lens.focal_px:g} px; it must be > 0"
             )
-    return np.array(focals, dtype=np.float64)
+    return ColmapModel(reconstruction=reconstruction, images=images)
 
 
-# --- points ----------------------------------------------------------------------------------------
-
-
-def points2d_xy(image: pycolmap.Image) -> FloatArray:
-    """Return the pixels of all points of an image, (k, 2), without a Python loop over them."""
-    if not len(image.points2D):
-        return np.zeros((0, 2))
-    return np.asarray(_IDENTITY_CAMERA.cam_from_img(image.points2D), dtype=np.float64).reshape(-1, 2)
-
-
-def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
-    """Return the indices, ascending, of the points2D that observe a 3D point, and the ids of those points.
-
-    pycolmap has no array of the ids. Only the observed points become Python objects, one attribute each;
-    most points of an image usually observe nothing.
-    """
-    keypoints = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-    points = image.get_observation_points2D()
-    return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
+def _refuse_unplaced_sensors(label: str, reconstruction: pycolmap.Reconstruction, images: Images) -> None:
+    """Refuse images through a lens of which nothing says where in its rig it stands."""
+    is_open = np.isnan(images.sensors.translations[images.lens_of]).any(axis=1)
+    if is_open.any():
+        k = int(np.argmax(is_open))
+        rig_id = reconstruction.frame(int(images.frames.ids[images.frame_of[k]])).rig_id
+        raise InputError(
+            f"{label}: camera {images.lenses[images.lens_of[k]].id} has no pose in rig {rig_id} "
+            f"(sensor_from_rig), so that image {images.names[k]} has none; calibrate the rig, or give a "
+            "trivial rig to each camera"
+        )

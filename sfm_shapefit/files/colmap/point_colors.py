@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
-from sfm_shapefit.files.colmap.model import observed_points, points2d_xy
+from sfm_shapefit.files.colmap.points import observed_points, points2d_xy
 
 
 class SeenColors(NamedTuple):
@@ -51,18 +51,14 @@ def read_colors(source: pycolmap.Reconstruction) -> PointColors:
     return PointColors(colors=colors, images=images)
 
 
-def color_points(
-    reconstruction: pycolmap.Reconstruction, source: PointColors, *, in_place: bool = False
-) -> pycolmap.Reconstruction:
-    """Return a copy whose points take the mean color of the source's points seen at the same points2D.
+def color_points(result: pycolmap.Reconstruction, source: PointColors) -> None:
+    """Give points the mean color of the source's points seen at the same points2D; `result` changes.
 
     Images take part if their points2D are the same in both, in number and coordinates. Points without
-    any common observation keep their color. A source without any color costs no copy: the
-    `reconstruction` itself is returned. So it is `in_place`, colored: a copy of a large one is large.
+    any common observation keep their color.
     """
     if not source.images:
-        return reconstruction
-    result = reconstruction if in_place else pycolmap.Reconstruction(reconstruction)
+        return
     ids = np.array(sorted(result.point3D_ids()), dtype=np.uint64)
     sums, counts = np.zeros((len(ids), 3)), np.zeros(len(ids), dtype=np.int64)
     for seen, rows in _common_observations(result, source):
@@ -73,7 +69,6 @@ def color_points(
     means = np.rint(sums[is_seen] / counts[is_seen, None]).astype(np.uint8)
     for point_id, mean in zip(ids[is_seen].tolist(), means, strict=True):
         result.point3D(point_id).color = mean
-    return result
 
 
 def _common_observations(

@@ -1,44 +1,64 @@
 """The door between reconstructions and `Points`, and pixels and rays of the points2D that observe them."""
 
 from collections.abc import Callable
+from operator import attrgetter
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, UInt64Array
 from sfm_shapefit.files.colmap.images import put_images
-from sfm_shapefit.files.colmap.lenses import camera_of, lens_of
-from sfm_shapefit.files.colmap.model import camera_rays, observed_points, points2d_xy
+from sfm_shapefit.files.colmap.lenses import camera_of, rays_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
 Keypoints = Callable[[int], FloatArray | None]
-"""Returns the pixels (k, 2) of the keypoints of an image by its row, if there are any."""
+"""Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
+
+_POINT3D_ID = attrgetter("point3D_id")
+# For this camera, pixel coordinates and normalized coordinates are the same numbers.
+_IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
+
+
+def points2d_xy(image: pycolmap.Image) -> FloatArray:
+    """Return the pixels of all points of an image, (k, 2), without a Python loop over them."""
+    if not len(image.points2D):
+        return np.zeros((0, 2))
+    return np.asarray(_IDENTITY_CAMERA.cam_from_img(image.points2D), dtype=np.float64).reshape(-1, 2)
+
+
+def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
+    """Return the indices, ascending, of the points2D that observe a 3D point, and the ids of those points.
+
+    pycolmap has no array of the ids. Only the observed points become Python objects, one attribute each;
+    most points of an image usually observe nothing.
+    """
+    keypoints = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+    points = image.get_observation_points2D()
+    return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
 
 
 class ModelPictures:
-    """The points2D of a reconstruction, or keypoints instead, seen through the lenses of `images`."""
+    """Keypoints seen through the lenses of `images`."""
 
-    def __init__(
-        self, reconstruction: pycolmap.Reconstruction, images: Images, keypoints: Keypoints | None = None
-    ) -> None:
-        self._images = [reconstruction.image(i) for i in images.ids.tolist()]
-        self._cameras, self._lens_of = [camera_of(lens) for lens in images.lenses], images.lens_of.tolist()
+    def __init__(self, images: Images, keypoints: Keypoints) -> None:
+        self._lenses, self._lens_of = images.lenses, images.lens_of.tolist()
+        self._cameras = [camera_of(lens) for lens in images.lenses]
         self._keypoints = keypoints
 
     def count(self, image: int) -> int:
-        """Return how many points2D an image has."""
+        """Return how many keypoints an image has."""
         return len(self._pixels(image))
 
     def pixels(self, image: int, keypoints: IntArray | Int32Array) -> FloatArray:
-        """Return where points2D are, (k, 2)."""
+        """Return where keypoints are, (k, 2)."""
         return self._pixels(image)[keypoints]
 
     def rays(self, image: int, pixels: FloatArray) -> FloatArray:
         """Return rays (k, 3) of pixels; through a case of OPENCV, of depth 1."""
-        camera = self._cameras[self._lens_of[image]]
-        if not lens_of(camera).is_adjustable:
-            return camera_rays(camera, pixels)
+        lens, camera = self._lenses[self._lens_of[image]], self._cameras[self._lens_of[image]]
+        if not lens.is_adjustable:
+            return rays_of(lens, pixels)
         on_plane = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
         return np.concatenate([on_plane, np.ones((len(pixels), 1))], axis=1)
 
@@ -50,8 +70,14 @@ class ModelPictures:
 
     def _pixels(self, image: int) -> FloatArray:
         """Return the pixels of an image, (k, 2)."""
-        xy = None if self._keypoints is None else self._keypoints(image)
-        return points2d_xy(self._images[image]) if xy is None or not len(xy) else xy
+        xy = self._keypoints(image)
+        return np.zeros((0, 2)) if xy is None else xy
+
+
+def points2d_of(reconstruction: pycolmap.Reconstruction, images: Images) -> Keypoints:
+    """Return what looks up the points2D of images."""
+    ids = images.ids.tolist()
+    return lambda image: points2d_xy(reconstruction.image(ids[image]))
 
 
 def points_of(reconstruction: pycolmap.Reconstruction, images: Images) -> Points:
@@ -70,19 +96,13 @@ def points_of(reconstruction: pycolmap.Reconstruction, images: Images) -> Points
     )
 
 
-def add_points(
-    reconstruction: pycolmap.Reconstruction,
-    images: Images,
-    points: Points,
-    colors: pycolmap.Reconstruction | None = None,
-) -> None:
+def add_points(reconstruction: pycolmap.Reconstruction, images: Images, points: Points) -> None:
     """Add points to our own `reconstruction`.
 
     Args:
         reconstruction: changed in place.
         images: of it, which the points' observations index.
         points: with ids that it has not.
-        colors: the model whose points give theirs, by the same ids.
     """
     image_ids, keypoints = images.ids[points.images].tolist(), points.keypoints.tolist()
     begin = 0
@@ -94,8 +114,6 @@ def add_points(
             track.add_element(image_id, keypoint)  # a TrackElement for each takes four times as long
         point = pycolmap.Point3D(xyz=xyz, track=track)
         point.error = error
-        if colors is not None:
-            point.color = colors.point3D(point_id).color
         reconstruction.add_point3D_with_id(point_id, point)
         begin = end
 

@@ -15,10 +15,10 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Datum, PositionPriors
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 
 _WGS84, _CARTESIAN = 0, 1
@@ -36,7 +36,7 @@ class MissingPriorsError(InputError):
     """A database that has no position prior of a model's images."""
 
 
-def database_priors(file: DatabaseFile, model: PosedModel) -> PositionPriors:
+def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     """Read the pose priors of the model's images, matched by name, from a database.
 
     Raises:
@@ -45,7 +45,7 @@ def database_priors(file: DatabaseFile, model: PosedModel) -> PositionPriors:
     """
     path, found = file.path, dict[int, tuple[FloatArray, FloatArray]]()
     systems: set[int] = set()
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_name = {name: index for index, name in enumerate(images.names)}
     selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
     by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
     # Of each version of the schema, the newest first, by the columns that it has.
@@ -70,7 +70,7 @@ def database_priors(file: DatabaseFile, model: PosedModel) -> PositionPriors:
     return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
 
 
-def table_priors(path: Path, model: PosedModel) -> PositionPriors:
+def table_priors(path: Path, images: Images) -> PositionPriors:
     """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
 
     A first line that names the columns is optional; where it calls the second one lat or latitude, rows
@@ -82,14 +82,14 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
             is one of the model's.
     """
     rows, geodetic = read_position_table(path)
-    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_name = {name: index for index, name in enumerate(images.names)}
     found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
     if not found:
-        raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
+        raise InputError(f"{path} has no prior of the model's images, such as {images.names[0]}")
     return _priors(found, f"{len(found)} positions of {path}", geodetic=geodetic)
 
 
-def exif_priors(folder: Path, model: PosedModel) -> PositionPriors:
+def exif_priors(folder: Path, images: Images) -> PositionPriors:
     """Read the GPS positions that the EXIF data of the model's images have, by pycolmap's own reader.
 
     A position without altitude has that of the median.
@@ -98,7 +98,7 @@ def exif_priors(folder: Path, model: PosedModel) -> PositionPriors:
         InputError: if no image of the model in the folder has a position.
     """
     found: dict[int, tuple[FloatArray, FloatArray]] = {}
-    for index, name in enumerate(model.names):
+    for index, name in enumerate(images.names):
         bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
         if bitmap is not None:
             read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()

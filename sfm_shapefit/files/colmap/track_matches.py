@@ -8,17 +8,21 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import PosedModel, observed_points, points2d_xy
+from sfm_shapefit.files.colmap.lenses import rays_of
+from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.points import observed_points, points2d_xy, points_of
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import (
     PLENTY,
     KeypointNumbers,
     Matches,
     PairNames,
     Reading,
-    Seeing,
     View,
     batch_ranges,
 )
+from sfm_shapefit.scene.points import Points
 
 
 class TrackMatches(Matches):
@@ -27,12 +31,12 @@ class TrackMatches(Matches):
     file = None
     """There is no database."""
 
-    def __init__(self, model: PosedModel) -> None:
+    def __init__(self, model: ColmapModel) -> None:
         """Collect what the images observe, and count the matches of each pair."""
         super().__init__()
-        self.names = model.names
-        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
-        self._images = dict(zip(model.names, images, strict=True))
+        self.names = model.images.names
+        images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
+        self._model, self._images = model.reconstruction, dict(zip(self.names, images, strict=True))
         self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
         self.total_keypoints = int(self.num_keypoints.sum())
         seen = [observed_points(image) for image in images]
@@ -54,11 +58,13 @@ class TrackMatches(Matches):
         self._starts = np.append(0, np.cumsum(np.bincount(self._image_of, minlength=len(images))))
         self.pairs, self.num_matches = self._count()
 
-    def at(
-        self, images: Seeing, left_out: PairNames = frozenset(), reading: Reading = PLENTY
-    ) -> View[Seeing]:
+    def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> View:
         """Return the matches as other images see them; none is kept, for they are made anew in no time."""
         return super().at(images, left_out, reading._replace(keeps=False))
+
+    def points_of(self, images: Images) -> Points:
+        """Return the points that some of the images observe, as the model has them."""
+        return points_of(self._model, images)
 
     def keypoints(self, name: str) -> FloatArray:
         """Return the pixels (k, 2) of the points of an image."""
@@ -66,6 +72,10 @@ class TrackMatches(Matches):
         if not np.isfinite(xy).all():
             raise InputError(f"image {name} has a point whose coordinates are not finite")
         return xy
+
+    def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
+        """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
+        return rays_of(lens, pixels)
 
     def matched(self, name: str) -> FloatArray:
         """Return the pixels (m, 2) of those points of an image that observe a 3D point."""
