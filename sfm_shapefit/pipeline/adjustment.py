@@ -6,13 +6,13 @@ once, and rotations that the matches know better than whoever gave them.
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.facts.options import PlacingOptions, Rotations
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -24,12 +24,10 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.rigs import rigid_parts
-from sfm_shapefit.pipeline.seed import Located, PosedPart, pose_images, posed_part, read_links
+from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.move import move_cameras
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
 
 _SAID_OF_MATCHES = (
@@ -48,58 +46,42 @@ def pull_of_rotations(rotations: Rotations) -> float | None:
     return {"auto": None, "held": 0.0, "free": math.inf}[rotations]
 
 
-def pull_cameras(
-    images: Images, located: Located, priors: PositionPriors, options: PlacementOptions
-) -> Located:
-    """Return the cameras pulled by position priors, which hold the gauge from here on.
+def pull_cameras(stand: Stand, options: PlacementOptions) -> Stand:
+    """Return the cameras pulled by the priors that have set the gauge, which holds from here on.
 
-    Raises:
-        UnsolvableError: if the factor would take more memory than the options allow.
+    Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
-    pulled = pull_to_priors(located.placement, located.gauge, priors, options)
-    frames = images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
-    given = located.given._replace(centers=pulled.anchors._replace(indices=frames))
-    return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
+    given = stand.given
+    if given.priors is None or given.control is not None or stand.gauge.scale != "prior":
+        return stand
+    priors = given.priors.with_sigmas()
+    if not len(priors.of(stand.placement.cameras)) or stand.gauge.axes is None:
+        return stand
+    try:
+        pulled = pull_to_priors(stand.placement, stand.gauge, priors, options)
+    except UnsolvableError:  # too large a factor
+        return stand
+    frames = stand.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
+    held = pulled.anchors._replace(indices=frames)
+    return stand._replace(placement=pulled.placement, gauge=pulled.gauge, held=held)
 
 
-class AfterAdjustment(NamedTuple):
-    """What an adjustment makes of the placement that it started from."""
-
-    source: MatchSource
-    """At the adjusted rotations."""
-    directions: PairDirections
-    """Measured anew at these, as far as they are usable there too."""
-    placement: Placement
-    """Moved to the adjusted centers, with those directions."""
-    adjusted: Estimate
-    """How it went."""
-    part: PosedPart
-    """The images that were adjusted, as they were before."""
-
-
-def adjust_placed(
-    source: MatchSource,
-    directions: PairDirections,
-    located: Located,
-    options: PlacingOptions,
-    clock: Clock,
-    pull_rad: float | None,
-) -> AfterAdjustment:
-    """Adjust all placed cameras, in the gauge that was chosen; `pull_rad` is that of their rotations.
+def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
+    """Adjust all placed cameras, in the frame that is worked in, and measure their directions again there.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    images, placement = source.images, located.placement
-    everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
-    posed = posed_part(pose_images(images, everyone))
-    links = read_links(source, everyone, posed, clock.advance)
-    freedom, given = replace(located.freedom, pull_rad=pull_rad), located.given_of(posed, images)
-    adjusted = adjust_placement(posed.images, links, options.structure, freedom, given)
+    images, placement, directions = stand.source.images, stand.placement, stand.directions
+    posed = posed_part(stand.place())
+    links = stand.read_links(posed, clock.advance)
+    freedom = replace(stand.freedom, pull_rad=stand.given.pull_rad)
+    adjusted = adjust_placement(posed.images, links, options.structure, freedom, stand.given_poses(posed))
     del links
-    similarity, centers = located.gauge.similarity, np.empty((images.num_images, 3))
+    similarity, centers = stand.gauge.similarity, np.empty((images.num_images, 3))
     centers[posed.rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
+    source = stand.source
     if not adjusted.freedom.holds_rotations or adjusted.lenses.sigmas or adjusted.sensors:
         source = source.at(images.turned(adjusted.images))
         corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
@@ -108,9 +90,18 @@ def adjust_placed(
         turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.sensors:  # which stand elsewhere in their frames now
-            measured = rigid_parts(source.images, located.fixed_images(images)).apply(measured)
+            measured = rigid_parts(source.images, stand.given.rigid.fixed).apply(measured)
         placement = replace(placement, measured=measured)
-    return AfterAdjustment(source, directions, move_cameras(placement, locations), adjusted, posed)
+    return stand._replace(
+        source=source,
+        directions=directions,
+        placement=move_cameras(placement, locations),
+        freedom=adjusted.freedom.among(posed.frames, len(images.frames.ids)),
+        intrinsics=stand.intrinsics.after(adjusted.lenses, adjusted.freedom.lenses),
+        estimate=adjusted,
+        scale=similarity.scale,
+        adjustment=adjusted,
+    )
 
 
 def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: float) -> Judged:

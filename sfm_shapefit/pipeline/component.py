@@ -9,16 +9,16 @@ import numpy as np
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MappedModel
-from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.components import pairs_among
-from sfm_shapefit.pipeline.first_placement import adjust_first_placement
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
+from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun, changed_parameters
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.pipeline.settle import Told, settle
+from sfm_shapefit.pipeline.settle import settle
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
 from sfm_shapefit.rotations.arrangements import agreeing_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -36,13 +36,11 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
     """
     found: dict[int, tuple[float, ...]] = {}
     for _, members, averaging in run.average_images(relative, {}):
-        images = run.pose(members, averaging.rotations)
-        source = see_matches(run.matches, images, run.inputs, run.options)
-        rule = GaugeRule(images, find_rigid_parts(images, run.options.placement), "unit")
+        given = _given(run, run.pose(members, averaging.rotations), run.inputs)
+        source = see_matches(run.matches, given.images, run.inputs, run.options)
         with suppress(UnsolvableError):
             with run.clock("first placement"):
-                free = run.intrinsics.free
-                first = adjust_first_placement(source, rule, run.options, run.clock, free, thorough=False)
+                first = adjust_first_placement(given, source, run.options, run.clock, thorough=False)
             found = changed_parameters(first.adjusted) | found
     return run.images.with_parameters(found)
 
@@ -73,9 +71,22 @@ def _locate_component(
     run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
 ) -> LocateResult:
     """Place one component: adjust a first placement, and locate from the rotations of that."""
-    source, told = _first_adjusted(run, members, averaging, relative)
+    images, inputs = run.pose(members, averaging.rotations), run.inputs
+    if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
+        _, among = pairs_among(relative, members)
+        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
+    given = _given(run, images, inputs)
+    source, first = see_matches(run.matches, images, inputs, run.options), None
+    if run.options.freedom.adjust != "none":
+        with run.clock("first placement"):
+            first = adjust_first_placement(given, source, run.options, run.clock)
+        source = source.at(run.pose(members, first.rotations, first.adjusted))
+        given = given._replace(
+            rigid=find_rigid_parts(source.images, run.options.placement),
+            intrinsics=given.intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses),
+        )
     with run.clock("locate"):
-        found = _settle(run, source, told)
+        found = _settle(run, source, _with_told(run, given, members), first)
     ends = members[found.directions.pairs].tolist()
     unknown = (np.nan, np.nan)
     scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
@@ -87,51 +98,33 @@ def _locate_component(
     )
 
 
-def _settle(run: MapRun, source: MatchSource, told: Told) -> LocateResult:
+def _settle(run: MapRun, source: MatchSource, given: Given, first: FirstPlacement | None) -> LocateResult:
     """Settle a component on the position priors of its images, if they can set a scale."""
     try:
-        return settle(source, told, run.options, run.clock.anew())
+        return settle(given, source, run.options, run.clock.anew(), first)
     except UselessPriorsError as error:  # which other components need not share
-        found = settle(source, told._replace(priors=None), run.options, run.clock.anew())
+        found = settle(given._replace(priors=None), source, run.options, run.clock.anew(), first)
         return replace(
             found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
         )
 
 
-def _first_adjusted(
-    run: MapRun, members: IntArray, averaging: AveragedRotations, relative: RelativeRotations
-) -> tuple[MatchSource, Told]:
-    """Return the matches of a component at the rotations of its first placement, and what is told of it."""
-    given, inputs = run.pose(members, averaging.rotations), run.inputs
-    names = set(given.names)
-    if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
-        _, among = pairs_among(relative, members)
-        inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(given, among, averaging))
-    rigid = find_rigid_parts(given, run.options.placement)
-    averaged = see_matches(run.matches, given, inputs, run.options)
-    source, first, intrinsics = averaged, None, run.intrinsics
-    if run.options.freedom.adjust != "none":
-        with run.clock("first placement"):
-            rule = GaugeRule(given, rigid, "unit")
-            first = adjust_first_placement(averaged, rule, run.options, run.clock, intrinsics.free)
-        intrinsics = intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses)
-        source = averaged.at(run.pose(members, first.rotations, first.adjusted))
-        rigid = find_rigid_parts(source.images, run.options.placement)
+def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
+    """Return what is known of a component's images before they are placed: nothing that sets a scale."""
+    rigid = find_rigid_parts(images, run.options.placement)
+    return Given(run.read.template(images), images, inputs, rigid, np.inf, intrinsics=run.intrinsics)
+
+
+def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:
+    """Return what is known of a component's images with what the user told of them."""
+    names = set(given.images.names)
     priors = None if run.priors is None else run.priors.of(members)
-    told = Told(
-        run.read.template(given),
-        given,
-        inputs,
-        rigid,
-        np.inf,
+    return given._replace(
         distances=tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names),
         priors=priors if priors is not None and len(priors) >= FEWEST_PRIORS else None,
         control=None if run.control is None else run.control.of(members),
         gravity=None if run.gravity is None else run.gravity.among(members),
-        intrinsics=intrinsics,
-        near=first,
     )
-    return source, told
 
 
 def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:

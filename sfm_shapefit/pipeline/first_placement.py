@@ -12,18 +12,15 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.rigs import place_cameras
-from sfm_shapefit.pipeline.seed import Located, pose_images, posed_part, read_links
-from sfm_shapefit.placement.gauge import unit_gauge
+from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.place import Near
 
 
@@ -35,27 +32,20 @@ class FirstPlacement(NamedTuple):
     rotations: FloatArray
     """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
     as the others were on average."""
-    stand: Near
+    near: Near
     """Where the images stand."""
 
 
 def adjust_first_placement(
-    source: MatchSource,
-    rule: GaugeRule,
-    options: PlacingOptions,
-    clock: Clock,
-    lenses: FreeLenses,
-    *,
-    thorough: bool = True,
+    given: Given, source: MatchSource, options: PlacingOptions, clock: Clock, *, thorough: bool = True
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
     Args:
+        given: what is known of the images; nothing of it sets a scale here but rigs.
         source: at the averaged rotations.
-        rule: what sets the gauge.
         options: of the run.
         clock: of the run.
-        lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
 
     Raises:
@@ -64,24 +54,19 @@ def adjust_first_placement(
     """
     images, wanted = source.images, Wanted(tracks=wants_points(source, options.nodes))
     measured = measure(source, options.directions, clock, wanted)
-    graph = rule.rigid.apply(build_graph(images, measured))
+    graph, directions = given.rigid.apply(build_graph(images, measured)), measured.directions
     del measured  # arrays of all pairs
     placement = next(place_cameras(graph, options.placement, options.nodes, clock))
-    everyone = np.ones(len(placement.cameras), dtype=np.bool_)
-    gauge = unit_gauge(placement.locations)
-    if placement.unit is not None:  # the offsets of sensors have theirs
-        gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
-    located = Located(placement, everyone, gauge)
     del graph
-    posed = posed_part(pose_images(images, located))
-    links = partial(read_links, source, located, posed, clock.advance)
-    freedom = Freedom(lenses=lenses, has_sensors=options.freedom.rigs == "free" and images.has_rigs)
-    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, thorough=thorough)
+    stand = Stand.of(given, source, directions, placement, options)
+    posed = posed_part(stand.place())
+    links = partial(stand.read_links, posed, clock.advance)
+    adjusted = adjust_thinly(posed.images, links, options.structure, stand.freedom, thorough=thorough)
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(images.num_images), posed.rows)
-    stand = Near(centers, placement.refined)
-    return FirstPlacement(adjusted, _turn_the_others(images.rotations, rotations, is_posed), stand)
+    near = Near(centers, placement.refined)
+    return FirstPlacement(adjusted, _turn_the_others(images.rotations, rotations, is_posed), near)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

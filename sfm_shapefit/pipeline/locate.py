@@ -19,6 +19,7 @@ from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.control_points import read_control
 from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
+from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import (
     choose_inputs,
     open_matches,
@@ -27,7 +28,7 @@ from sfm_shapefit.pipeline.inputs import (
 )
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
-from sfm_shapefit.pipeline.settle import Told, settle
+from sfm_shapefit.pipeline.settle import settle
 
 if TYPE_CHECKING:
     import pycolmap
@@ -96,7 +97,7 @@ def locate(
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
-        told = Told(
+        told = Given(
             template,
             images,
             inputs,
@@ -108,4 +109,4 @@ def locate(
             control=control,
             intrinsics=intrinsics,
         )
-        return settle(source, told, options, clock)
+        return settle(told, source, options, clock)

@@ -1,0 +1,115 @@
+"""Where the cameras of one rigid piece stand, from their placement to their model."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
+from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.executors import Advance
+from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
+from sfm_shapefit.facts.options import PlacingOptions
+from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.pipeline.given import Given
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.known_positions import KnownPositions
+
+
+class PosedPart(NamedTuple):
+    """The placed images of all, in the order of their ids: that of the sums of an adjustment."""
+
+    images: Images
+    rows: IntArray
+    """(i,) their rows among all."""
+    frames: IntArray
+    """(f,) rows of their frames among all."""
+
+
+class Stand(NamedTuple):
+    """Where the cameras of one rigid piece stand, in the frame that is worked in."""
+
+    given: Given
+    source: MatchSource
+    """The matches, at the rotations that the piece has now."""
+    directions: PairDirections
+    placement: Placement
+    gauge: Gauge
+    """The map from the placement's locations to the frame that is worked in."""
+    freedom: Freedom
+    """What may move."""
+    intrinsics: DoubtedIntrinsics
+    held: KnownPositions | None = None
+    """Priors that pull at the frames and hold the gauge by that, with the weights that they ended with."""
+    estimate: Estimate | None = None
+    """The last adjustment; None if there was none."""
+    scale: float = 1.0
+    """Length of the solver's unit in units of the estimate."""
+    adjustment: Estimate | None = None
+    """How this placement was adjusted; None if it was not."""
+
+    @classmethod
+    def of(
+        cls,
+        given: Given,
+        source: MatchSource,
+        directions: PairDirections,
+        placement: Placement,
+        options: PlacingOptions,
+    ) -> "Stand":
+        """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
+        gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
+        free = Freedom(lenses=given.intrinsics.free, has_sensors=given.frees_rigs(options.freedom.rigs))
+        return cls(given, source, directions, placement, gauge, free, given.intrinsics)
+
+    def place(self, kept: BoolArray | None = None) -> Images:
+        """Return all images where they are placed, fixed ones as they were; NaN where neither.
+
+        Args:
+            kept: (k,) which of the placement's cameras count; all if None.
+        """
+        chosen = np.ones(len(self.placement.cameras), dtype=np.bool_) if kept is None else kept
+        centers = self.gauge.similarity.apply(self.placement.locations[chosen])
+        images = self.source.images
+        placed = images.placed(self.placement.cameras[chosen], centers)
+        fixed, frames = self.given.fixed_frames[:, None], placed.frames
+        return placed.posed(frames.rotations, np.where(fixed, images.frames.centers, frames.centers))
+
+    def given_poses(self, posed: PosedPart) -> GivenPoses:
+        """Return what is known of the frames of some placed images beside the pixels."""
+        rotations = None if self.adjustment is None else self.given.images.frames.rotations
+        return GivenPoses(rotations, self.given.fixed_frames, self.held).of(posed.frames)
+
+    def pictures(self, posed: PosedPart) -> ModelPictures:
+        """Return the keypoints of placed images and their lenses."""
+        rows, view = posed.rows.tolist(), self.source.view
+        return ModelPictures(posed.images, lambda k: view.keypoints(rows[k]))
+
+    def read_links(self, posed: PosedPart, advance: Advance) -> Links:
+        """Return what joins the keypoints of placed images; all rays are forgotten.
+
+        From here to the end of a triangulation, or an adjustment, most memory is needed.
+        """
+        view, pictures = self.source.view, self.pictures(posed)
+        if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
+            return collect_tracks(posed.images, pictures, self.source.matches.points_of(posed.images))
+        # A further piece is small: read no more than it needs.
+        among = self.placement.cameras if self.placement.piece else None
+        without = self.placement.rejected_pairs
+        links = view.links(without=without, among=among, advance=advance, consume=True)
+        place = np.full(self.source.images.num_images, -1)
+        place[posed.rows] = np.arange(len(posed.rows))
+        return collect_matches(posed.images, pictures, place, links, view.num_matches)
+
+
+def posed_part(images: Images) -> PosedPart:
+    """Return those of some images that have a pose."""
+    rows = np.flatnonzero(images.is_posed)
+    rows = rows[np.argsort(images.ids[rows])]
+    return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
