@@ -52,9 +52,9 @@ def pull_cameras(stand: Stand, options: PlacementOptions) -> Stand:
     Priors without a standard deviation do not pull, nor do those whose axes are not known.
     """
     given = stand.given
-    if given.priors is None or given.control is not None or stand.gauge.scale != "prior":
+    if given.known.priors is None or given.known.control is not None or stand.gauge.scale != "prior":
         return stand
-    priors = given.priors.with_sigmas()
+    priors = given.known.priors.with_sigmas()
     if not len(priors.of(stand.placement.cameras)) or stand.gauge.axes is None:
         return stand
     try:

@@ -103,7 +103,8 @@ def _settle(run: MapRun, source: MatchSource, given: Given, first: FirstPlacemen
     try:
         return settle(given, source, run.options, run.clock.anew(), first)
     except UselessPriorsError as error:  # which other components need not share
-        found = settle(given._replace(priors=None), source, run.options, run.clock.anew(), first)
+        without = given._replace(known=replace(given.known, priors=None))
+        found = settle(without, source, run.options, run.clock.anew(), first)
         return replace(
             found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
         )
@@ -117,14 +118,11 @@ def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
 
 def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:
     """Return what is known of a component's images with what the user told of them."""
-    names = set(given.images.names)
-    priors = None if run.priors is None else run.priors.of(members)
-    return given._replace(
-        distances=tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names),
-        priors=priors if priors is not None and len(priors) >= FEWEST_PRIORS else None,
-        control=None if run.control is None else run.control.of(members),
-        gravity=None if run.gravity is None else run.gravity.among(members),
-    )
+    names, known = set(given.images.names), run.known.of(members)
+    if known.priors is not None and len(known.priors) < FEWEST_PRIORS:
+        known = replace(known, priors=None)
+    distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
+    return given._replace(distances=distances, known=known)
 
 
 def _false_pairs(images: Images, among: RelativeRotations, averaging: AveragedRotations) -> PairNames:

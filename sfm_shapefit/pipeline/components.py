@@ -15,10 +15,10 @@ from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gravity import refine_with_gravity
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
-from sfm_shapefit.rotations.average import average_relative_rotations
+from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.gravity import with_gravity
 from sfm_shapefit.rotations.options import AveragingOptions
 from sfm_shapefit.scene.given import Gravity
 
@@ -87,7 +87,7 @@ class ComponentAveraging(NamedTuple):
         answer = self._arrange(len(members), local, self._evidence_of(inside))
         if self.gravity is None:
             return answer
-        return refine_with_gravity(answer, local, self.gravity.among(members))
+        return refine_with_gravity(answer, local, self.gravity.of(members))
 
     def _arrange(
         self, num_frames: int, relative: RelativeRotations, evidence: FloatArray
@@ -132,3 +132,14 @@ def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
     labels = connected_components(num_frames, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
+
+
+def refine_with_gravity(
+    averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
+) -> AveragedRotations:
+    """Return averaged rotations of frames refined on their pairs and gravities together."""
+    supports = relative.weight_shares * relative.num_matches
+    given, _ = check_pairs(
+        relative.pairs, relative.rotations, relative.information, supports, len(averaged.registered)
+    )
+    return with_gravity(averaged, given, gravity)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +9,6 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
@@ -38,24 +35,6 @@ SETS_SCALE: dict[ScaleKind, str] = {
     "unit": "an arbitrary unit",
 }
 """What a scale is that of, in words."""
-
-PRIORS_OF_DATABASE = "database"
-"""In place of a table or folder: the database's own pose priors."""
-
-
-def read_priors(images: Images, file: DatabaseFile | None, asked: Path | str | None) -> PositionPriors | None:
-    """Return the position priors of images, if they are asked for.
-
-    Raises:
-        InputError: if they are asked for and there are none.
-    """
-    if asked is None:
-        return None
-    if str(asked) == PRIORS_OF_DATABASE:
-        if file is None:
-            raise InputError("there is no database whose priors could be taken; give one with --database")
-        return database_priors(file, images)
-    return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
 
 
 def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str], missing: str) -> None:

@@ -12,7 +12,7 @@ from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.options import KnownDistance, Scale
 from sfm_shapefit.scene.freedom import RigFreedom
-from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
 from sfm_shapefit.scene.images import Images
 
 
@@ -30,17 +30,15 @@ class Given(NamedTuple):
     scale: Scale = "unit"
     """The scale where nothing that is known sets it."""
     distances: tuple[KnownDistance, ...] = ()
-    priors: PositionPriors | None = None
-    control: ControlPoints | None = None
-    gravity: Gravity | None = None
-    """Measured gravity, which turns the model upright."""
+    known: Known = NOTHING_KNOWN
+    """What the user told of them beside."""
     intrinsics: DoubtedIntrinsics = NO_DOUBTS
     """Which intrinsics are in doubt, and what became of them so far."""
 
     @property
     def rule(self) -> GaugeRule:
         """What sets scale, origin and axes."""
-        return GaugeRule(self.images, self.rigid, self.scale, self.priors, self.distances)
+        return GaugeRule(self.images, self.rigid, self.scale, self.known.priors, self.distances)
 
     @property
     def fixed_frames(self) -> BoolArray:
@@ -57,7 +55,7 @@ class Given(NamedTuple):
     def of_further_piece(self) -> "Given":
         """Return what is known of a further rigid piece: nothing of positions."""
         free = self.rigid._replace(fixed=np.zeros_like(self.rigid.fixed), groups=None, fixed_group=None)
-        return self._replace(rigid=free, scale="unit", distances=(), priors=None, control=None, gravity=None)
+        return self._replace(rigid=free, scale="unit", distances=(), known=NOTHING_KNOWN)
 
     def frees_rigs(self, asked: RigFreedom) -> bool:
         """Return whether the adjustments change where sensors stand in their rigs, if there are any."""

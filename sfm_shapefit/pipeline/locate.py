@@ -17,8 +17,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
+from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import (
     choose_inputs,
@@ -27,6 +26,7 @@ from sfm_shapefit.pipeline.inputs import (
     see_matches,
 )
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
+from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
 from sfm_shapefit.pipeline.settle import settle
 
@@ -90,8 +90,7 @@ def locate(
             matches = stack.enter_context(closing(open_matches(model, inputs)))
             wanted = options.freedom.intrinsics
             images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out)
-            known = read_priors(images, matches.file, priors)
-            control = read_control(images, options.gauge.control_points)
+            known = read_known(images, matches.file, priors, options.gauge.control_points)
             rigid = find_rigid_parts(images, options.placement, read_fixed_images(model, options.fix))
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
@@ -105,8 +104,7 @@ def locate(
             pull_of_rotations(options.rotations),
             scale=options.gauge.scale,
             distances=options.gauge.known_distance,
-            priors=known,
-            control=control,
+            known=known,
             intrinsics=intrinsics,
         )
         return settle(told, source, options, clock)

@@ -87,7 +87,7 @@ def _map_opened(run: MapRun) -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            told = ToldOfJoins(run.priors, options.gauge.known_distance, run.without)
+            told = ToldOfJoins(run.known.priors, options.gauge.known_distance, run.without)
             found = join_models(models, run.images, run.matches, told, clock)
     left_out = {
         name: reasons[frame]

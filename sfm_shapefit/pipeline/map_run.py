@@ -23,16 +23,15 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging
-from sfm_shapefit.pipeline.control_points import read_control
-from sfm_shapefit.pipeline.gauge_choice import read_priors, refuse_unknown_names
-from sfm_shapefit.pipeline.gravity import read_gravity
+from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
+from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
-from sfm_shapefit.scene.given import ControlPoints, Gravity, PositionPriors
+from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames, View
 
@@ -55,9 +54,7 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
         inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
         images, intrinsics = settle_intrinsics(images, file, options.freedom.intrinsics, inputs.left_out)
         refuse_unknown_names(options.gauge.known_distance, images.names, "the database has no image")
-        positions = read_priors(images, file, priors)
-        control = read_control(images, options.gauge.control_points)
-        gravity = read_gravity(file, images, options.averaging.gravity)
+        known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
         matches = DatabaseMatches(file, images.names)
     return MapRun(
         options=options,
@@ -66,9 +63,7 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
         read=read,
         images=images,
         intrinsics=intrinsics,
-        priors=positions,
-        control=control,
-        gravity=gravity,
+        known=known,
         without=inputs.left_out,
     )
 
@@ -84,9 +79,7 @@ class MapRun(NamedTuple):
     """All of the database, at the origin."""
     intrinsics: DoubtedIntrinsics
     """Which of theirs are in doubt."""
-    priors: PositionPriors | None
-    control: ControlPoints | None
-    gravity: Gravity | None
+    known: Known
     without: PairNames
     """Pairs that are taken for unmatched."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
@@ -153,7 +146,8 @@ class MapRun(NamedTuple):
         of_image, images = self.frame_of_image, self.images
         sensors = images.sensors.rotations[images.lens_of]
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
-        gravity = None if self.gravity is None else self.gravity.of_frames(of_image, sensors)
+        gravity = self.known.gravity
+        gravity = None if gravity is None else gravity.of_frames(of_image, sensors)
         averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, self.shares_of_frames())
         for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
             members = np.flatnonzero(np.isin(of_image, frames))

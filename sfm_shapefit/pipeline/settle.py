@@ -46,13 +46,12 @@ from sfm_shapefit.pipeline.adjustment import (
     with_uncertainty,
 )
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.control_points import bring_to_control_points
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, GaugeRule
 from sfm_shapefit.pipeline.given import Given
-from sfm_shapefit.pipeline.gravity import turn_model_upright
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.known import bring_to_known
 from sfm_shapefit.pipeline.measure import (
     Wanted,
     add_evidence,
@@ -139,10 +138,8 @@ def finish_piece(
     del placed, started  # with their samples of errors
     seeded = seed_points(stand, kept, options, clock)
     moves = judged.unit is None and not given.rigid.fixed.any()
-    seeded, control_points, of_control = bring_to_control_points(
-        seeded, given.control, options.structure, moves=moves
-    )
-    seeded, of_gravity = turn_model_upright(seeded, given.gravity)
+    brought = bring_to_known(seeded, given.known, options.structure, moves=moves)
+    seeded = brought.seeded
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
@@ -157,10 +154,9 @@ def finish_piece(
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
     prior_angles = None
-    if given.priors is not None and gauge.scale == "prior" and gauge.axes is not None:
-        prior_angles = compare_with_priors(
-            directions.pairs, directions.directions, given.priors, gauge, centers
-        )
+    priors = given.known.priors
+    if priors is not None and gauge.scale == "prior" and gauge.axes is not None:
+        prior_angles = compare_with_priors(directions.pairs, directions.directions, priors, gauge, centers)
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
     return LocateResult(
         reconstruction=reconstruction,
@@ -187,8 +183,7 @@ def finish_piece(
             *_collect_warnings(stand, judged, kept, seeded.points.num_points),
             *prior_warnings(prior_angles, directions.pairs, images.names),
             *_gauge_warnings(given.rule, gauge, centers, options.gauge.scale),
-            *of_control,
-            *of_gravity,
+            *brought.warnings,
             *support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0),
         ),
         fixed=given.rigid.fixed,
@@ -197,7 +192,7 @@ def finish_piece(
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
-        control_points=tuple(control_points),
+        control_points=brought.control_points,
     )
 
 

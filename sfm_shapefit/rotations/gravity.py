@@ -92,7 +92,7 @@ def with_gravity(averaged: AveragedRotations, given: AveragingPairs, gravity: Gr
         gravity: gravities of images that have a rotation; with fewer than two `averaged` is returned.
     """
     members = np.flatnonzero(averaged.registered).astype(np.int64)
-    gravities = gravity.among(members)
+    gravities = gravity.of(members)
     if len(gravities.indices) < FEWEST_GRAVITIES:
         return averaged
     upright = averaged.rotations @ turn_upright(down_of(averaged.rotations[members], gravities)).T

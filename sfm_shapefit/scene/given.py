@@ -1,6 +1,6 @@
 """What a user tells of the images beside the matches: positions, control points, gravity; types only."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -125,9 +125,9 @@ class Gravity(NamedTuple):
     sigmas: FloatArray
     """(k,) standard deviations about each of two axes, in radians."""
 
-    def among(self, members: IntArray) -> "Gravity":
-        """Return those of some members (n,), ascending, numbered by their place among these."""
-        _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
+    def of(self, images: IntArray) -> "Gravity":
+        """Return those of some images (n,), ascending, numbered by their place among these."""
+        _, rows, places = np.intersect1d(self.indices, images, assume_unique=True, return_indices=True)
         return Gravity(places, self.directions[rows], self.sigmas[rows])
 
     def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
@@ -141,3 +141,20 @@ class Gravity(NamedTuple):
         found, first = np.unique(frames[order], return_index=True)
         rows = order[first]
         return Gravity(found, turned[rows], self.sigmas[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Known:
+    """What a user tells of images beside the matches."""
+
+    priors: PositionPriors | None = None
+    control: ControlPoints | None = None
+    gravity: Gravity | None = None
+
+    def of(self, images: IntArray) -> "Known":
+        """Return what is told of some images (n,), ascending, numbered by their place among these."""
+        told = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Known(**{name: None if one is None else one.of(images) for name, one in told.items()})
+
+
+NOTHING_KNOWN = Known()

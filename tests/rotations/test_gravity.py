@@ -12,7 +12,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.pipeline.gravity import refine_with_gravity
+from sfm_shapefit.pipeline.components import refine_with_gravity
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.rotations.gravity import DOWN, down_of, judge_gravity
 from sfm_shapefit.scene.given import Gravity
@@ -86,7 +86,7 @@ def test_standard_deviations_are_relative_to_the_cameras_and_not_to_the_world_wh
 def test_one_gravity_says_too_little():
     problem, gravity, _ = drifting_chain(12)
     without = average_relative_rotations(12, problem.relative)
-    assert refine_with_gravity(without, problem.relative, gravity.among(np.array([3]))) is without
+    assert refine_with_gravity(without, problem.relative, gravity.of(np.array([3]))) is without
 
 
 def test_gravities_of_a_rig_are_those_of_its_frames():

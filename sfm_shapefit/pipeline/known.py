@@ -1,0 +1,144 @@
+"""What the user tells of images beside the matches: read before the work, and at its end what sets the axes.
+
+A further kind is a type of `scene.given`, a reader in `files`, what it does to a model in `placement`, and a
+line in each of the two functions here.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
+from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
+from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
+from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, off_by
+from sfm_shapefit.pipeline.seed import Seeded, turn_about_origin
+from sfm_shapefit.placement.control_points import (
+    control_gauge,
+    fit_control_points,
+    triangulate_control_points,
+)
+from sfm_shapefit.rotations.gravity import FEWEST_GRAVITIES, down_of, judge_gravity, turn_upright
+from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
+from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.options import StructureOptions
+
+PRIORS_OF_DATABASE = "database"
+"""In place of a table or folder: the database's own pose priors."""
+_NAMED = 3  # images; of more with a wrong gravity only the worst are named
+
+
+def read_known(
+    images: Images,
+    file: DatabaseFile | None,
+    priors: Path | str | None = None,
+    control_points: str = "",
+    gravity: str = "",
+) -> Known:
+    """Return what the user tells of images: position priors, control points, gravity, as far as asked for.
+
+    Raises:
+        InputError: if something is asked for and cannot be read, or there is none of these images.
+    """
+    return Known(
+        priors=None if priors is None else _read_priors(images, file, priors),
+        control=_read_control(images, control_points) if control_points else None,
+        gravity=_read_gravity(images, file, gravity) if gravity else None,
+    )
+
+
+class BroughtToKnown(NamedTuple):
+    """A model after what the user told has set its axes, and what is said of it."""
+
+    seeded: Seeded
+    control_points: tuple[ControlPoint, ...]
+    """A row for each control point."""
+    warnings: tuple[str, ...]
+
+
+def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool) -> BroughtToKnown:
+    """Return a model in scale and axes of control points, or with z up by gravity, where these are known.
+
+    Points that cannot tell scale and axes leave the model as it is, and so do all where the model is not to
+    move: they check its scale then.
+    """
+    rows, warnings = list[ControlPoint](), list[str]()
+    if known.control is not None:
+        seeded, rows, warnings = _bring_to_control_points(seeded, known.control, options, moves=moves)
+    if known.gravity is not None:
+        seeded, more = _turn_upright(seeded, known.gravity)
+        warnings += more
+    return BroughtToKnown(seeded, tuple(rows), tuple(warnings))
+
+
+def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:
+    if str(asked) == PRIORS_OF_DATABASE:
+        if file is None:
+            raise InputError("there is no database whose priors could be taken; give one with --database")
+        return database_priors(file, images)
+    return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
+
+
+def _read_control(images: Images, file: str) -> ControlPoints:
+    known = read_control_points(Path(file), images)
+    if reason := known.why_too_few():
+        raise InputError(f"{file}: {reason}")
+    return known
+
+
+def _read_gravity(images: Images, file: DatabaseFile | None, asked: str) -> Gravity:
+    if asked != GRAVITY_OF_DATABASE:
+        return table_gravity(Path(asked), images)
+    if file is None:
+        raise InputError("there is no database whose gravity could be taken; give a table")
+    return database_gravity(file, images)
+
+
+def _bring_to_control_points(
+    seeded: Seeded, known: ControlPoints, options: StructureOptions, *, moves: bool
+) -> tuple[Seeded, list[ControlPoint], list[str]]:
+    """Return a model in the world of control points, a row for each point, and what to warn of."""
+    found = triangulate_control_points(known, look_at_marks(seeded.images, known), options)
+    fit = fit_control_points(known, found.positions)
+    warnings = list(control_warnings(known, found, fit, seeded.images.names))
+    rows = control_rows(known, found, fit)
+    if isinstance(fit, str):
+        return seeded, rows, warnings
+    if not moves:
+        unused = (
+            f"control points were not used for the scale, which is that of {SETS_SCALE[seeded.gauge.scale]}"
+        )
+        checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
+        return seeded, checks, [*warnings, f"{unused}; {off_by(fit.motion.scale)}"]
+    return seeded.moved(fit.motion, control_gauge(seeded.gauge, known, fit)), rows, warnings
+
+
+def _turn_upright(seeded: Seeded, gravity: Gravity) -> tuple[Seeded, list[str]]:
+    """Return a model turned so that z points up, unless something else set its axes, and what to warn of."""
+    images, members = seeded.images, np.flatnonzero(seeded.images.is_posed)
+    rotations, own = images.rotations[members], gravity.of(members)
+    if len(own.indices) < FEWEST_GRAVITIES:
+        few = f"{len(own.indices)} of the placed images have a gravity, and two are needed"
+        return seeded, [f"{few} to turn the model upright"]
+    turn = turn_upright(down_of(rotations, own))
+    off, wrong = judge_gravity(rotations @ turn.T, own)
+    warnings = []
+    if wrong.any():
+        worst = np.flatnonzero(wrong)[np.argsort(-off[wrong], kind="stable")]
+        names = [images.names[members[own.indices[k]]] for k in worst[:_NAMED].tolist()]
+        warnings.append(
+            f"the gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no "
+            f"part: above all those of {', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"
+        )
+    if seeded.gauge.axes is not None:
+        return seeded, warnings
+    statement = f"{seeded.gauge.statement}; z up by {int(np.sum(~wrong))} of {len(wrong)} gravities"
+    return seeded.moved(
+        turn_about_origin(turn), replace(seeded.gauge, axes=turn, statement=statement)
+    ), warnings
