@@ -38,11 +38,11 @@ class AdjustedModel(Displayed):
     reconstruction: "pycolmap.Reconstruction"
     """A new one: ids, names and tracks are the input's, errors of points are updated."""
     frame_ids: tuple[int, ...]
-    """Of the frames with a pose, in the order of the problem and of the covariances."""
+    """Ids of the frames with a pose, in the order of the problem and of the covariances."""
     adjusted: Adjusted
     """The answer as arrays: costs, iterations, why it ended."""
     covariances: FrameCovariances | None
-    """Of the frames' centers and rotations, if they were asked for."""
+    """Covariances of the frames' centers and rotations, if they were asked for."""
 
     def summary(self) -> dict[str, Any]:
         """Return the main figures in plain values."""

@@ -125,7 +125,7 @@ def _measure_again(
 ) -> PairDirections:
     """Return the usable directions as they are at other rotations; the others, and what is said, stay.
 
-    Of images whose rotations were clearly wrong, and are `corrected`, it is what their matches say now.
+    Images whose rotations were clearly wrong, and are `corrected`, get what their matches say now.
     """
     usable = before.usable()
     others = np.delete(before.pairs, usable, axis=0)

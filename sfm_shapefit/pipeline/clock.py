@@ -23,7 +23,7 @@ class Clock:
     executor: Executor | None = None
     """Shares out pairs and tracks among its workers; None: all is done in this process."""
     threads: int = field(default_factory=SolverOptions().num_threads)
-    """Of this process."""
+    """Threads of this process."""
 
     @classmethod
     def of(

@@ -31,8 +31,8 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
     """Return the images with the intrinsics that first placements of all components find.
 
     Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
-    ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
-    in several components the one with most images counts.
+    ones among them; a placement that is wrong in places knows the focal length all the same. Where a
+    camera is in several components, the one with most images counts.
     """
     found: dict[int, tuple[float, ...]] = {}
     for _, members, averaging in run.average_images(relative, {}):

@@ -35,7 +35,7 @@ class ComponentAveraging(NamedTuple):
     options: AveragingOptions
     clock: Clock
     gravity: Gravity | None
-    """Of the frames."""
+    """Gravity in the axes of frames."""
     shares: Mapping[tuple[int, int], float]
     """The matched share of the overlap of pairs of frames, as far as it is known."""
 

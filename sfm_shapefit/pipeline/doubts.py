@@ -24,34 +24,32 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, RayMatches, join_rays
 
-# A pair of so few matches is never sound, see `RelativeRotations.are_sound`.
-_LEAST_MATCHES = 8
-# Robust weight as placed below which a pair is poor, and the share of a camera's matches in poor pairs that
-# makes the camera doubtful.
-_POOR = 0.9
-# The same, from which a pair of very many is first tried as it is given: no other pose fits as many matches.
-# On a made ring of 900 images, 1 % of the answers for right cameras are then off by more than 3.5 standard
-# deviations, of trials 10 %: these end beside the best pose. Pairs turned by 0.5 to 3 degrees keep up to 6 %
-# of the turn. On photographs (liberty-calibrated) some false pairs would be believed as they are given, so
-# that where pairs are fewer all are asked without prejudice. 0.7 is as good on two made rings and a facade.
+_LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
+_POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
+_DOUBTFUL_SHARE = 0.1  # share of a camera's matches in poor pairs; above, all pairs of the camera are asked
 _LIKELY = 0.6
-_DOUBTFUL_SHARE = 0.1
-# Pairs of each camera that are asked at most, those of most matches, and matches of a pair. Beyond 750 images
-# they are fewer, so that about so many are asked in all: a thousand take more than a second.
-# Measured on a made facade and a made ring of 900 images, 60 of them turned: 33 pairs of each camera leave
-# out the same cameras as all pairs; 15 and 6 do so on the facade, and on the ring one more, which is wrong.
+"""Robust weight of a pair as placed, from which a pair of very many is first tried as it is given: no other
+pose fits as many matches.
+
+On a made ring of 900 images, 1 % of the answers for right cameras are then off by more than 3.5 standard
+deviations, of trials 10 %: these end beside the best pose. Pairs turned by 0.5 to 3 degrees keep up to 6 % of
+the turn. On photographs (liberty-calibrated) some false pairs would be believed as they are given, so that
+where pairs are fewer all are asked without prejudice. 0.7 is as good on two made rings and a facade.
+"""
 _MOST_PAIRS = 40
-_MOST_ASKED = 30_000
-_FEWEST_PAIRS = 6
-_MOST_MATCHES = 150
-# Of the focal lengths: cameras that are asked at most; pairs, about, and of each camera at least; pairs of
-# each two cameras at most; matches of a pair at least and at most.
-_MOST_CAMERAS = 200
-_FOCAL_PAIRS, _FEWEST_FOCAL_PAIRS = 300, 8
-_PAIRS_OF_TWO = 60
-_FOCAL_MATCHES = (20, 60)
-# Within this angle a direction agrees with the solution, whatever its standard deviation.
-_AGREEING_DEG = 3.0
+"""Pairs of a camera that are asked at most, those with most matches; a thousand take more than a second.
+
+Measured on a made facade and a made ring of 900 images, 60 of them turned: 33 pairs of each camera leave out
+the same cameras as all pairs; 15 and 6 do so on the facade, and on the ring one more, which is wrong.
+"""
+_MOST_ASKED = 30_000  # pairs of all cameras together; beyond 750 images each camera has fewer for it
+_FEWEST_PAIRS = 6  # pairs of a camera, however many cameras there are; see `_MOST_PAIRS`
+_MOST_MATCHES = 150  # matches of a pair that are looked at; more hardly change its rotation
+_MOST_CAMERAS = 200  # lenses whose focal lengths are asked; beyond, the pairs of each are too few
+_FOCAL_PAIRS, _FEWEST_FOCAL_PAIRS = 300, 8  # pairs, about, in all and at least of each lens; for their time
+_PAIRS_OF_TWO = 60  # pairs of each two lenses; more of the same two say nothing new
+_FOCAL_MATCHES = (20, 60)  # matches of a pair, least and most; fewer decide nothing, more take time
+_AGREEING_DEG = 3.0  # degrees; a direction so near agrees with the solution, whatever its standard deviation
 
 
 def ask_pairs(

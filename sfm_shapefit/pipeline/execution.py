@@ -26,9 +26,8 @@ from sfm_shapefit.base.executors import Advance, Answer, WorkerError, answers
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 MATCHES_PER_TASK = 1_000_000
-"""About 1.5 seconds of work for directions, and 230 MB."""
-# Dask gives a task whose worker died to another so many times.
-_RETRIES = 3
+"""Matches of a task; about 1.5 seconds of work for directions, and 230 MB."""
+_RETRIES = 3  # times that dask gives a task to another worker; one that kills three is at fault itself
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,7 +28,7 @@ class FirstPlacement(NamedTuple):
     """What comes out of the adjustment of a first placement."""
 
     adjusted: Estimate
-    """Of the images that the first placement has, in any scale and from any origin."""
+    """Where an adjustment has the images that were placed, in any scale and from any origin."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
     as the others were on average."""

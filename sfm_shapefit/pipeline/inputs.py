@@ -27,7 +27,7 @@ class MatchSource:
 
     matches: Matches
     view: View
-    """Of these, but for the pairs that are left out."""
+    """How the images see them, but for the pairs that are left out."""
     inputs: Inputs
     """Where they come from."""
     economy: Economy = ECONOMIES[0]

@@ -14,8 +14,7 @@ from sfm_shapefit.scene.freedom import IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
 
-# A view graph that wants a focal length further off says more about the graph than about the lens.
-_MOST_OFF = 4.0
+_MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
 
 def settle_intrinsics(

@@ -52,7 +52,7 @@ class ToldOfJoins(NamedTuple):
     """What the user told of images of several models."""
 
     priors: PositionPriors | None = None
-    """Of the images; None: those of the database, if it has any."""
+    """Position priors of the images; None: those of the database, if it has any."""
     distances: Sequence[KnownDistance] = ()
     left_out: PairNames = frozenset()
     """Pairs of images whose matches say nothing."""

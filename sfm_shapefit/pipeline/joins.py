@@ -33,8 +33,7 @@ from sfm_shapefit.scene.matches import MatchBatch, View
 if TYPE_CHECKING:
     import pycolmap
 
-# A camera may miss a point of the other model by so many thresholds of reprojection errors: models drift.
-_WIDENING = 2.0
+_WIDENING = 2.0  # thresholds of reprojection errors by which a camera may miss the other model; models drift
 _NOTHING_IN_COMMON = "no pair of images and no position priors tie them together"
 
 
@@ -85,7 +84,7 @@ class _Between(NamedTuple):
     """Matches between images of two models."""
 
     images: IntArray
-    """(k, 2) of each match, that of the larger model first."""
+    """(k, 2) images of each match, that of the larger model first."""
     points: IntArray
     """(k, 2) ids of the points that its keypoints observe; -1 for none."""
     rays: FloatArray
@@ -123,11 +122,11 @@ class _Evidence:
         self.centers = np.full((images.num_images, 3), np.nan)
         self.rotations = np.full((images.num_images, 3, 3), np.nan)
         self.ids: list[IntArray] = []
-        """Of each image, the id of the point that each keypoint observes; -1 for none."""
+        """For each image, the id of the point that each keypoint observes; -1 for none."""
         for image, number in enumerate(self.model_of_image.tolist()):
             self.ids.append(self._observed(image, number) if number >= 0 else np.zeros(0, dtype=np.int64))
         self.by_priors: dict[int, PlacedByPriors | str | None] = {}
-        """Of each model that was asked; fitted once, whatever the number of models it is compared with."""
+        """Models on their priors, those that were asked; fitted once, with however many they are compared."""
         self.matches = self._read_matches(see(self.images.apart()))
 
     def _observed(self, image: int, number: int) -> IntArray:
@@ -305,7 +304,7 @@ class _Merging:
         self.reconstruction = reconstruction
         self.world_from = {number: Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))}
         self.joins: list[Joined] = []
-        # Of each model, the ids of its points here, by those in the model where they are others.
+        # For each model: the new ids of its points, by their old ones, where they are others.
         self.ids: dict[int, dict[int, int]] = {number: {}}
 
     def add(self, done: Joined, model: MappedModel, same_points: list[tuple[int, int]]) -> None:

@@ -26,9 +26,9 @@ from sfm_shapefit.pipeline.joined import ToldOfJoins
 from sfm_shapefit.pipeline.joins import JoinedModels, join_models
 from sfm_shapefit.pipeline.map_run import MapRun, start_run
 
-# Of the images: where so many have intrinsics in doubt, the relative rotations are measured twice. Fewer are
-# found with the poses, which the others hold; their pairs do not decide the averaging.
 _MANY_DOUBTED = 0.25
+"""Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
+with the poses, which the others hold, and their pairs do not decide the averaging."""
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 

@@ -35,8 +35,7 @@ from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames, View
 
-# Pairs: the shares of more would cost more than they are worth, 0.2 ms a pair and 16 bytes a match.
-_MOST_SCORED_PAIRS = 20_000
+_MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match
 
 
 def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None) -> "MapRun":
@@ -83,7 +82,7 @@ class MapRun(NamedTuple):
     without: PairNames
     """Pairs that are taken for unmatched."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
-    """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
+    """Scores of pairs with a relative rotation: by triangles, and the matched share of their overlap."""
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""

@@ -25,8 +25,7 @@ from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, j
 from sfm_shapefit.tracks.options import NodeOptions
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
-# Beyond so many pairs standard deviations take the pairs as independent.
-_MAX_SAMPLED_PAIRS = 100_000
+_MAX_SAMPLED_PAIRS = 100_000  # pairs; beyond, standard deviations take them as independent, for memory
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -37,10 +36,10 @@ _ADVICE = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Measured:
-    """What one pass over the matches tells."""
+    """What one pass over the matches yields."""
 
     directions: PairDirections
-    """Of all pairs."""
+    """Directions of all pairs, usable or not."""
     tracks: Tracks | None = None
     """Points seen by three cameras or more, which may become nodes; None where they were not asked for."""
     errors: list[FloatArray] | None = None
@@ -161,7 +160,7 @@ def build_graph(images: Images, measured: Measured) -> MeasuredGraph:
 
 
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:
-    """Return what there is to do, as far as it is known once the directions are measured."""
+    """Return the work to do, as far as it is known once the directions are measured."""
     usable = directions.usable()
     is_sampled = source.economy.samples and len(usable) <= _MAX_SAMPLED_PAIRS
     return replace(

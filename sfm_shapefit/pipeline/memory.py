@@ -29,23 +29,16 @@ from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method
 from sfm_shapefit.solver.splitting.linear import predict_factor
 
-_MB = 1e6
-# The interpreter with all that `locate` imports.
-_STARTED_BYTES = 195e6
-# Compiled code, thread pools, pages of the database.
-_KERNELS_BYTES = 50e6
-# Of a keypoint of the input: while it is read, afterwards, and once only the colors of its points are left.
+_MB = 1e6  # bytes; as users count them
+_STARTED_BYTES = 195e6  # bytes; the interpreter with all that `locate` imports
+_KERNELS_BYTES = 50e6  # bytes; compiled code, thread pools, pages of the database
 _READ_BYTES, _MODEL_BYTES, _COLOR_BYTES = 95.0, 55.0, 8.0
-# Samples of each direction error, two numbers each.
-_SAMPLES = 96
-# Entries of a block of the factor.
-_BLOCK = 9
-# Observations of points that are adjusted, for each match, where keypoints are more: .45 to .66 on real sets.
-_OBSERVATIONS_OF_A_MATCH = 0.7
-# Of an observation: its track, and its part of the normal equations.
-_OBSERVATION_BYTES = 620.0
-# Unknowns of an adjusted camera, and up to how many of them their system is dense.
-_UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
+"""Bytes of a keypoint of the input: while it is read, afterwards, and once only its point's color is left."""
+_SAMPLES = 96  # samples of each direction's error; two numbers each, see `judgement.correlated_errors`
+_BLOCK = 9  # entries of a block of the factor; three coordinates by three
+_OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
+_OBSERVATION_BYTES = 620.0  # bytes of an observation; its track, and its part of the normal equations
+_UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 _FRUGAL = Reading(batch=50_000, rays_bytes=50_000_000, keeps=False)
 
@@ -56,7 +49,7 @@ class Workload:
 
     num_images: int
     num_keypoints: int
-    """Of all images."""
+    """Keypoints of all images."""
     num_pairs: int
     num_matches: int
     num_edges: int
@@ -154,7 +147,7 @@ def keep_within_memory(
 
     Args:
         measured: graph to be placed.
-        describe: returns what there is to do with a graph.
+        describe: returns the work that a graph makes.
         limit_mb: peak memory in MB to stay below.
         least: what is given up already.
 
@@ -171,9 +164,9 @@ def keep_within_memory(
 def describe_work(
     measured: MeasuredGraph, work: Workload, placement: PlacementOptions, freedom: FreedomOptions
 ) -> Workload:
-    """Return what there is to do once the graph is known: its factor is planned, nothing is solved.
+    """Return the work that is left once the graph is known: its factor is planned, nothing is solved.
 
-    `work` is what there is to do but for the graph.
+    `work` is all of it but for the graph.
     """
     graph, entries = measured.graph, 0
     needs_factor = measured.groups is not None

@@ -27,7 +27,7 @@ from sfm_shapefit.solver.options import OnIteration
 if TYPE_CHECKING:
     import pycolmap
 
-MAX_ROTATION_ERROR_DEG = 10.0
+MAX_ROTATION_ERROR_DEG = 10.0  # degrees; pairs off by more are taken for false, as 1DSfM does
 
 
 def place(

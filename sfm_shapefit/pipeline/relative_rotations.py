@@ -24,8 +24,7 @@ from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.scene.matches import View
 from sfm_shapefit.solver.options import SolverOptions
 
-# About a second of work, be they many pairs of few matches or few of many.
-_MATCHES_PER_TASK = 100_000
+_MATCHES_PER_TASK = 100_000  # matches; about a second of work, be they of many pairs or of few
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

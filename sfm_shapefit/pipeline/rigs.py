@@ -31,8 +31,7 @@ from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
-# Extent of the fixed centers, of their distance from the origin, that counts as none.
-_COINCIDENT = 1e-9
+_COINCIDENT = 1e-9  # extent of fixed centers over their distance from the origin; less is rounding
 
 
 class Rigid(NamedTuple):
@@ -122,7 +121,7 @@ def place_cameras(
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
-    hand_back_memory()  # of what the graph was made of
+    hand_back_memory()  # what the graph was made of is gone
     placed = partial(place_pieces, options=options, near=near, on_iteration=clock.iteration)
     if measured.groups is None or not measured.num_points or nodes.points == "always":
         yield from placed(measured)

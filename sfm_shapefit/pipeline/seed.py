@@ -28,8 +28,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import filter_points
 
-# Fewer trusted cameras are no result.
-_FEWEST_KEPT = 3
+_FEWEST_KEPT = 3  # trusted cameras; fewer are no result, so that all are kept then
 
 
 class Seeded(NamedTuple):
@@ -83,7 +82,7 @@ def seed_points(stand: Stand, kept: BoolArray, options: PlacingOptions, clock: C
     """
     source, fixed = stand.source, stand.given.fixed_frames
     images, points, adjusted = _make_points(stand, kept, options, clock)
-    hand_back_memory()  # of the links, before their matches are read again
+    hand_back_memory()  # the links are gone, and their matches are read again
     seen = images_of_few_points(points, images, options.structure.min_points_per_image, fixed)
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)

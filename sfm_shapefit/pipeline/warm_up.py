@@ -70,8 +70,7 @@ FURTHER = (
 
 # Kernels of these rooms are compiled by further examples only, all but one.
 _ROOMS_OF_FURTHER = ("rotations", "synthetic")
-# Each process takes 300 MB.
-_MOST_PROCESSES = 8
+_MOST_PROCESSES = 8  # processes; each takes 300 MB
 _KERNEL = re.compile(r"^@kernel\s+def (\w+)", re.MULTILINE)
 
 
@@ -89,16 +88,16 @@ class WarmUp:
     """A sentence for each example that failed."""
 
 
-def warm_up(examples: Sequence[str], tell: Tell | None = None) -> WarmUp:
+def warm_up(examples: Sequence[str], report: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
     Args:
         examples: names of functions of `pipeline.examples`.
-        tell: called when a kernel is ready.
+        report: called whenever a kernel is ready.
     """
     if not examples:
         return WarmUp(0, ())
-    tell = tell or (lambda _done, _total: None)
+    report = report or (lambda _done, _total: None)
     expected, ready = _kernels(set(examples) <= set(NEEDED)), set[str]()
     failures = []
     for heard in _run(examples, min(num_cores(), len(examples), _MOST_PROCESSES)):
@@ -106,20 +105,20 @@ def warm_up(examples: Sequence[str], tell: Tell | None = None) -> WarmUp:
             failures.append(str(heard))
         else:
             ready.add(heard)
-            tell(len(ready & expected), len(expected))
+            report(len(ready & expected), len(expected))
     if not failures:
-        tell(len(expected), len(expected))
+        report(len(expected), len(expected))
     return WarmUp(len(ready), tuple(failures))
 
 
 @contextmanager
-def compile_together(tell: Tell, say: Callable[[str], None]) -> Iterator[None]:
+def compile_together(report: Tell, say: Callable[[str], None]) -> Iterator[None]:
     """Let the processes of a warm-up compile what the block misses; alone it compiles what they leave.
 
     There is no warm-up on a single core, nor where there was one already, as it would find nothing to do.
 
     Args:
-        tell: called when a kernel is ready.
+        report: called whenever a kernel is ready.
         say: told why the kernels of a wheel do not serve, if they do not.
     """
 
@@ -130,7 +129,7 @@ def compile_together(tell: Tell, say: Callable[[str], None]) -> Iterator[None]:
         if missing and num_cores() > 1:
             # Where no process can be started, as where memory is short, all is compiled here.
             with suppress(OSError, MemoryError), counted_as_compiling():
-                warm_up(missing, tell)
+                warm_up(missing, report)
 
     with on_miss(act):
         yield

@@ -42,7 +42,7 @@ REQUIRED_FILES = ("cameras", "images", "points3D")
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; a wrong one does not."""
 
-_NO_POINT = np.uint64(2**64 - 1)
+_NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 _U64 = struct.Struct("<Q")
@@ -55,14 +55,14 @@ _POSE = struct.Struct("<7d")
 _FRAME = struct.Struct("<II7dI")
 _FRAME_DATA = struct.Struct("<iIQ")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
-_POINT3D_BYTES = 51  # id 8, xyz 24, rgb 3, error 8, track length 8
-_TRACK_ELEMENT_BYTES = 8
+_POINT3D_BYTES = 51  # bytes of a point; id 8, xyz 24, rgb 3, error 8, track length 8
+_TRACK_ELEMENT_BYTES = 8  # bytes of an observation; image 4, keypoint 4
 
 
 def check_model_files(folder: Path) -> None:
     """Refuse a model folder that pycolmap must not be given.
 
-    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads. It
+    Where a folder holds both formats, the binary one is checked, since pycolmap reads that. It
     must have cameras, images and points3D, and either both or none of rigs and frames.
 
     Raises:

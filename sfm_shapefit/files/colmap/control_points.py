@@ -28,7 +28,7 @@ from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.given import ControlPoints, Datum, MarkedViews
 from sfm_shapefit.scene.images import Images
 
-_LARGEST = 1e30
+_LARGEST = 1e30  # units; squares of squares of larger coordinates overflow
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
 _LOCAL = {"local", "enu"}
 _GEODETIC = re.compile(r"(epsg:4326|epsg:4979|wgs84|.*\+proj=(latlong|longlat)\b.*)")

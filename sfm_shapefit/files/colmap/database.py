@@ -24,11 +24,11 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, RelativePoses, View
 
-_KEYPOINT_BITS = np.uint64(32)
-_KEYPOINT_MASK = np.uint64(2**32 - 1)
+_KEYPOINT_BITS = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
+_KEYPOINT_MASK = np.uint64(2**32 - 1)  # bits of the second keypoint; the first stands above them
 
-# Of COLMAP's configurations these are not verified (0, 1, 7), a pure rotation (5), or several motions (8).
 _CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
+"""COLMAP's configurations without a direction: not verified (0, 1, 7), a pure turn (5), several motions (8)."""
 
 # Stored translations are 1, or of the scene's size; shorter ones mean "none".
 _MIN_TRANSLATION = 1e-12
@@ -135,7 +135,7 @@ class DatabaseMatches(Matches):
         stored = np.frombuffer(self._stored_matches(chosen), dtype="<u4").reshape(-1, 2).astype(np.uint64)
         swapped = np.repeat(self.rows.swapped[chosen], counts)
         first, second = np.where(swapped, stored.T[::-1], stored.T)
-        # Of two keypoints one number is made, for numbers are sorted several times faster than rows.
+        # A match is made one number, for numbers are sorted several times faster than rows.
         both = first << _KEYPOINT_BITS | second
         ends = np.cumsum(counts)
         for begin, end in zip((ends - counts).tolist(), ends.tolist(), strict=True):
@@ -231,7 +231,7 @@ class DatabasePart:
     """Some pairs of a view, and all that is needed to read them elsewhere: see `MatchPart`."""
 
     path: Path
-    """Of the database, absolute, the same for all workers."""
+    """Absolute path of the database; it must be the same for all workers."""
     rows: PairRows
     """Where in it the pairs are: to find that out anew takes longer, the more pairs the database has."""
     images: Images

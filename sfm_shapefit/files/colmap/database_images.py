@@ -20,8 +20,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.files.colmap.template import FrameHead, Template
 from sfm_shapefit.scene.images import Frames, Images
 
-# No image has a side of so many pixels.
-_LARGEST_SIDE = 2**31
+_LARGEST_SIDE = 2**31  # pixels; no image has such a side, so that the row is damaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,7 +21,7 @@ MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
 
 NO_ID = 2**32 - 1
-"""COLMAP's ids are 32-bit, and this one is none."""
+"""Id of nothing; COLMAP's ids are 32-bit, and this one is none."""
 
 # COLMAP's TwoViewGeometryConfiguration; what these list is not verified: undefined, degenerate, watermark.
 _CONFIGS_WITHOUT_MATCHES = (0, 1, 7)

@@ -23,8 +23,8 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.scene.images import Sensors
 from sfm_shapefit.scene.lens import Lens
 
-_CAMERA = 0
-_POSE_BYTES = 7 * 8
+_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
+_POSE_BYTES = 7 * 8  # bytes of a pose; a quaternion and a translation in doubles
 
 
 class InFrame(NamedTuple):

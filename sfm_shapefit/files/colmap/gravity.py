@@ -16,10 +16,10 @@ from sfm_shapefit.files.lines import is_number, lines_of_cells
 from sfm_shapefit.scene.given import Gravity
 from sfm_shapefit.scene.images import Images
 
-_SIGMA_DEG = 1.0
-# No instrument is as exact, and beside a gravity that is, the pairs' share of the system drowns in rounding.
+_SIGMA_DEG = 1.0  # degrees; that of a phone, where the table states none
 _LEAST_SIGMA_DEG = 1e-3
-_LARGEST = 1e30
+"""Degrees; no instrument is as exact, and beside such a gravity the pairs' share drowns in rounding."""
+_LARGEST = 1e30  # units; squares of squares of larger coordinates overflow
 _FORM = "the name of an image, three components of its gravity and at most a standard deviation in degrees"
 
 

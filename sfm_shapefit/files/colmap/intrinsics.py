@@ -1,10 +1,9 @@
 """Intrinsics that were never measured: which they are, and focal lengths of them from the view graph.
 
 COLMAP sets a focal length to 1.2 times the larger side of the image where it knows none, and to that of the
-EXIF data where there is one; the database says of the first that it is no prior. Of the second it says that
-it is one, but such a camera has never been calibrated either: its distortion is 0 in a model that has some,
-and its principal point the very middle of the image. Where most cameras of a database were calibrated, all
-were.
+EXIF data where there is one. The database calls the second a prior, but such a camera has never been
+calibrated either: its distortion is 0 in a model that has some, and its principal point the very middle of
+the image. Where most cameras of a database were calibrated, all were.
 
 A fundamental matrix knows the focal lengths of its two images (Fetzer, Reisert, Kanatani, "Stable intrinsic
 auto-calibration from fundamental matrices of devices with uncorrelated camera parameters", WACV 2020).
@@ -45,22 +44,20 @@ _FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}
 _DISTORTION_SIGMAS = {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
 # COLMAP's TwoViewGeometryConfiguration: essential or fundamental matrix, not a homography.
 _WITH_DEPTH = (2, 3)
-# A camera needs so many pairs with depth, and such a share of all of its pairs.
-_FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3
+_FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3  # pairs of a camera with depth, and their share; fewer say nothing
 # Pairs of most matches that take part: 100 bytes each, and the time is in proportion to them.
 _MOST_PAIRS = 50_000
-# Of the factors that pycolmap finds: it adds up in the order in which its threads end, so the thirteenth
-# digit differs from run to run, and an adjustment from there in more.
 _DIGITS = 8
-# Of unit rays: what makes relative rotations worth measuring anew.
-_SAME_RAYS = 0.01
+"""Digits of the factors that pycolmap finds which are kept: it adds up in the order in which its threads end,
+so the thirteenth digit differs from run to run, and an adjustment from there in more."""
+_SAME_RAYS = 0.01  # difference of unit rays; more makes relative rotations worth measuring anew
 
 
 class Uncalibrated(NamedTuple):
     """A camera that was never calibrated."""
 
     origin: Origin
-    """Of its intrinsics."""
+    """Where its intrinsics come from."""
     database_id: int
     """Its id in the database."""
 
@@ -147,7 +144,7 @@ def calibrate_view_graph(
         left_out: pairs of images that say nothing.
 
     Returns:
-        Of the cameras whose pairs can tell.
+        The factors of those cameras whose pairs determine one.
 
     Raises:
         InputError: if the database cannot be read.

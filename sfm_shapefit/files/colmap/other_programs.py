@@ -14,8 +14,8 @@ from sfm_shapefit.scene.posed_model import Intrinsics, PosedModelFile, model_of_
 def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reconstruction:
     """Return a scene as a new reconstruction: cameras and images from id 1 on, a frame for each image.
 
-    Points seen by fewer than two images are left out. Of several observations of a point in one image the
-    first counts.
+    Points seen by fewer than two images are left out. If an image observes a point several times, the first
+    observation counts.
 
     Raises:
         InputError: if a name stands twice, or a camera is refused by pycolmap; `label` names the file.

@@ -17,7 +17,7 @@ class SeenColors(NamedTuple):
     """What an image sees of colored points."""
 
     digest: bytes
-    """Of the coordinates of all its points2D: another model's are the same if it has the same."""
+    """Digest of the coordinates of all its points2D: another model's are the same if it has the same."""
     keypoints: Int32Array
     """(k,) indices of the points2D that observe a point, ascending."""
     points: Int32Array
@@ -29,7 +29,7 @@ class PointColors:
     """The colors of a model's points, and the images that see them."""
 
     colors: npt.NDArray[np.uint8]
-    """(p, 3) of the points, ascending by id."""
+    """(p, 3) colors of the points, ascending by id."""
     images: Mapping[int, SeenColors]
     """By the ids of the images; of a model without any color, none."""
 

@@ -21,15 +21,13 @@ from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 
-_WGS84, _CARTESIAN = 0, 1
-_SENSOR_IS_CAMERA = 0
+_WGS84, _CARTESIAN = 0, 1  # coordinate system of a prior; the numbers are COLMAP's
+_SENSOR_IS_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
 """What joins pose priors to their images, of databases whose priors may be of other sensors too."""
-# A row has name and position, and no standard deviation, one or three.
-_TABLE_COLUMNS = (4, 5, 7)
+_TABLE_COLUMNS = (4, 5, 7)  # cells of a row; a name, a position, and no, one or three standard deviations
 _GEODETIC_NAMES = {"lat", "latitude"}
-# Sums of squares of squares of coordinates and standard deviations must not overflow.
-_LARGEST = 1e30
+_LARGEST = 1e30  # units; sums of squares of squares of larger coordinates or sigmas overflow
 
 
 class MissingPriorsError(InputError):
@@ -48,7 +46,7 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     index_of_name = {name: index for index, name in enumerate(images.names)}
     selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
     by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
-    # Of each version of the schema, the newest first, by the columns that it has.
+    # One for each version of the schema, the newest first, by the columns that it has.
     queries = {
         ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, PRIORS_OF_IMAGES),
         ("image_id", covariances): selected.format(covariances, by_image),

@@ -18,8 +18,7 @@ from contextvars import ContextVar
 
 import pycolmap
 
-# This is glog's level FATAL.
-_QUIET = 3
+_QUIET = 3  # level of the log; glog calls it FATAL
 _heard = ContextVar("pycolmap_is_heard", default=False)
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import IntArray, UInt32Array
 
 MATCH_BYTES = 8
-"""Of a match that is kept."""
+"""Bytes of a match that is kept; two keypoints of 32 bits."""
 
 MOST_MATCHES = 64_000_000
-"""Of a database with more, in 0.5 GB, none is kept: all are read from the file each time."""
+"""Matches of a database, 0.5 GB; of more none is kept, and all are read from the file each time."""
 
 
 class SortedMatches:

@@ -25,15 +25,14 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import refuse_irregular_file
 
 _SIDECARS = ("-wal", "-journal")
-# Bytes 18 and 19 of the header say so.
-_WAL_VERSION = 2
-_LOCK_TIMEOUT_S = 2.0
-_COPY_ATTEMPTS = 3
+_WAL_VERSION = 2  # bytes 18 and 19 of the header; they are 2 where the file has a write-ahead log
+_LOCK_TIMEOUT_S = 2.0  # seconds; another program that writes is waited for so long
+_COPY_ATTEMPTS = 3  # copies; a file that changes during each of them is in use
 
 # A database may come from anywhere: what no query of ours needs is not allowed.
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: 2**29,  # bytes of a value or a row; 20 million keypoints, 67 million matches
-    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,  # of the schema's statements too
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,  # bytes of a statement; those of the schema count
     sqlite3.SQLITE_LIMIT_COLUMN: 100,
     sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 20,
     sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 3,
