@@ -47,7 +47,7 @@ from sfm_shapefit.base import jit
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sfm_shapefit"
 GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "rigidity": (("rigidity/*.py",), ("rigidity",)),
+    "rigidity": (("graph/rigidity/*.py",), ("rigidity",)),
     "certificate": (("solver/certificate.py",), ("certificate", "exact_certificate", "solver")),
     "newton": (("solver/newton/*.py",), ("newton", "exact_certificate", "solver")),
     "splitting": (("solver/splitting/*.py",), ("splitting", "certificate", "exact_certificate")),

@@ -1,7 +1,8 @@
 """The cases of `answers`: a name by meaning, which stays, and a command line in the folder of the inputs.
 
-Command lines are spelled as in 82dd265; `answer_spellings` says how they are spelled in other checkouts. A
-case whose output has a truth is followed by others that read that output. Of large sets only defaults run.
+A word KEY=VALUE of a command line becomes a key of --config. A checkout that knows other words is recorded by
+its own scripts, under the same names. A case whose output has a truth is followed by others that read that
+output. Of large sets only defaults run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,33 +36,28 @@ class Case(NamedTuple):
     """Cases that read its output, run after it."""
     quick: bool = False
 
-    @property
-    def is_verbatim(self) -> bool:
-        """Whether its words may be unknown: the refusal is the answer."""
-        return self.name.startswith("wrong/")
-
 
 _PLACEMENT = {
-    "shapefit": "--objective shapefit",
-    "lud": "--objective lud",
-    "newton": "--solver newton",
-    "admm": "--solver admm",
-    "unrefined": "--no-refine",
-    "small-factor": "--factor-memory-mb 1",
-    "loose-gap": "--tol 1e-5",
+    "shapefit": "objective=shapefit",
+    "lud": "objective=lud",
+    "newton": "solver=newton",
+    "admm": "solver=admm",
+    "unrefined": "refine=false",
+    "small-factor": "factor_memory_mb=1",
+    "loose-gap": "tol=1e-5",
 }
 """Variants that `locate` and `place` have in common."""
 
 _FROM_PRIORS = {
     "priors": "--priors scenes/{scene}/priors.txt",
-    "priors-pull": "--priors scenes/{scene}/priors.txt --refine-with-priors",
+    "priors-pull": "--priors scenes/{scene}/priors.txt",
     "gps": "--priors scenes/{scene}/gps.csv",
-    "gps-pull": "--priors scenes/{scene}/gps.csv --refine-with-priors",
+    "gps-pull": "--priors scenes/{scene}/gps.csv",
     "control": "--control-points scenes/{scene}/control.txt",
-    "control-adjusted": "--control-points scenes/{scene}/control.txt --bundle-adjust",
+    "control-adjusted": "--control-points scenes/{scene}/control.txt --adjust full",
     "distance": "--known-distance 0001.jpg 0003.jpg 2.5",
     "distances": "--known-distance 0001.jpg 0003.jpg 2.5 --known-distance 0002.jpg 0005.jpg 3.5",
-    "database-priors": "--scale prior",
+    "database-priors": "--priors database",
 }
 """Variants whose scale is told."""
 
@@ -70,12 +66,12 @@ _BOTH = {
     "all-trusted": "--min-trust 0",
     "points-never": "--points never",
     "points-always": "--points always",
-    "unadjusted": "--no-adjust",
-    "adjusted": "--bundle-adjust",
-    "lenses-held": "--refine-intrinsics none",
-    "lenses-focal": "--refine-intrinsics focal",
-    "lenses-all": "--refine-intrinsics all --bundle-adjust",
-    "sensors-free": "--refine-rigs --bundle-adjust",
+    "unadjusted": "--adjust none",
+    "adjusted": "--adjust full",
+    "lenses-held": "--intrinsics held",
+    "lenses-focal": "--intrinsics focal",
+    "lenses-all": "--intrinsics all --adjust full",
+    "sensors-free": "--rigs free --adjust full",
     "without-pairs": "--without scenes/{scene}/pairs.txt",
     "unit": "--scale unit",
     "one-thread": "--threads 1",
@@ -90,17 +86,17 @@ _LOCATE = {
     **_BOTH,
     "input-scale": "--scale input",
     "rotations-free": "--rotations free",
-    "rotations-held": "--rotations measured",
-    "rotations-sigma": "--rotation-sigma-deg 0.5",
-    "tracks": "--directions tracks",
-    "tracks-adjusted": "--directions tracks --bundle-adjust",
+    "rotations-held": "--rotations held",
+    "rotations-sigma": "--rotations 0.5",
+    "tracks": "directions=tracks",
+    "tracks-adjusted": "directions=tracks --adjust full",
     "config": "--config told.toml",
     "fixed-names": "--fix scenes/{scene}/fixed.txt",
-    "fixed-names-adjusted": "--fix scenes/{scene}/fixed.txt --bundle-adjust",
+    "fixed-names-adjusted": "--fix scenes/{scene}/fixed.txt --adjust full",
     "fixed-solved": "--fix solved",
-    "fixed-solved-adjusted": "--fix solved --bundle-adjust",
-    "fixed-solved-shapefit": "--fix solved --objective shapefit",
-    "thresholds": "--min-inliers 40 --inlier-threshold-px 1 --max-reprojection-error-px 2",
+    "fixed-solved-adjusted": "--fix solved --adjust full",
+    "fixed-solved-shapefit": "--fix solved objective=shapefit",
+    "thresholds": "min_inliers=40 inlier_threshold_px=1 max_reprojection_error_px=2",
 }
 _NOT_OF_ALL = {"sensors-free", "database-priors", "gps", "gps-pull", "tracks-adjusted"}
 _NOT_OF_ALL |= {"fixed-solved-adjusted", "fixed-solved-shapefit", "all-trusted"}
@@ -136,8 +132,8 @@ _LOCATED = {
 
 _MAP = {
     **_BOTH,
-    "shapefit": "--objective shapefit",
-    "many-matches": "--min-matches 30",
+    "shapefit": "objective=shapefit",
+    "many-matches": "min_matches=30",
     "large-models": "--min-model-size 20",
     "few-points-kept": "--min-points-per-image 0",
     "gravity": "--gravity scenes/{scene}/gravity.txt",

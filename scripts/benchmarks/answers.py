@@ -41,7 +41,6 @@ import pycolmap
 from benchmarks.answer_cases import BUNDLED, Case, all_cases
 from benchmarks.answer_differences import compare, compare_use, report
 from benchmarks.answer_inputs import MADE, MADRID, make_inputs
-from benchmarks.answer_spellings import Spelling
 from harness.driver import DATA, ROOT
 from harness.process import thread_environment
 
@@ -64,6 +63,7 @@ json.dump([code, used.ru_maxrss * 1024 / 1e6, used.ru_utime + used.ru_stime], op
 A process's peak, as the system tells it, begins with that of its parent, which is therefore a small process.
 """
 _PAIR_COLUMNS = {"name1", "name2", "support", "residual_deg", "verdict", "reason"}
+_KEY = re.compile(r"[a-z_]+=")
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
 _BORDERS = re.compile(r"[\s\u2500-\u257f|+]+")
 _MODEL_FILES = {f"{stem}.txt" for stem in ("cameras", "images", "points3D", "rigs", "frames")}
@@ -87,7 +87,6 @@ class Runner:
 
     def __init__(self, package: Path, work: Path) -> None:
         self.package, self.work = package, work
-        self.spelling = Spelling(self._help)
 
     def ask(self, case: Case) -> dict[str, Answer]:
         """Return the answers of a case and of those that follow it, by name."""
@@ -100,14 +99,12 @@ class Runner:
         return answers
 
     def _answer(self, case: Case) -> Answer:
-        spelled = self.spelling.spell(case.argv) if case.argv and not case.is_verbatim else (case.argv, {})
-        if spelled is None:
-            return {"skipped": "its words are not known to this checkout"}
-        words, keys = spelled
+        words = [word for word in case.argv if not _KEY.match(word)]
+        keys = [word.partition("=") for word in case.argv if _KEY.match(word)]
         if keys:
             told = self.work / f"told-{case.name.replace('/', '-')}.toml"
-            told.write_text("".join(f"{key} = {_toml(value)}\n" for key, value in keys.items()))
-            words = [*words, "--config", told.name]
+            told.write_text("".join(f"{key} = {_toml(value)}\n" for key, _, value in keys))
+            words += ["--config", told.name]
         start = time.perf_counter()
         run = self.run([sys.executable, "-m", "sfm_shapefit.cli", *words])
         said = [line for line in run.stderr.splitlines() if line.strip()]
@@ -159,10 +156,6 @@ class Runner:
                 process.communicate()
                 return Run("timeout", "", "", math.nan, math.nan)
         return Run("timeout" if code == -signal.SIGXCPU else code, stdout, stderr, memory_mb, cpu_s)
-
-    def _help(self, words: list[str]) -> str:
-        run = self.run([sys.executable, "-m", "sfm_shapefit.cli", *words])
-        return run.stdout if run.code == 0 else ""
 
     def check(self) -> None:
         """Refuse if another package than that of the checkout would run."""

@@ -86,12 +86,12 @@ BENCHMARK = Benchmark(
         " warmed up first, so that nothing is compiled while the clock runs. Graphs: our best answer has the"
         f" lowest error, and takes {on_graphs.FASTER:g} times less CPU time than the fastest peer of equal or"
         " lower error, if any. Scenes: by default `locate` has a median and a mean error at most 5 % above"
-        " the lowest of the peers' positions; mapping, which ends with bundle adjustment, is only shown."
+        " the lowest of the peers' positions. What mapping reaches, `map` measures."
     },
     columns={
         "error": "1 on graphs, both centered and of unit norm; the set's on scenes, median / mean / max after"
         " L1 alignment",
-        "seconds (CPU)": "of the call that turns directions, tracks or (mapping) a database into positions;"
+        "seconds (CPU)": "of the call that turns directions or tracks into positions;"
         " for `locate`, wall-clock of placing and judging, for positioning without its tracks",
         "peak MB": "10^6 bytes; resident, of the whole process while the clock ran",
     },

@@ -1,4 +1,4 @@
-"""pycolmap: GLOMAP's global positioning at given rotations, whole mappings, and rotation averaging.
+"""pycolmap: GLOMAP's global positioning at given rotations, and whole mappings.
 
 pycolmap binds the positioning itself (`run_global_positioning`: camera-to-point directions of all tracks,
 from random positions) but not the track building before it. Tracks are built here the same way: components of
@@ -27,8 +27,6 @@ import numpy.typing as npt
 import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-
-from sfm_shapefit.files.colmap.quiet import quiet_log
 
 MIN_VIEWS = 3
 MAX_SPREAD_PX = 10.0
@@ -139,33 +137,6 @@ def map_database(
     if not models:
         raise RuntimeError(f"pycolmap.{function.__name__} made no model")
     return max(models.values(), key=lambda model: model.num_reg_images()), seconds
-
-
-def average_rotations(database: Path, model: Path, min_num_matches: int = 15) -> pycolmap.Reconstruction:
-    """Return a model of the images of `model` with rotations averaged by pycolmap, and centers 0.
-
-    The relative rotations are those that COLMAP's geometric verification stored for the pairs; intrinsics
-    are those of `model`, so that runs on averaged and on given rotations differ in the rotations only.
-    Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in
-    GLOMAP.
-
-    Raises:
-        RuntimeError: if pycolmap reports that the averaging failed.
-    """
-    with quiet_log():
-        reconstruction, _, pose_graph = _read(database, min_num_matches)
-        # The intrinsics are wanted; the rotations are estimated anew.
-        take_rotations(reconstruction, pycolmap.Reconstruction(str(model)))
-        keep_frames(reconstruction, ())
-        settings = pycolmap.RotationEstimatorOptions()
-        settings.random_seed = 0
-        if not pycolmap.run_rotation_averaging(settings, pose_graph, reconstruction, []):
-            raise RuntimeError("pycolmap.run_rotation_averaging reports failure")
-    for image_id in reconstruction.reg_image_ids():
-        image = reconstruction.image(image_id)
-        pose = pycolmap.Rigid3d(image.cam_from_world().rotation, np.zeros(3))
-        reconstruction.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-    return reconstruction
 
 
 def _read(

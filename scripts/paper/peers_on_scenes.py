@@ -2,14 +2,12 @@
 
 pytheia and gtsam get the directions that `locate` measures, all of its rigid piece, with the same rotations
 and before any bundle adjustment. pycolmap's global positioning gets the same rotations and intrinsics and the
-tracks of the same matches, in the three settings of `colmap_peer`; its global mapping gets the database,
-averages rotations itself and ends with bundle adjustment, in two settings. Ours stands twice: from the same
+tracks of the same matches, in the three settings of `colmap_peer`. Ours stands twice: from the same
 directions alone, all cameras kept, and as `locate` does it by default, with points as nodes and without the
 cameras it does not trust. Every contender runs in its own fresh process, on one thread, once; errors are
 taken after robust alignment to the truth, over the cameras that the contender places.
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -33,8 +31,7 @@ EQUAL = 1.05
 """Differences below count as equal: the truth is no better."""
 SAME_DIRECTIONS, BY_DEFAULT = "ours, the same directions", "ours, `locate` by default"
 SAME_OPTIONS: dict[str, Any] = {"threads": 1, "points": "never", "min_trust": 0.0, "adjust": "none"}
-POSITIONING, MAPPING = "pycolmap positioning", "pycolmap mapping"
-_MAPPING_MATCHES = (15, 30)
+POSITIONING = "pycolmap positioning"
 
 
 class Directions(NamedTuple):
@@ -49,8 +46,7 @@ def contenders() -> tuple[str, ...]:
     """Return the names of all contenders, ours first."""
     on_directions = (one.name for one in GRAPH_CONTENDERS if one.package is not None)
     positioning = (f"{POSITIONING}, {setting.label}" for setting in colmap_peer.SETTINGS)
-    mapping = (f"{MAPPING}, min_num_matches {count}" for count in _MAPPING_MATCHES)
-    return (BY_DEFAULT, SAME_DIRECTIONS, *on_directions, *positioning, *mapping)
+    return (BY_DEFAULT, SAME_DIRECTIONS, *on_directions, *positioning)
 
 
 def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, cpu_limit_s: int) -> Answer:
@@ -88,22 +84,14 @@ def _locate(name: str, folder: Path, scene: Scene) -> Answer:
         return _ours(name, folder, scene)
     database = folder / "database.db"
     reset_peak()
+    setting = next(one for one in colmap_peer.SETTINGS if name == f"{POSITIONING}, {one.label}")
     with quiet_log():
-        if name.startswith(MAPPING):
-            cpu = time.process_time()
-            model, seconds = colmap_peer.map_database(database, int(name.rsplit(" ", 1)[1]))
-            cpu_s = time.process_time() - cpu
-            note = "own rotations, bundle adjusted"
-        else:
-            setting = next(one for one in colmap_peer.SETTINGS if name == f"{POSITIONING}, {one.label}")
-            model, num_tracks, seconds, cpu_s = colmap_peer.position(
-                database, folder / "sparse" / "0", setting
-            )
-            note = f"{num_tracks} tracks"
+        model, num_tracks, seconds, cpu_s = colmap_peer.position(database, folder / "sparse" / "0", setting)
     peak_mb = peak_memory_mb()
     images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
     centers = {image.name: image.projection_center() for image in images}
-    return Answer(name, _errors(centers, folder, scene), seconds, cpu_s, peak_mb, note)
+    errors = _errors(centers, folder, scene)
+    return Answer(name, errors, seconds, cpu_s, peak_mb, f"{num_tracks} tracks")
 
 
 def _ours(name: str, folder: Path, scene: Scene) -> Answer:
@@ -135,12 +123,9 @@ def _errors(centers: Mapping[str, FloatArray], folder: Path, scene: Scene) -> Er
 
 
 def checks(rows: Sequence[Answer]) -> list[Check]:
-    """Return the limits of one set: our default's errors against the lowest of the peers'.
-
-    Mapping ends with bundle adjustment and is no peer of positions alone; it is shown, not raced.
-    """
+    """Return the limits of one set: our default's errors against the lowest of the peers'."""
     ours = next(row for row in rows if row.name == BY_DEFAULT)
-    no_peers = (SAME_DIRECTIONS, BY_DEFAULT, MAPPING)
+    no_peers = (SAME_DIRECTIONS, BY_DEFAULT)
     peers = [row.error for row in rows if row.error and not row.name.startswith(no_peers)]
     if ours.error is None or not peers:
         return []

@@ -6,8 +6,7 @@ import math
 import pytest
 
 from benchmarks import answers
-from benchmarks.answer_cases import all_cases
-from benchmarks.answer_spellings import Spelling, read_help
+from benchmarks.answer_cases import Case, all_cases
 from tests.scenes import ROOT
 
 CASE = "place/graph40/unrefined"
@@ -116,46 +115,17 @@ def test_an_interrupted_recording_is_read_and_continued(tmp_path):
     assert answers.choose(folders, only=CASE, done=[CASE]) == []
 
 
-HELPS = {
-    "locate": """
-  --rotations <auto|held|free>  What turns; see --no-refine.
-  --adjust <none|seed|full>
-                                What is adjusted.
-  --config FILE                 Options.
-  -q, --quiet                   Nothing.
-""",
-    "check": "  --report FILE  The page.\n  --threads / --no-threads  Threads.\n",
-}
+def test_a_word_with_a_value_becomes_a_key_of_the_configuration(tmp_path):
+    class Noted(answers.Runner):
+        def run(self, command):
+            (told,) = self.work.glob("told-*.toml")
+            return answers.Run(0, f"{' '.join(command[3:])}; {told.read_text()}", "", 1.0, 1.0)
 
-
-@pytest.mark.parametrize(
-    ("line", "spelled", "keys"),
-    [
-        ("locate A B -q --quiet", "locate A B -q --quiet", {}),
-        ("locate A B --bundle-adjust", "locate A B --adjust full", {}),
-        ("locate A B --rotations measured", "locate A B --rotations held", {}),
-        ("locate A B --rotations free", "locate A B --rotations free", {}),
-        ("locate A B --rotation-sigma-deg 0.5", "locate A B --rotations 0.5", {}),
-        ("locate A B --refine-with-priors", "locate A B", {}),
-        ("locate A B --no-refine --tol 1e-5", "locate A B", {"refine": "false", "tol": "1e-5"}),
-        ("report A --write-to B", "check A --report B", {}),
-        ("check A --tol 1", None, {}),
-        ("view A", None, {}),
-    ],
-)
-def test_a_command_line_is_spelled_as_the_checkout_knows_it(line, spelled, keys):
-    spelling = Spelling(lambda words: HELPS.get(words[0], "") if words[1] == "--help" else "")
-    expected = None if spelled is None else (spelled.split(), keys)
-    assert spelling.spell(line.split()) == expected
-
-
-def test_flags_and_choices_are_read_from_the_lines_that_define_them():
-    found = read_help(HELPS["locate"])
-    assert found.flags == {"--rotations", "--adjust", "--config", "--quiet"}
-    assert found.choices == {
-        "--rotations": frozenset({"auto", "held", "free"}),
-        "--adjust": frozenset({"none", "seed", "full"}),
-    }
+    case = Case("place/a", ("place", "graph.txt", "tol=1e-5", "refine=false", "objective=lud", "--strict"))
+    (answer,) = Noted(ROOT, tmp_path).ask(case).values()
+    words, _, keys = answer["printed"].partition("; ")
+    assert words == "place graph.txt --strict --config told-place-a.toml"
+    assert keys == 'tol = # refine = false objective = "lud"'  # printed numbers are not compared
 
 
 def test_names_of_cases_are_unique_and_missing_sets_are_skipped(tmp_path):

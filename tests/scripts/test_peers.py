@@ -15,7 +15,7 @@ from paper import colmap_peer as colmap
 from paper import peers_on_graphs as on_graphs
 from paper import peers_on_scenes as on_scenes
 from paper.cone_solvers import solve_cvxpy, solve_direct
-from paper.peers_on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
+from paper.peers_on_scenes import BY_DEFAULT, POSITIONING, SAME_DIRECTIONS, Answer, checks
 from sfm_shapefit import ViewGraph, certify
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
@@ -128,7 +128,6 @@ def rows(ours, peer):
         Answer(SAME_DIRECTIONS, errors(0.1, 0.1)),
         Answer(BY_DEFAULT, ours, peak_mb=512.4),
         Answer(f"{POSITIONING}, all", peer, seconds=1.0),
-        Answer(f"{MAPPING}, all", errors(0.01, 0.01)),
         Answer("another", None, note="failed: no answer"),
     ]
 
