@@ -15,7 +15,6 @@ STILL_TO_DO = {
     "adjustment",
     "cli",
     "facts",
-    "files",
     "pipeline",
     "report",
     "scene",

@@ -165,7 +165,7 @@ def workspaces(tmp_path_factory):
         edit_database(made[name.upper()] / "database.db", statement)
     made["RIGS"] = folder / "rigs"
     drive = make_rig_drive(SceneOptions(seed=0, num_images=18, num_points=800, max_pairs_per_image=12))
-    write_workspace(drive.scene, made["RIGS"], WorkspaceOptions(model="rotations"))
+    write_workspace(drive, made["RIGS"], WorkspaceOptions(model="rotations"))
     return made
 
 

@@ -80,7 +80,7 @@ def measure(method: str, share: float, num_images: int, drives: int) -> Row:
     outcomes = []
     size = {"num_images": num_images, "num_points": 2000, "max_pairs_per_image": 12}
     for seed in range(drives):
-        scene = make_rig_drive(SceneOptions(corrupted_pair_fraction=share, seed=seed, **size)).scene
+        scene = make_rig_drive(SceneOptions(corrupted_pair_fraction=share, seed=seed, **size))
         with temporary_scene(scene, model="rotations", relative_poses=True) as (_, workspace):
             outcomes.append(_run(method, scene, workspace))
     cells = {

@@ -25,10 +25,10 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
-from numba.core.event import Listener, install_listener
+from numba.core.event import install_listener
 from numba.extending import get_cython_function_address, intrinsic, register_jitable
 
-from sfm_shapefit.base.kernel_cache import KernelCache, choose_target
+from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
 
 choose_target()
 
@@ -74,21 +74,7 @@ def inner_kernel(function: Kernel) -> Kernel:
 @contextmanager
 def on_compilation(begun: Callable[[], None]) -> Iterator[None]:
     """Call `begun`, once, when a kernel begins to be compiled that the cache on disk does not have."""
-
-    class First(Listener):  # type: ignore[misc]
-        """Hears of kernels that are compiled, not of those that are loaded."""
-
-        told = False
-
-        def on_start(self, _event: Any) -> None:
-            if not self.told:
-                self.told = True
-                begun()
-
-        def on_end(self, _event: Any) -> None:
-            """Hear of a kernel that is compiled."""
-
-    with install_listener("numba:compile", First()):
+    with install_listener("numba:compile", CompileTime(begun)):
         yield
 
 

@@ -105,14 +105,20 @@ def hear_of_kernels(hear: Callable[[str], None]) -> Iterator[None]:
 
 
 class CompileTime(Listener):  # type: ignore[misc]
-    """Adds up the seconds that are spent compiling; what is compiled inside another kernel counts once."""
+    """Adds up the seconds that are spent compiling; what is compiled inside another kernel counts once.
 
-    def __init__(self) -> None:
+    `begun` is called at the first kernel that is compiled. Kernels that are loaded are not heard of.
+    """
+
+    def __init__(self, begun: Callable[[], None] | None = None) -> None:
         self.seconds = 0.0
-        self._depth, self._since = 0, 0.0
+        self._begun, self._depth, self._since = begun, 0, 0.0
 
     def on_start(self, _event: Any) -> None:
         """Begin to compile something."""
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            begun()
         if self._depth == 0:
             self._since = time.perf_counter()
         self._depth += 1
@@ -163,15 +169,15 @@ class KernelCache(NullCache):  # type: ignore[misc]
         name = self._file_name(signature, target_context.codegen())
         if not name:
             return None
-        found = self._find(name, target_context)
-        if found is None and _missed:
+        code = self._find(name, target_context)
+        if code is None and _missed:
             _missed.pop()()
-            found = self._find(name, target_context)
-        if found is None:
+            code = self._find(name, target_context)
+        if code is None:
             self._say_once()
-        if found is not None:
+        if code is not None:
             self._tell()
-        return found
+        return code
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep the code for a signature, if any folder can be written."""

@@ -55,20 +55,20 @@ class _Reader(pickle.Unpickler):
 
     def find_class(self, module_name: str, name: str) -> Any:
         """Return an object of a module."""
-        found = super().find_class(module_name, name)
+        value = super().find_class(module_name, name)
         is_environment = (module_name, name) == ("numba.core.environment", "_rebuild_env")
-        return partial(_environment, found) if is_environment else found
+        return partial(_environment, value) if is_environment else value
 
 
 def _environment(rebuild: Callable[..., Any], module_name: str, constants: list[Any], name: str) -> Any:
     """Return the constants that a compiled function needs, as numba's `rebuild` does."""
-    known = getattr(Environment, "_memo", None)
-    if known is None or name in known or module_name in sys.modules:
+    environments = getattr(Environment, "_memo", None)
+    if environments is None or name in environments or module_name in sys.modules:
         return rebuild(module_name, constants, name)
     environment = Environment({"__name__": module_name})
     environment.consts[:] = constants
     environment.env_name = name
-    known[name] = environment
+    environments[name] = environment
     return environment
 
 

@@ -5,9 +5,9 @@
     VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
     VERTEX_XY          id x y                      the same in the plane
 
-Of an edge the rotation and the direction of x y z are taken; its length and the 21 numbers of its information
-matrix are not used. Ids are whole numbers: on writing the nodes' own where all are, else 0, 1, ... with the
-names in comments.
+The rotation of an edge and the direction of its x y z are read; its length and the 21 numbers of its
+information matrix are not used. Ids are whole numbers: the nodes' own where all of these are, else 0, 1, ...
+with the names in comments.
 
 Source: Kuemmerle, Grisetti, Strasdat, Konolige, Burgard, "g2o: a general framework for graph
 optimization", ICRA 2011, and its file format.
@@ -21,14 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.files.lines import TextTable, first_words, is_repeated, read_lines, rotations_by_name
-from sfm_shapefit.files.onedsfm import EpipolarGeometries
+from sfm_shapefit.files.lines import TextTable, first_words, read_lines, rotations_by_name
+from sfm_shapefit.files.onedsfm import EpipolarGeometries, geometries_of
 
 _POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
-_POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
-# An edge ends with so many numbers, the upper triangle of its information matrix.
-_INFORMATION = 21
+_POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10  # words; a tag, one id or two, a center, a quaternion
+_INFORMATION = 21  # numbers behind an edge; the upper triangle of its information matrix, not used
 _PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
 _FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
 
@@ -50,17 +48,10 @@ def read_g2o(path: Path | str) -> EpipolarGeometries:
         if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION:
             del row[-_INFORMATION:]
     values = table.values(first=3, width=_RELATIVE_POSE_COLUMNS)
-    names, pairs = table.pairs(first=1)
-    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
     largest = np.abs(values[:, :3]).max(axis=1)
     table.refuse(~(largest > 0.0), "has no translation, so no direction")
-    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
-    return EpipolarGeometries(
-        names=names,
-        pairs=pairs,
-        rotations=_rotations(table, values[:, 3:]),
-        to_second=normalized(values[:, :3] / largest[:, None]),  # squares neither overflow nor vanish
-    )
+    to_second = values[:, :3] / largest[:, None]  # so that squares neither overflow nor vanish
+    return geometries_of(table, 1, _rotations(table, values[:, 3:]), to_second)
 
 
 def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:

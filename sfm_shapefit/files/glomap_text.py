@@ -1,4 +1,4 @@
-"""Relative poses as text, one pair a line: read. GLOMAP's form, names instead of ids.
+"""Relative poses as text, one pair a line, in GLOMAP's form: names instead of ids. They are read only.
 
     NAME1 NAME2 QW QX QY QZ TX TY TZ        # comments and empty lines are skipped
 
@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.files.lines import UNIT_TOLERANCE, first_numbers, is_repeated, read_lines
-from sfm_shapefit.files.onedsfm import EpipolarGeometries
+from sfm_shapefit.files.lines import UNIT_TOLERANCE, first_numbers, read_lines
+from sfm_shapefit.files.onedsfm import EpipolarGeometries, geometries_of
 
-_COLUMNS = 9
+_COLUMNS = 9  # words of a line; two names, a quaternion, a translation
 
 
 def is_relative_poses(source: Path | str) -> bool:
@@ -37,17 +36,9 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     """
     table = read_lines(Path(path), "NAME1 NAME2 QW QX QY QZ TX TY TZ")
     values = table.values(first=2, width=_COLUMNS)
-    names, pairs = table.pairs()
     quaternions, translations = values[:, :4], values[:, 4:]
     lengths = np.linalg.norm(translations, axis=1)
-    table.refuse(pairs[:, 0] == pairs[:, 1], "joins an image with itself")
     table.refuse_no_unit(quaternions, "has no unit quaternion QW QX QY QZ")
     table.refuse(np.asarray(~(lengths > 0.0)), "has no translation, so no direction")
-    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
-    return EpipolarGeometries(
-        names=names,
-        pairs=pairs,
-        rotations=rotations,
-        to_second=normalized(-np.einsum("kji,kj->ki", rotations, translations)),
-    )
+    return geometries_of(table, 0, rotations, -np.einsum("kji,kj->ki", rotations, translations))

@@ -17,13 +17,10 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import read_lines
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
-# Directions printed with 5 digits pass.
-_UNIT_TOLERANCE = 1e-4
-_ROUNDED = 1e-7
-# Sums of squares of products of weights must not overflow.
-_LARGEST_WEIGHT = 1e30
-# A row has at least two ids and a direction in the plane.
-_MIN_COLUMNS = 4
+_UNIT_TOLERANCE = 1e-4  # error of a direction's length; one that is printed with 5 digits passes
+_ROUNDED = 1e-7  # error of a direction's length beyond which it is scaled; it was printed with few digits
+_LARGEST_WEIGHT = 1e30  # weight, and 1 over the smallest; sums of squares of products must not overflow
+_MIN_COLUMNS = 4  # columns; two ids and a direction in the plane
 
 
 def read_graph(path: Path | str) -> ViewGraph:
@@ -54,7 +51,7 @@ def read_graph(path: Path | str) -> ViewGraph:
     table.refuse(~(weights > 0.0), "has a weight that is not positive")
     extreme = (weights < 1.0 / _LARGEST_WEIGHT) | (weights > _LARGEST_WEIGHT)
     table.refuse(extreme, f"has a weight beyond 1 / {_LARGEST_WEIGHT:g} to {_LARGEST_WEIGHT:g}")
-    rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
+    rounded = np.abs(lengths - 1.0) > _ROUNDED  # ViewGraph sees to the rest
     directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
     try:
         return ViewGraph(len(ids), edges, directions, weights, ids)

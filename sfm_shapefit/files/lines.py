@@ -12,11 +12,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 
-# Longer numbers are words: Python refuses to convert very long ones.
-_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
 UNIT_TOLERANCE = 1e-3
-"""By how much the length of a quaternion or direction, or R R^T, may be off: a few printed digits pass."""
+"""Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
 
 
 def refuse_irregular_file(path: Path) -> None:
@@ -36,7 +35,7 @@ def refuse_irregular_file(path: Path) -> None:
 
 
 def is_database(path: Path) -> bool:
-    """Tell whether a path is a file that begins as a database of SQLite does."""
+    """Return whether a path is a file that begins as a database of SQLite does."""
     if not path.is_file():
         return False
     try:
@@ -187,19 +186,19 @@ def rotations_by_name(
     ids = [row[column] for row in table.rows]
     table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
     row_of = {name: row for row, name in enumerate(ids)}
-    known = np.array([name in row_of for name in names], dtype=np.bool_)
-    if not known.any():
+    has_one = np.array([name in row_of for name in names], dtype=np.bool_)
+    if not has_one.any():
         raise InputError(f"{table.file} has a rotation of none of the {len(names)} cameras; check its ids")
-    found = np.tile(np.eye(3), (len(names), 1, 1))
-    found[known] = rotations[[row_of[name] for name in names if name in row_of]]
-    return found, known
+    chosen = np.tile(np.eye(3), (len(names), 1, 1))
+    chosen[has_one] = rotations[[row_of[name] for name in names if name in row_of]]
+    return chosen, has_one
 
 
 def is_repeated(rows: IntArray) -> BoolArray:
     """Return which of (k, c) rows occurred before."""
-    found = np.ones(len(rows), dtype=np.bool_)
-    found[np.unique(rows, axis=0, return_index=True)[1]] = False
-    return found
+    repeated = np.ones(len(rows), dtype=np.bool_)
+    repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return repeated
 
 
 def is_number(word: str) -> bool:

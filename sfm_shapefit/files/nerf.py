@@ -1,4 +1,4 @@
-"""NeRF's transforms.json, as nerfstudio and instant-ngp read it: written.
+"""NeRF's transforms.json, written as nerfstudio and instant-ngp read it.
 
     transform_matrix  world_from_camera, 4 x 4, in OpenGL's camera axes: x right, y up, looking along -z
 
@@ -19,7 +19,6 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import FLIP_YZ
 from sfm_shapefit.scene.posed_model import Intrinsics, PosedModelFile
 
-# Of each camera model: nerfstudio's name, the number of focal lengths, and the keys of the distortion.
 _MODELS = {
     "SIMPLE_PINHOLE": ("OPENCV", 1, ()),
     "PINHOLE": ("OPENCV", 2, ()),
@@ -33,8 +32,9 @@ _MODELS = {
     "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1, ("k1", "k2")),
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", 2, ("k1", "k2", "k3", "k4")),
 }
-# nerfstudio has no such terms of FULL_OPENCV.
+"""By COLMAP's name of a camera model: nerfstudio's, the number of focal lengths, keys of the distortion."""
 _DENOMINATOR = ("k4", "k5", "k6")
+"""Terms of FULL_OPENCV that nerfstudio does not have."""
 
 
 def nerf_text(scene: PosedModelFile) -> str:
@@ -52,8 +52,8 @@ def nerf_text(scene: PosedModelFile) -> str:
     ):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation.T @ FLIP_YZ, center
-        own = {} if shared else intrinsics[camera]
-        frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
+        lens = {} if shared else intrinsics[camera]
+        frames.append({"file_path": f"images/{name}", **lens, "transform_matrix": (matrix + 0.0).tolist()})
     return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -27,6 +27,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import FLIP_YZ, nearest_rotations, normalized, rotation_angles_deg
 from sfm_shapefit.files.lines import (
     UNIT_TOLERANCE,
+    TextTable,
     first_numbers,
     is_repeated,
     read_lines,
@@ -35,7 +36,7 @@ from sfm_shapefit.files.lines import (
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
-_PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
+_PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10  # words of a line; ids and a matrix, a translation too or not
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,7 +58,7 @@ class EpipolarGeometries:
         return replace(self, pairs=pairs, rotations=rotations, to_second=to_second)
 
     def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
-        """Return (m,) by how many degrees each relative rotation contradicts the cameras' (n, 3, 3)."""
+        """Return the angles (m,), degrees, between relative rotations and those of the cameras' (n, 3, 3)."""
         i, j = self.pairs.T
         return rotation_angles_deg(self.rotations @ rotations[i] @ rotations[j].swapaxes(1, 2))
 
@@ -71,12 +72,27 @@ class EpipolarGeometries:
         Raises:
             InputError: if no pair is left.
         """
-        kept = known[self.pairs].all(axis=1)
-        if not kept.any():
+        joined = known[self.pairs].all(axis=1)
+        if not joined.any():
             raise InputError("no pair joins two cameras that have a rotation; check the rotations' ids")
-        i = self.pairs[kept, 0]
-        to_first = -np.einsum("eba,eb->ea", rotations[i], self.to_second[kept])
-        return ViewGraph(len(self.names), self.pairs[kept], normalized(to_first), names=self.names)
+        i = self.pairs[joined, 0]
+        to_first = -np.einsum("eba,eb->ea", rotations[i], self.to_second[joined])
+        return ViewGraph(len(self.names), self.pairs[joined], normalized(to_first), names=self.names)
+
+
+def geometries_of(
+    table: TextTable, first: int, rotations: FloatArray, to_second: FloatArray
+) -> EpipolarGeometries:
+    """Return the relative poses of pairs whose two cameras stand in a table's columns from `first` on.
+
+    Raises:
+        InputError: if a line joins a camera with itself, or repeats a pair, in whatever order.
+    """
+    names, pairs = table.pairs(first)
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
+    directions = normalized(to_second)
+    return EpipolarGeometries(names=names, pairs=pairs, rotations=rotations, to_second=directions)
 
 
 def is_onedsfm(source: Path | str) -> bool:
@@ -91,8 +107,6 @@ def is_onedsfm(source: Path | str) -> bool:
 def read_onedsfm(source: Path | str) -> EpipolarGeometries:
     """Read a 1DSfM folder (EGs.txt, and cc.txt if it has one, whose cameras alone are kept) or an EGs.txt.
 
-    A pair that stands twice, in whatever order, is an error.
-
     Raises:
         InputError: if a file cannot be read, naming the first malformed line by its number.
     """
@@ -100,19 +114,12 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
     table = read_lines(path / _PAIRS_FILE if path.is_dir() else path, "i j R11 ... R33 t1 t2 t3")
     values = table.values(first=2, width=_PAIR_COLUMNS)
     rotations, translations = values[:, :9].reshape(-1, 3, 3), values[:, 9:]
-    names, pairs = table.pairs()
     table.refuse(_is_no_rotation(rotations), "has no rotation matrix in columns 3 to 11")
     table.refuse_no_unit(translations, "has no unit direction at its end")
-    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
-    table.refuse(is_repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
-    found = EpipolarGeometries(
-        names=names,
-        pairs=pairs,
-        rotations=FLIP_YZ @ nearest_rotations(rotations).swapaxes(1, 2) @ FLIP_YZ,
-        to_second=normalized(translations) @ FLIP_YZ,
-    )
+    relative = FLIP_YZ @ nearest_rotations(rotations).swapaxes(1, 2) @ FLIP_YZ
+    poses = geometries_of(table, 0, relative, translations @ FLIP_YZ)
     component = path / _COMPONENT_FILE
-    return _restrict(found, component) if path.is_dir() and component.is_file() else found
+    return _restrict(poses, component) if path.is_dir() and component.is_file() else poses
 
 
 def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
@@ -130,20 +137,20 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
 
 
 def onedsfm_files(
-    found: EpipolarGeometries, rotations: FloatArray, cameras: IntArray, locations: FloatArray
+    poses: EpipolarGeometries, rotations: FloatArray, cameras: IntArray, locations: FloatArray
 ) -> dict[str, str]:
     """Return the text of EGs.txt, cc.txt, rots.txt and soln.txt, by name; numbers round-trip.
 
     Args:
-        found: the pairs to write.
+        poses: the pairs to write.
         rotations: (n, 3, 3) cam_from_world, of all cameras.
         cameras: (k,) those that are placed, which alone stand in the last three files.
         locations: (k, 3) of these.
     """
-    relative = FLIP_YZ @ found.rotations.swapaxes(1, 2) @ FLIP_YZ
-    pair_rows = np.concatenate([relative.reshape(-1, 9), found.to_second @ FLIP_YZ], axis=1)
-    ids = [f"{found.names[i]} {found.names[j]}" for i, j in found.pairs.tolist()]
-    placed = [found.names[k] for k in cameras.tolist()]
+    relative = FLIP_YZ @ poses.rotations.swapaxes(1, 2) @ FLIP_YZ
+    pair_rows = np.concatenate([relative.reshape(-1, 9), poses.to_second @ FLIP_YZ], axis=1)
+    ids = [f"{poses.names[i]} {poses.names[j]}" for i, j in poses.pairs.tolist()]
+    placed = [poses.names[k] for k in cameras.tolist()]
     return {
         _PAIRS_FILE: _text(ids, pair_rows),
         _COMPONENT_FILE: "".join(f"{name}\n" for name in placed),
@@ -157,18 +164,18 @@ def _text(ids: list[str], values: FloatArray) -> str:
     return "".join(f"{name} {' '.join(map(repr, row))}\n" for name, row in rows)
 
 
-def _restrict(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:
+def _restrict(poses: EpipolarGeometries, component: Path) -> EpipolarGeometries:
     """Return the cameras of a cc.txt and the pairs between them."""
     table = read_lines(component, "i")
     table.refuse(np.array([len(row) != 1 for row in table.rows]), "is not one camera's id")
     wanted = {row[0] for row in table.rows}
-    inside = np.array([name in wanted for name in found.names])
-    kept = inside[found.pairs].all(axis=1)
-    if not kept.any():
+    inside = np.array([name in wanted for name in poses.names])
+    between = inside[poses.pairs].all(axis=1)
+    if not between.any():
         raise InputError(f"{component} keeps no pair of {_PAIRS_FILE}; remove it, or correct its ids")
-    left, renumbered = found.subset(np.flatnonzero(kept).tolist()), np.cumsum(inside) - 1
-    names = tuple(name for name in found.names if name in wanted)
-    return replace(left, names=names, pairs=renumbered[left.pairs])
+    remaining, renumbered = poses.subset(np.flatnonzero(between).tolist()), np.cumsum(inside) - 1
+    names = tuple(name for name in poses.names if name in wanted)
+    return replace(remaining, names=names, pairs=renumbered[remaining.pairs])
 
 
 def _is_no_rotation(matrices: FloatArray) -> BoolArray:

@@ -10,7 +10,7 @@ y down as in COLMAP. Lengths in the image are in units of its larger side, from 
     pixel = larger side * normalized + (width, height) / 2          (COLMAP's pixels: first center at 0.5)
 
 tracks.csv, versions 1 and 2: `image track feature x y [scale] r g b ...`, tab-separated, x and y
-normalized; tracks are the points. Of several reconstructions the one with most shots is read.
+normalized; tracks are the points. Where there are several reconstructions, the one with most shots is read.
 
 Source: https://opensfm.org/docs/geometry.html and dataset.html.
 """

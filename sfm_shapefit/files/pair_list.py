@@ -19,25 +19,25 @@ def read_pair_list(path: Path, known: Collection[str]) -> PairNames:
 
     Args:
         path: the file.
-        known: names of the images that there are.
+        known: names of all images.
 
     Raises:
         InputError: if the file cannot be read, lists no pair, or a line is malformed or names no image; it
             is named by its number.
     """
-    there, found = frozenset(known), set()
+    names, pairs = frozenset(known), set()
     for number, cells in lines_of_cells(path):
         if cells[:2] == _HEADER:
             continue
         if len(cells) < 2:
             raise InputError(f"{path}, line {number}: expected the names of two images")
-        unknown = [name for name in cells[:2] if name not in there]
+        unknown = [name for name in cells[:2] if name not in names]
         if unknown:
             raise InputError(f"{path}, line {number}: there is no image {unknown[0]!r}")
         first, second = sorted(cells[:2])
         if first == second:
             raise InputError(f"{path}, line {number}: {first} makes no pair with itself")
-        found.add((first, second))
-    if not found:
+        pairs.add((first, second))
+    if not pairs:
         raise InputError(f"{path} lists no pair; give the names of two images per line")
-    return frozenset(found)
+    return frozenset(pairs)

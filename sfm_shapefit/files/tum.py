@@ -1,4 +1,4 @@
-"""Poses as plain text: the TUM RGB-D trajectory format, and a CSV; both written.
+"""Poses written as plain text: the TUM RGB-D trajectory format, and a CSV.
 
     TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the center, and R^T as a quaternion
     CSV   name,x,y,z,qw,qx,qy,qz              the center, and cam_from_world as in COLMAP's images.txt

@@ -164,7 +164,7 @@ def locate_from_tracks(folder: Path) -> None:
 def locate_rigs(folder: Path) -> None:
     """Locate the cameras of two rigs."""
     drive = synthetic.make_rig_drive(SceneOptions(num_images=18, num_points=600, max_pairs_per_image=12))
-    write_workspace(drive.scene, folder / "drive", WorkspaceOptions(model="rotations"))
+    write_workspace(drive, folder / "drive", WorkspaceOptions(model="rotations"))
     locate(folder / "drive" / "sparse" / "0")
 
 

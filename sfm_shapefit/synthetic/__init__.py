@@ -47,7 +47,7 @@ if TYPE_CHECKING:
         project_distorted,
         surface_points,
     )
-    from sfm_shapefit.synthetic.rigs import RigScene, make_rig_drive
+    from sfm_shapefit.synthetic.rigs import make_rig_drive
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
@@ -60,7 +60,6 @@ __all__ = [
     "Noise",
     "RenderOptions",
     "RenderedScene",
-    "RigScene",
     "Scene",
     "SceneOptions",
     "StreetProblem",

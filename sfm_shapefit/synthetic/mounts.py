@@ -48,22 +48,29 @@ class Rigs:
 def mounted(kind: RigKind, num_images: int) -> Rigs:
     """Return one rig of a kind and its frames: whole ones only, so that there may be fewer images."""
     yaw_deg, offsets_m = _SENSORS[kind]
-    return rigs_of(num_images // len(yaw_deg), np.array(yaw_deg), np.array(offsets_m))
+    frames = np.zeros(num_images // len(yaw_deg), dtype=np.int64)
+    return rigs_of(frames, np.array(yaw_deg), np.array([offsets_m]))
 
 
-def rigs_of(num_frames: int, yaw_deg: FloatArray, offsets_m: FloatArray) -> Rigs:
-    """Return one rig, sensors turned left by `yaw_deg` and at `offsets_m`, and its frames, all complete."""
-    count = len(yaw_deg)
+def rigs_of(rig_of_frame: IntArray, yaw_deg: FloatArray, offsets_m: FloatArray) -> Rigs:
+    """Return rigs of s sensors, turned left by `yaw_deg` (s,), and their frames, all complete.
+
+    Args:
+        rig_of_frame: (f,) the rig of each frame.
+        yaw_deg: (s,) of the sensors, in every rig.
+        offsets_m: (rigs, s, 3) place of each sensor in its rig.
+    """
+    count, num_frames = len(yaw_deg), len(rig_of_frame)
     return Rigs(
-        rig_of_frame=np.zeros(num_frames, dtype=np.int64),
+        rig_of_frame=rig_of_frame,
         frame_of_image=np.repeat(np.arange(num_frames), count),
         sensor_of_image=np.tile(np.arange(count), num_frames),
-        sensor_rotations=yawed(yaw_deg)[None],
-        sensor_centers=offsets_m[None],
+        sensor_rotations=np.tile(_yawed(yaw_deg), (len(offsets_m), 1, 1, 1)),
+        sensor_centers=offsets_m,
     )
 
 
-def yawed(yaw_deg: FloatArray) -> FloatArray:
+def _yawed(yaw_deg: FloatArray) -> FloatArray:
     """Return sensor_from_rig rotations (s, 3, 3) of sensors turned to the left about the rig's y axis."""
     yaw = np.radians(yaw_deg)
     cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
@@ -71,7 +78,6 @@ def yawed(yaw_deg: FloatArray) -> FloatArray:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-# Yaw and offset of each sensor.
 _SENSORS: dict[RigKind, tuple[list[float], list[list[float]]]] = {
     "none": ([0.0], [[0.0, 0.0, 0.0]]),
     "pair": ([0.0, 0.0], [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0]]),
@@ -81,3 +87,4 @@ _SENSORS: dict[RigKind, tuple[list[float], list[list[float]]]] = {
         [[0.0, 0.0, 0.0], [1.2, 0.0, 0.0], [-0.2, -0.2, -1.0], [1.4, -0.2, -1.0]],
     ),
 }
+"""Yaw in degrees, and offset in meters, of each sensor of a kind of rig."""

@@ -249,10 +249,10 @@ def _shade(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np
     sky = _SKY[0] + height * np.subtract(_SKY[1], _SKY[0])
     colors: npt.NDArray[np.float32] = sky.astype(np.float32)
     # Texture coordinates over inverse depth are linear in the ray: rows (u / z, v / z, 1 / z).
-    kept = triangles.rows
-    texels = np.concatenate([scene.surfaces.texels[kept], np.ones((len(kept), 3, 1))], axis=2)
+    rows = triangles.rows
+    texels = np.concatenate([scene.surfaces.texels[rows], np.ones((len(rows), 3, 1))], axis=2)
     img_from_ray = np.einsum("kca,kcb->kab", texels, triangles.inverse)
-    texture, brightness = scene.surfaces.texture[kept], scene.surfaces.brightness[kept]
+    texture, brightness = scene.surfaces.texture[rows], scene.surfaces.brightness[rows]
     _paint(colors, rays, nearest, img_from_ray, texture, brightness, pyramid, levels)
     return colors
 

@@ -8,14 +8,14 @@ Rotations are known; the metric offsets of the sensors in their rigs are what fi
 A rig's axes are those of its first camera: x to the right, y down, z ahead.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
-from sfm_shapefit.synthetic.mounts import Rigs, yawed
+from sfm_shapefit.synthetic.mounts import rigs_of
 from sfm_shapefit.synthetic.options import SceneOptions
 from sfm_shapefit.synthetic.scenes import Scene, build_scene
 
@@ -23,8 +23,7 @@ NUM_RIGS, NUM_SENSORS = 2, 3  # rigs, cameras of each; the fewest that differ, a
 
 _STEP_M = 1.5  # meters between two frames of a vehicle; their views overlap
 _YAW_DEG = np.array([0.0, 40.0, -40.0])  # degrees to the left of ahead; views of neighbors overlap
-# Meters to the right, down and ahead, by rig and sensor: cars of two sizes.
-_OFFSETS_M = np.array(
+_OFFSETS_M = np.array(  # meters to the right, down and ahead, by rig and sensor; cars of two sizes
     [
         [[0.0, 0.0, 0.0], [-0.8, 0.1, -0.3], [0.8, 0.1, -0.3]],
         [[0.0, 0.0, 0.0], [-1.0, -0.3, -0.5], [1.0, -0.3, -0.5]],
@@ -33,14 +32,7 @@ _OFFSETS_M = np.array(
 _LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])  # meters, by rig; two cars on one street
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RigScene(Rigs):
-    """A photographed scene with the rigs that its images belong to."""
-
-    scene: Scene
-
-
-def make_rig_drive(options: SceneOptions) -> RigScene:
+def make_rig_drive(options: SceneOptions) -> Scene:
     """Return the drive of two rigs of three cameras, with exact rotations.
 
     `options.num_images` is rounded down to whole frames; `shape` and `rig` are not read. ValueError if there
@@ -52,24 +44,14 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     if options.rotation_noise_deg:
         raise ValueError("rotation_noise_deg must be 0: the frames of a rig turn as one")
     layout_rng, *rngs = np.random.default_rng(options.seed).spawn(6)
-    frame_of_image = np.repeat(np.arange(num_frames), NUM_SENSORS)
-    sensor_of_image = np.tile(np.arange(NUM_SENSORS), num_frames)
-    rig_of_frame = np.arange(num_frames) % NUM_RIGS
-    rotations, centers = _frames(num_frames, rig_of_frame, layout_rng)
-    rigs = Rigs(
-        rig_of_frame=rig_of_frame,
-        frame_of_image=frame_of_image,
-        sensor_of_image=sensor_of_image,
-        sensor_rotations=np.tile(yawed(_YAW_DEG), (NUM_RIGS, 1, 1, 1)),
-        sensor_centers=_OFFSETS_M,
-    )
+    rigs = rigs_of(np.arange(num_frames) % NUM_RIGS, _YAW_DEG, _OFFSETS_M)
+    rotations, centers = _frames(num_frames, rigs.rig_of_frame, layout_rng)
     layout = replace(
         LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng),
         centers=rigs.centers_of(rotations, centers),
         rotations=rigs.rotations_of(rotations),
     )
-    scene = build_scene(layout, rigs, options, rngs)
-    return RigScene(scene=scene, **{item.name: getattr(rigs, item.name) for item in fields(Rigs)})
+    return build_scene(layout, rigs, options, rngs)
 
 
 def _frames(

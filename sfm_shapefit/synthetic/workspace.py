@@ -45,10 +45,10 @@ def _points(scene: Scene) -> ModelPoints:
     keypoint = np.concatenate([np.arange(len(ids)) for ids in scene.keypoint_points])
     point = np.concatenate(scene.keypoint_points)
     length = np.bincount(point[point >= 0], minlength=len(scene.points))
-    kept = np.flatnonzero((point >= 0) & (length[point] >= 2))
-    kept = kept[np.argsort(point[kept], kind="stable")]
+    visible = np.flatnonzero((point >= 0) & (length[point] >= 2))
+    visible = visible[np.argsort(point[visible], kind="stable")]
     shown = np.flatnonzero(length >= 2)
-    seen = np.stack([image[kept], keypoint[kept]], axis=1)
+    seen = np.stack([image[visible], keypoint[visible]], axis=1)
     tracks = np.split(seen, np.cumsum(length[shown])[:-1]) if len(shown) else []
     return ModelPoints(shown + 1, scene.points[shown], scene.colors[shown], tracks)
 

@@ -233,8 +233,8 @@ def test_a_pose_graph_gives_the_same_relative_poses():
         ("a b 1 0 0 0 1 0", r"line 2: has 8 columns, expected 9"),
         ("a b 1 1 0 0 1 0 0", r"line 2: has no unit quaternion"),
         ("a b 1 0 0 0 0 0 0", r"line 2: has no translation"),
-        ("a a 1 0 0 0 1 0 0", r"line 2: joins an image with itself"),
-        ("d c 1 0 0 0 1 0 0", r"line 2: gives a pair for the second time"),
+        ("a a 1 0 0 0 1 0 0", r"line 2: joins a camera with itself"),
+        ("d c 1 0 0 0 1 0 0", r"line 2: repeats an earlier pair"),
         ("a b 1 0 0 0 1 0 x", r"line 2: 'x' is not a number"),
     ],
 )

@@ -206,8 +206,8 @@ def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
         ("EDGE_SE3:QUAT 1 2 nan 0 0 0 0 0 1", "line 2: has a number that is not finite"),
         ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 2", "line 2: has no unit quaternion"),
         ("EDGE_SE3:QUAT 1 2 0 0 0 0 0 0 1", "line 2: has no translation"),
-        ("EDGE_SE3:QUAT 2 2 1 0 0 0 0 0 1", "line 2: joins a vertex with itself"),
-        ("EDGE_SE3:QUAT 1 0 1 0 0 0 0 0 1", "line 2: gives a pair for the second time"),
+        ("EDGE_SE3:QUAT 2 2 1 0 0 0 0 0 1", "line 2: joins a camera with itself"),
+        ("EDGE_SE3:QUAT 1 0 1 0 0 0 0 0 1", "line 2: repeats an earlier pair"),
         ("EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1", "line 2: is neither a vertex nor EDGE_SE3:QUAT"),
     ],
 )

@@ -141,7 +141,7 @@ def test_fixed_cameras_stay_to_the_bit(ring, adjusted, tmp_path, count):
 
 def test_rigs_set_the_scale_and_the_input_the_origin(adjusted, tmp_path):
     drive = make_rig_drive(SceneOptions(num_images=36, num_points=600, max_pairs_per_image=12, seed=4))
-    write_workspace(drive.scene, tmp_path / "drive", WorkspaceOptions())
+    write_workspace(drive, tmp_path / "drive", WorkspaceOptions())
     options = {"points": "never", **adjusted}
     found = sfm_shapefit.locate(tmp_path / "drive" / "sparse" / "0", **options)
     assert found.gauge.scale == "rig"
@@ -152,4 +152,4 @@ def test_rigs_set_the_scale_and_the_input_the_origin(adjusted, tmp_path):
             np.testing.assert_allclose(ours.matrix(), pose.matrix(), atol=1e-12)
     np.testing.assert_allclose(np.median(found.images.centers - centers, axis=0), 0.0, atol=EXACT)
     assert_in_the_axes_of(found.images, rotations)
-    assert np.ptp(centers) == pytest.approx(np.ptp(drive.scene.centers), rel=2e-3)
+    assert np.ptp(centers) == pytest.approx(np.ptp(drive.centers), rel=2e-3)

@@ -154,8 +154,8 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
 def workspaces(tmp_path_factory):
     """Models with a database: plain, and of rigs."""
     folder = tmp_path_factory.mktemp("rigs") / "drive"
-    rigs = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
+    drive = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
+    write_workspace(drive, folder, WorkspaceOptions(model="rotations"))
     return {"plain": RING / "sparse" / "0", "rigs": folder / "sparse" / "0"}
 
 

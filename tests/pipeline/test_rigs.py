@@ -38,16 +38,16 @@ from tests.scenes import RING, copied, edit_database, read_from
 
 
 @pytest.fixture(scope="module")
-def rigs():
+def drive():
     """Twelve frames of two rigs, a fifth of the pairs wrong."""
     size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
     return make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
 
 
 @pytest.fixture(scope="module")
-def workspace(rigs, tmp_path_factory):
+def workspace(drive, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs") / "drive"
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
+    write_workspace(drive, folder, WorkspaceOptions(model="rotations"))
     return folder
 
 
@@ -62,19 +62,19 @@ def centers_of(reconstruction):
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
 
 
-def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(rigs, workspace):
+def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(drive, workspace):
     model = read_model(workspace / "truth")
     truth = model.reconstruction
     assert (truth.num_rigs(), truth.num_frames(), truth.num_cameras()) == (2, 12, 6)
-    np.testing.assert_allclose(centers_of(truth)[1], rigs.scene.centers, atol=1e-12)
+    np.testing.assert_allclose(centers_of(truth)[1], drive.centers, atol=1e-12)
     assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
     with pycolmap.Database.open(workspace / "database.db") as database:
         assert (database.num_rigs(), database.num_frames()) == (2, 12)
-    first = rigs.sensor_of_image == 0
-    expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
+    first = drive.rigs.sensor_of_image == 0
+    expected = drive.centers - drive.centers[first][drive.rigs.frame_of_image]
     np.testing.assert_allclose(model.images.offsets, expected, atol=1e-12)
     assert not model.images.offsets[first].any()
-    np.testing.assert_array_equal(model.images.frame_of, rigs.frame_of_image)
+    np.testing.assert_array_equal(model.images.frame_of, drive.rigs.frame_of_image)
     assert model.images.has_rigs
 
 
@@ -112,12 +112,12 @@ def assert_rigs_equal(a, b, atol=0.0):
             np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
 
 
-def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, workspace, found):
+def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(drive, workspace, found):
     ids, own = centers_of(found.reconstruction)
     assert ids == list(range(1, 37))
-    fit = fit_similarity(own, rigs.scene.centers, rotate=False)
+    fit = fit_similarity(own, drive.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
-    errors = np.linalg.norm(fit.apply(own) - rigs.scene.centers, axis=1)
+    errors = np.linalg.norm(fit.apply(own) - drive.centers, axis=1)
     assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
     assert found.certified.gap <= 1e-8
     assert found.gauge.statement.startswith("rig: ")
@@ -146,8 +146,8 @@ def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_move
     assert found.summary()["num_placed"] == again.num_reg_images()
 
 
-def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
-    images = rigs.scene
+def test_an_image_without_pairs_comes_with_its_frame(drive, workspace, found):
+    images = drive
     kept = ~(images.pairs == 4).any(axis=1)
     counts = np.diff(images.match_offsets)
     rows = np.repeat(kept, counts)
@@ -166,11 +166,11 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     assert located.reconstruction.num_reg_images() == 36
 
 
-def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
+def test_bundle_adjustment_keeps_the_rigs(workspace, drive):
     located = sfm_shapefit.locate(workspace / "sparse" / "0", adjust="full", points="never")
     given = pycolmap.Reconstruction(workspace / "sparse" / "0")
     assert_rigs_equal(located.reconstruction, given, atol=1e-12)
-    fit = fit_similarity(centers_of(located.reconstruction)[1], rigs.scene.centers, rotate=False)
+    fit = fit_similarity(centers_of(located.reconstruction)[1], drive.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
 
 
@@ -184,7 +184,7 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
 
 
-def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, rigs, tmp_path):
+def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, drive, tmp_path):
     model = read_model(workspace / "truth")
     apart = float(np.linalg.norm(model.images.centers[0] - model.images.centers[20]))
     rows = zip(model.images.names, (3.0 * model.images.centers).tolist(), strict=True)
@@ -203,8 +203,8 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     assert unused[2] == "the scale unit was not used, but that of the rigs"
 
 
-def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False))
+def test_rigs_whose_sensors_coincide_have_no_scale(drive, tmp_path):
+    write_workspace(drive, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
@@ -300,7 +300,7 @@ def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
     assert np.abs(after[new] - given[new]).max() > 1.0
 
 
-def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(rigs, workspace, tmp_path):
+def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(drive, workspace, tmp_path):
     model = pycolmap.Reconstruction(workspace / "truth")
     names = tmp_path / "names.txt"
     names.write_text("0008.jpg\n")
@@ -310,7 +310,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
             found.reconstruction.image(image_id).cam_from_world().matrix(),
             model.image(image_id).cam_from_world().matrix(),
         )
-    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - rigs.scene.centers, axis=1)
+    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - drive.centers, axis=1)
     assert np.median(errors) < 0.02  # grows with the distance from the frame that is held
 
 

@@ -230,17 +230,17 @@ def test_errors_are_taken_after_shift_and_scale_and_those_of_rotations_after_the
 
 def test_scale_and_errors_are_those_of_the_model(tmp_path):
     drive = make_rig_drive(SceneOptions(num_images=12, num_points=300, min_matches=8))
-    write_workspace(drive.scene, tmp_path / "w", WorkspaceOptions(model="rotations"))
+    write_workspace(drive, tmp_path / "w", WorkspaceOptions(model="rotations"))
     model = pycolmap.Reconstruction(tmp_path / "w" / "truth")
-    exact = rigs.compare(drive.scene, model, 1.0)
+    exact = rigs.compare(drive, model, 1.0)
     assert exact.num_images == 12
     assert exact.scale_error == pytest.approx(0.0, abs=1e-12)
     assert exact.errors_m.max() < 1e-9
     turn = pycolmap.Rotation3d(np.array([0.0, 0.6, 0.0, 0.8]))
     model.transform(pycolmap.Sim3d(1.01, turn, np.array([5.0, -2.0, 1.0])))
-    larger = rigs.compare(drive.scene, model, 1.0)
+    larger = rigs.compare(drive, model, 1.0)
     assert larger.scale_error == pytest.approx(0.01, rel=1e-6)
-    size = np.linalg.norm(drive.scene.centers - drive.scene.centers.mean(axis=0), axis=1)
+    size = np.linalg.norm(drive.centers - drive.centers.mean(axis=0), axis=1)
     np.testing.assert_allclose(larger.errors_m, 0.01 * size, rtol=1e-6)
     worse = larger._replace(num_images=11)
     names = ("placed", "scale", f"mean / {rigs.HELD}", f"mean / {rigs.FREE}")
