@@ -18,9 +18,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder with a report.html")
     parser.add_argument("picture", type=Path, help="PNG to write")
-    parser.add_argument("--dark", action="store_true", help="in dark colors")
     args = parser.parse_args()
-    with chromium(*SIZE, dark=args.dark) as driver:
+    with chromium(*SIZE) as driver:
         opened(driver, (args.out / "report.html").resolve())
         driver.execute_script(
             "document.getElementById('next').hidden = true"
