@@ -1,5 +1,6 @@
 """Reconstructions adjusted and triangulated through the doors to arrays, as the pipeline does it."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +24,17 @@ from sfm_shapefit.tracks.options import StructureOptions
 
 
 def posed_images(model):
-    """The posed images of a model, in the order of their ids."""
+    """The posed images of a model, in the order of their ids, through lenses that are all in doubt."""
     every = images_of(model)
     own = every.part(np.flatnonzero(every.is_posed))
-    return own.part(np.argsort(own.ids))
+    own = own.part(np.argsort(own.ids))
+    return own.with_lenses([in_doubt(lens) for lens in own.lenses])
+
+
+def in_doubt(lens, focal_sigma=0.3, distortion_sigma=0.1):
+    """A lens that may be off as it stands."""
+    sigmas = {"focal_sigma": focal_sigma, "distortion_sigma": distortion_sigma}
+    return replace(lens, given=lens.parameters, **sigmas)
 
 
 def copy_without_points(model):

@@ -54,7 +54,7 @@ CHANGES = {
     "a figure in locate.json": Change(2, r"\bline_sigma\b", {"facts/model.py", "facts/result.py"}),
     "something else that adjustments may free": Change(
         5,
-        r"\bhas_sensors\b|\bSensorSigma\b|\bfree_sensors\b|\bfrees_rigs\b",
+        r"\bhas_sensors\b|\bjudge_sensors\b|\bfree_sensors\b|\bfrees_rigs\b|\bplace_sigma\b",
         {
             "adjustment/estimate.py",
             "adjustment/free_sensors.py",

@@ -249,7 +249,7 @@ def change_focal_lengths(scene: Scene) -> Row:
 
 
 def change_camera(model: ColmapModel, images: IntArray, factor: float) -> tuple[ColmapModel, int]:
-    """Return a model some of whose images have a camera of their own, of another focal length, and its id."""
+    """Return a model some of whose images have another camera, of another focal length, and its row."""
     own, rotations = model.images.apart(), model.images.rotations
     first = own.lenses[own.lens_of[images[0]]]
     params = list(first.parameters)
@@ -260,7 +260,7 @@ def change_camera(model: ColmapModel, images: IntArray, factor: float) -> tuple[
     lenses = (*own.lenses, replace(first, parameters=tuple(params), id=new_id))
     alone = replace(own, lenses=lenses, lens_of=lens_of, sensors=own.sensors.part(np.zeros(len(lenses), int)))
     used = alone.part(np.arange(own.num_images))  # only lenses that an image looks through
-    return replace(model, images=used.turned_to(rotations)), new_id
+    return replace(model, images=used.turned_to(rotations)), len(used.lenses) - 1
 
 
 BENCHMARK = Benchmark(

@@ -29,6 +29,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.scene.lens import FOCAL_LENGTHS
 
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
 _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest
@@ -199,6 +200,21 @@ def _dual(motions: FloatArray) -> FloatArray:
         gram = np.einsum("nai,naj->ij", dual, motions)
     read: FloatArray = dual @ np.linalg.inv(gram)
     return read
+
+
+def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
+    """Return the standard deviation of each lens's focal length as a share of it, (l,); 0 for what is held.
+
+    Args:
+        problem: at its minimum, with its priors.
+        options: as it was adjusted with.
+
+    Raises:
+        UnsolvableError: if the observations leave more open than a similarity.
+    """
+    sigmas = estimate_covariances(problem, options).lens_sigmas[:, FOCAL_LENGTHS]
+    values = np.array([lens.values()[FOCAL_LENGTHS] for lens in problem.lenses])
+    return np.asarray((sigmas / values).max(axis=1))
 
 
 def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int) -> FrameCovariances:

@@ -1,29 +1,15 @@
 """What an adjustment gives back: images where they stand, and how well that is known."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
 
-from sfm_shapefit.adjustment.free_sensors import SensorSigma
+import numpy as np
+
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
-
-
-class RefinedLenses(NamedTuple):
-    """What an adjustment makes of the lenses that it may change, by the ids of their cameras."""
-
-    sigmas: Mapping[int, float]
-    """Standard deviation of the focal length, as a share of it."""
-    undetermined: tuple[int, ...]
-    """Those whose focal length the points leave open: it is what was given."""
-
-
-UNREFINED = RefinedLenses({}, ())
-"""Where no lens was free."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,10 +27,13 @@ class Estimate:
     `shared_errors`. None where they are not known, as of models of more frames than are worth the time."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
-    lenses: RefinedLenses = UNREFINED
-    """What became of lenses that were free."""
-    sensors: Mapping[int, SensorSigma] = field(default_factory=dict)
-    """Of the sensors that were free in their rigs, by the ids of their cameras."""
+    focal_sigmas: FloatArray
+    """(l,) standard deviations of the focal lengths that were free, as shares of them; NaN for the others."""
+    undetermined: BoolArray
+    """(l,) lenses whose focal length the points leave open: it is what was given."""
+    sensor_sigmas: FloatArray
+    """(l, 2) standard deviations of the sensors that were free in their rigs, see `judge_sensors`; NaN for
+    the others."""
     initial_error_px: float = math.nan
     """Mean reprojection error at the poses of the start, of the points triangulated there."""
     final_error_px: float = math.nan
@@ -53,6 +42,21 @@ class Estimate:
     """Whether the last solve met its tolerance within its limit of 100 steps."""
     iterations: int = 0
     """Steps of all solves together."""
+
+    @property
+    def is_refined(self) -> BoolArray:
+        """Lenses whose focal length was free, (l,)."""
+        return ~np.isnan(self.focal_sigmas)
+
+    @property
+    def is_tried(self) -> BoolArray:
+        """Lenses whose focal length was free, or is held because the points left it open, (l,)."""
+        return self.is_refined | self.undetermined
+
+    @property
+    def refines_sensors(self) -> bool:
+        """Whether sensors were free in their rigs."""
+        return bool(np.isfinite(self.sensor_sigmas).any())
 
     @property
     def statement(self) -> str:

@@ -1,20 +1,18 @@
 """Sensors that may move in their rigs: how well the observations tell where they are."""
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem
 from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.scene.images import Images
 
 # Errors that keypoints share make those of a sensor's pose larger than the noise alone does, as those of a
-# focal length (`adjustment.free_lenses`).
+# focal length (`scene.lens`).
 _SHARED_NOISE = 7.0
 _LARGEST_TURN_RAD = math.radians(1.0)
 _OPEN_SENSOR = (
@@ -23,19 +21,10 @@ _OPEN_SENSOR = (
 )
 
 
-class SensorSigma(NamedTuple):
-    """How well an adjustment knows the pose of a sensor in its rig, by the noise alone."""
-
-    place: float
-    """Largest standard deviation of its place along an axis of the rig, units of the seed."""
-    turn_rad: float
-    """Largest standard deviation of its rotation about an axis."""
-
-
 def judge_sensors(
     images: Images, free: BoolArray, adjusted: AdjustmentProblem, options: AdjustmentOptions
-) -> Mapping[int, SensorSigma]:
-    """Return how well free sensors are known, by the ids of their cameras.
+) -> FloatArray:
+    """Return how well the poses of sensors in their rigs are known, by the noise alone.
 
     Args:
         images: those of the problem.
@@ -43,21 +32,26 @@ def judge_sensors(
         adjusted: the problem, at its minimum.
         options: by which that is one.
 
+    Returns:
+        Largest standard deviations (l, 2) of the place along an axis, units of the images, and of the
+        rotation about one, rad; NaN for sensors that are held.
+
     Raises:
         InputError: if the observations leave the pose of a sensor open.
     """
+    found = np.full((len(free), 2), np.nan)
     if not free.any():
-        return {}
+        return found
     assert adjusted.rig is not None
     try:
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:
         raise InputError(_OPEN_SENSOR.format(camera="one of the sensors")) from error
-    camera_ids = [images.lenses[k].id for k in np.flatnonzero(free).tolist()]
     longest = float(np.linalg.norm(adjusted.rig.translations, axis=1).max())
     limits = np.repeat([METRIC_SIGMA * longest, _LARGEST_TURN_RAD], 3) / _SHARED_NOISE
     off = np.nan_to_num((sigmas / limits).max(axis=1), nan=np.inf)
     if off.max() > 1.0:
-        raise InputError(_OPEN_SENSOR.format(camera=f"camera {camera_ids[int(np.argmax(off))]}"))
-    largest = zip(camera_ids, sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1), strict=True)
-    return {camera_id: SensorSigma(float(place), float(turn)) for camera_id, place, turn in largest}
+        worst = images.lenses[np.flatnonzero(free)[np.argmax(off)]]
+        raise InputError(_OPEN_SENSOR.format(camera=f"camera {worst.id}"))
+    found[free] = np.column_stack([sigmas[:, :3].max(axis=1), sigmas[:, 3:].max(axis=1)])
+    return found

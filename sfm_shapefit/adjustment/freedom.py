@@ -1,15 +1,30 @@
-"""What an adjustment may change beside centers and points, and what is known of poses beside the pixels."""
+"""What an adjustment may change beside centers and points, and what is known of poses beside the pixels.
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+Only lenses in doubt move, each with a prior about what was given. The prior of a focal length is relative,
+exp(+-s) f to first order; those of the distortion are absolute, as the coefficients of a lens are of the same
+size whatever its focal length. What the observations leave open after all shows in the standard deviation at
+the answer: a focal length that is not credible (`Lens.is_credible`) stays as given. The distortion of such a
+lens stays free, with its prior. Along a street driven straight ahead the focal length is a stretch of the
+whole scene along the way, which no pixel sees; what bends the street sideways is the distortion, and each
+pixel sees it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
-from sfm_shapefit.adjustment.problem import AdjustmentProblem, RotationPrior, isotropic_information
+from sfm_shapefit.adjustment.problem import (
+    AdjustmentProblem,
+    LensPrior,
+    RotationPrior,
+    isotropic_information,
+)
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.lens import Lens
 
 
 class GivenPoses(NamedTuple):
@@ -43,8 +58,10 @@ class Freedom:
     They enter covariances, and nothing else."""
     noise_px: float = 0.5
     """Standard deviation of an observation per axis, which pulls are weighed against."""
-    lenses: FreeLenses = ALL_HELD
-    """All others stay what they are to the bit."""
+    focal: BoolArray = field(default_factory=lambda: np.zeros((), dtype=np.bool_))
+    """Lenses whose focal lengths move, (l,) or one for all; they are in doubt."""
+    distortion: BoolArray = field(default_factory=lambda: np.zeros((), dtype=np.bool_))
+    """Lenses whose distortion moves, (l,) or one for all; they are in doubt."""
     has_sensors: bool = False
     """Whether sensors move in their rigs, all but the references."""
 
@@ -66,11 +83,40 @@ class Freedom:
         """Return the lenses that move in their rigs, (l,)."""
         return self.has_sensors & ~images.sensors.is_reference
 
-    def of(self, frames: IntArray) -> "Freedom":
-        """Return the freedom of some of the frames."""
+    @property
+    def lenses(self) -> BoolArray:
+        """Lenses that move, (l,) or one for all; all others stay what they are to the bit."""
+        return self.focal | self.distortion
+
+    def over(self, num_lenses: int) -> "Freedom":
+        """Return the same with the lenses one by one."""
+        focal, distortion = (np.broadcast_to(one, num_lenses) for one in (self.focal, self.distortion))
+        return replace(self, focal=focal, distortion=distortion)
+
+    def holding(self, held: BoolArray, lenses: Sequence[Lens]) -> "Freedom":
+        """Return the same, the focal lengths of `held` lenses (l,) among all held; else the whole lens.
+
+        Whole: where its distortion does not move by itself, as the focal length was held already, or as it
+        has none.
+        """
+        bends = np.array([lens.is_bent for lens in lenses], dtype=np.bool_)
+        distortion = self.distortion & ~(held & ~(self.focal & bends))
+        return replace(self, focal=self.focal & ~held, distortion=distortion)
+
+    def overrides(self) -> dict[str, Any]:
+        """Return the options of an adjustment that moves its lenses."""
+        return {
+            "free_focal_lengths": bool(self.lenses.any()),
+            "free_distortion": bool(self.distortion.any()),
+        }
+
+    def of(self, frames: IntArray, lenses: IntArray) -> "Freedom":
+        """Return the freedom of some of the frames and lenses."""
         pull, doubt = self.pull_rad, self.doubt_rad
         return replace(
             self,
+            focal=self.focal[lenses] if self.focal.ndim else self.focal,
+            distortion=self.distortion[lenses] if self.distortion.ndim else self.distortion,
             pull_rad=pull[frames] if isinstance(pull, np.ndarray) else pull,
             doubt_rad=doubt[frames] if isinstance(doubt, np.ndarray) else doubt,
         )
@@ -88,9 +134,23 @@ class Freedom:
 
     def apply(self, problem: AdjustmentProblem, given: FloatArray | None) -> AdjustmentProblem:
         """Return the problem with the pull of given rotations (f, 3, 3), and with what holds its lenses."""
-        problem = self.lenses.apply(problem)
+        problem = self._apply_to_lenses(problem)
         if given is None or self.holds_rotations or np.isinf(self.least_pull_rad):
             return problem
         sigmas = np.broadcast_to(np.asarray(self.pull_rad), problem.num_frames)
         prior = RotationPrior(rotations=given, information=isotropic_information(sigmas))
         return replace(problem, rotation_prior=prior)
+
+    def _apply_to_lenses(self, problem: AdjustmentProblem) -> AdjustmentProblem:
+        """Return the problem with its lenses fixed but for those that move, which their doubts pull at."""
+        if not self.lenses.any():
+            return problem
+        values = np.array([lens.values() for lens in problem.lenses])
+        information, lenses = np.zeros_like(values), list(problem.lenses)
+        over = self.over(len(lenses))
+        for k, lens in enumerate(problem.lenses):
+            lenses[k] = replace(lens, fixed=not over.lenses[k], focal_fixed=not over.focal[k])
+            if over.lenses[k]:
+                values[k], information[k] = lens.as_given().values(), lens.information()
+        prior = LensPrior(values=values, information=information)
+        return replace(problem, lenses=lenses, lens_prior=prior)

@@ -40,14 +40,15 @@ from sfm_shapefit.adjustment import (
     frames_not_gained,
     reprojection_errors_px,
 )
-from sfm_shapefit.adjustment.estimate import UNREFINED, Estimate, RefinedLenses
-from sfm_shapefit.adjustment.free_lenses import focal_sigmas
+from sfm_shapefit.adjustment.covariance import focal_sigmas
+from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -97,7 +98,10 @@ class AdjustmentRun:
     given: GivenPoses
     checked_length: int
     """Fewest observations of a point that a model may have."""
-    lenses: RefinedLenses = UNREFINED
+    focal_sigmas: FloatArray
+    """(l,) those of `Estimate`."""
+    undetermined: BoolArray
+    """(l,) those of `Estimate`."""
     loss_scale_px: float = 1.0
     """That of the last solve."""
     iterations: int = 0
@@ -107,7 +111,7 @@ class AdjustmentRun:
     @property
     def frees_more_than_poses(self) -> bool:
         """Whether lenses or sensors change."""
-        return bool(self.freedom.lenses.doubts) or bool(self.freedom.sensors(self.images).any())
+        return bool(self.freedom.lenses.any()) or bool(self.freedom.sensors(self.images).any())
 
     def triangulate(
         self, widening: float, *, checked: bool = False
@@ -179,7 +183,7 @@ class AdjustmentRun:
             run.options_at_optimum(),
             cost_tolerance=fall,
             first_damping=first_damping,
-            **self.freedom.lenses.overrides(),
+            **self.freedom.overrides(),
         )
         run = replace(run, iterations=run.iterations + done.iterations, converged=done.converged)
         return run.moved(views_of(self.images).images_of(self.images, done.problem)), done.problem
@@ -200,35 +204,31 @@ class AdjustmentRun:
             return replace(self, images=images)
         return replace(self, images=images, links=with_rays_of(images, self.links, changed))
 
-    def judge_lenses(self, last: AdjustmentProblem) -> "tuple[AdjustmentRun, list[int]]":
-        """Return the run with how well focal lengths are known, and the cameras that leave theirs open."""
-        free = self.freedom.lenses
-        if not free.doubts:
-            return self, []
-        ids = [lens.id for lens in self.images.lenses]
+    def judge_lenses(self, last: AdjustmentProblem) -> "tuple[AdjustmentRun, BoolArray]":
+        """Return the run with how well focal lengths are known, and the lenses (l,) left open."""
+        free, lenses = self.freedom, self.images.lenses
+        if not free.lenses.any():
+            return self, free.lenses
         try:
-            sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides())).tolist()
+            sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
         except UnsolvableError:
-            sigmas = [math.inf] * len(ids)
-        found, told = dict(zip(ids, sigmas, strict=True)), free.with_free_focal()
-        lenses = self.lenses._replace(sigmas={i: found[i] for i in ids if i in told})
-        unknown = [
-            lens.id
-            for lens in self.images.lenses
-            if lens.id in free.doubts and not free.doubts[lens.id].accepts(lens, found[lens.id])
-        ]
-        return replace(self, lenses=lenses), unknown
+            sigmas = np.full(len(lenses), np.inf)
+        sigmas = np.where(np.isnan(sigmas), np.inf, sigmas)
+        is_open = free.lenses.copy()
+        for k in np.flatnonzero(free.lenses).tolist():
+            is_open[k] = not lenses[k].is_credible(float(sigmas[k]))
+        return replace(self, focal_sigmas=np.where(free.focal, sigmas, np.nan)), is_open
 
-    def holding(self, cameras: list[int]) -> "AdjustmentRun":
-        """Return the run with lenses as they were given, their focal lengths held from now on.
+    def holding(self, held: BoolArray) -> "AdjustmentRun":
+        """Return the run with some lenses (l,) as they were given, their focal lengths held from now on.
 
         A lens that is not to be believed even so is held as a whole.
         """
-        free, undetermined = self.freedom.lenses, dict.fromkeys((*self.lenses.undetermined, *cameras))
-        given = {camera: free.doubts[camera].given for camera in cameras}
-        run = self.moved(self.images.with_lenses([given.get(lens.id, lens) for lens in self.images.lenses]))
-        freedom = replace(run.freedom, lenses=free.holding(cameras))
-        return replace(run, freedom=freedom, lenses=run.lenses._replace(undetermined=tuple(undetermined)))
+        old = self.images.lenses
+        lenses = [lens.as_given() if held[k] else lens for k, lens in enumerate(old)]
+        run = self.moved(self.images.with_lenses(lenses))
+        freedom = run.freedom.holding(held, old)
+        return replace(run, freedom=freedom, undetermined=run.undetermined | held)
 
     def estimate(
         self,
@@ -246,8 +246,9 @@ class AdjustmentRun:
             errors=errors,
             covariances=None if known is None else known.covariances[self.images.frame_of],
             scale_sigma=None if known is None else known.scale_sigma,
-            lenses=self.lenses,
-            sensors=judge_sensors(self.images, free, last, self.options_at_optimum()),
+            focal_sigmas=self.focal_sigmas,
+            undetermined=self.undetermined,
+            sensor_sigmas=judge_sensors(self.images, free, last, self.options_at_optimum()),
             initial_error_px=initial_error_px,
             converged=self.converged,
             iterations=self.iterations,
@@ -278,13 +279,16 @@ def begin(
 ) -> AdjustmentRun:
     """Return the run of an adjustment that is to begin."""
     fewest = options.fewest_views(images.num_images) if isinstance(links, MatchedKeypoints) else 2
+    num_lenses = len(images.lenses)
     return AdjustmentRun(
         images=images,
         links=links,
         options=options,
-        freedom=freedom,
+        freedom=freedom.over(num_lenses),
         given=given if given.rotations is not None else given._replace(rotations=images.frames.rotations),
         checked_length=max(options.min_track_length, fewest),
+        focal_sigmas=np.full(num_lenses, np.nan),
+        undetermined=np.zeros(num_lenses, dtype=np.bool_),
     )
 
 
@@ -325,10 +329,10 @@ def repeat_with_known_lenses(run: AdjustmentRun, solve: Callable[[AdjustmentRun]
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
-        run, unknown = run.judge_lenses(last)
-        if not unknown:
+        run, is_open = run.judge_lenses(last)
+        if not is_open.any():
             return run, last
-        run, last = solve(run.holding(unknown))
+        run, last = solve(run.holding(is_open))
     return run.judge_lenses(last)[0], last
 
 

@@ -1,18 +1,17 @@
 """What became of intrinsics that were in doubt: which, why, how they changed, and how sure that is."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from typing import Annotated, Literal
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import UNREFINED, RefinedLenses
-from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of
-from sfm_shapefit.files.colmap.intrinsics import Origin
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.lens import Origin
 
 _NAMED = 3
 _UNCHANGED = 1e-12
@@ -68,60 +67,79 @@ class CameraIntrinsics(Record):
         return ", distortion " + ", ".join(f"{value:.4f}" for value in after[is_distortion])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DoubtedIntrinsics:
-    """Cameras whose intrinsics are in doubt, and what became of them; by COLMAP's ids of cameras."""
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedIntrinsics:
+    """What may still change of lenses in doubt, and what became of them so far; arrays over lenses."""
 
-    given: Mapping[int, Lens] = field(default_factory=dict)
-    """As they were given."""
-    origins: Mapping[int, Origin] = field(default_factory=dict)
-    """Where those come from."""
-    free: FreeLenses = ALL_HELD
-    """What adjustments may still change."""
-    view_graph: Mapping[int, float] = field(default_factory=dict)
-    """By which factor the view graph made focal lengths larger, before anything was adjusted."""
-    refined: RefinedLenses = UNREFINED
-    """What the adjustments made of them."""
+    focal: BoolArray
+    """(l,) lenses whose focal length adjustments may change."""
+    distortion: BoolArray
+    """(l,) lenses whose distortion adjustments may change."""
+    by_view_graph: BoolArray
+    """(l,) lenses whose focal length the view graph has changed before anything was adjusted."""
+    focal_sigmas: FloatArray
+    """(l,) standard deviations of adjusted focal lengths, as shares of them; NaN if none was adjusted."""
+    undetermined: BoolArray
+    """(l,) lenses whose focal length an adjustment has left open."""
 
-    def after(self, refined: RefinedLenses, free: FreeLenses) -> "DoubtedIntrinsics":
-        """Return the same after one more adjustment; what it left open is held from then on."""
-        undetermined = tuple(dict.fromkeys((*self.refined.undetermined, *refined.undetermined)))
-        together = RefinedLenses({**self.refined.sigmas, **refined.sigmas}, undetermined)
-        return replace(self, refined=together, free=free)
+    @property
+    def may_change(self) -> bool:
+        """Whether adjustments may change any lens."""
+        return bool(self.focal.any() or self.distortion.any())
 
-    def how(self, camera: int) -> How:
-        """Return what decided about the focal length of a camera at last."""
-        if camera in self.refined.undetermined:
+    def part(self, lenses: IntArray) -> "RefinedIntrinsics":
+        """Return those of some lenses."""
+        return RefinedIntrinsics(*(getattr(self, one.name)[lenses] for one in fields(self)))
+
+    def after(self, estimate: Estimate, lenses: IntArray) -> "RefinedIntrinsics":
+        """Return the same after an adjustment of some lenses, by their rows; what it left open is held."""
+        focal, distortion, undetermined = self.focal.copy(), self.distortion.copy(), self.undetermined.copy()
+        focal[lenses], distortion[lenses] = estimate.freedom.focal, estimate.freedom.distortion
+        undetermined[lenses] |= estimate.undetermined
+        sigmas = self.focal_sigmas.copy()
+        sigmas[lenses] = np.where(estimate.is_refined, estimate.focal_sigmas, sigmas[lenses])
+        return RefinedIntrinsics(focal, distortion, self.by_view_graph, sigmas, undetermined)
+
+    def how(self, lens: int) -> How:
+        """Return what decided about the focal length of a lens at last."""
+        if self.undetermined[lens]:
             return "undetermined"
-        if camera in self.refined.sigmas:
+        if not np.isnan(self.focal_sigmas[lens]):
             return "adjusted"
-        return "view graph" if camera in self.view_graph else "held"
+        return "view graph" if self.by_view_graph[lens] else "held"
 
     def rows(self, images: Images) -> list[CameraIntrinsics]:
-        """Return a row for each camera that took placed images and was in doubt."""
+        """Return a row for each lens that took placed images and was in doubt."""
         counts = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)).tolist()
-        taken = zip(images.lenses, counts, strict=True)
-        return [self._row(lens.id, lens, count) for lens, count in taken if count and lens.id in self.origins]
+        rows = []
+        for k, lens in enumerate(images.lenses):
+            if lens.origin is None or not counts[k]:
+                continue
+            how, given = self.how(k), lens.as_given()
+            sigma_px = float(self.focal_sigmas[k]) * lens.focal_px
+            rows.append(
+                CameraIntrinsics(
+                    camera=lens.id,
+                    num_images=counts[k],
+                    model=lens.model,
+                    origin=lens.origin.value,
+                    decided_by=how,
+                    given_focal_px=given.focal_px,
+                    focal_px=lens.focal_px,
+                    focal_sigma_px=sigma_px if how == "adjusted" and np.isfinite(sigma_px) else None,
+                    given_parameters=list(given.parameters),
+                    parameters=list(lens.parameters),
+                )
+            )
+        return rows
 
-    def _row(self, camera: int, found: Lens, num_images: int) -> CameraIntrinsics:
-        given, sigma = self.given[camera], self.refined.sigmas.get(camera, np.nan)
-        known = self.how(camera) == "adjusted" and np.isfinite(sigma)
-        return CameraIntrinsics(
-            camera=camera,
-            num_images=num_images,
-            model=found.model,
-            origin=self.origins[camera].value,
-            decided_by=self.how(camera),
-            given_focal_px=given.focal_px,
-            focal_px=found.focal_px,
-            focal_sigma_px=float(sigma) * found.focal_px if known else None,
-            given_parameters=list(given.parameters),
-            parameters=list(found.parameters),
-        )
 
-
-NO_DOUBTS = DoubtedIntrinsics()
-"""Every camera is calibrated, or taken as it is."""
+def intrinsics_in_doubt(
+    focal: BoolArray, distortion: BoolArray, by_view_graph: BoolArray
+) -> RefinedIntrinsics:
+    """Return what adjustments may change of lenses (l,), before any of them."""
+    unknown, nothing = np.full(len(focal), np.nan), np.zeros(len(focal), dtype=np.bool_)
+    return RefinedIntrinsics(focal, distortion, by_view_graph, unknown, nothing)
 
 
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
@@ -140,9 +158,9 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     return ["; ".join(parts) + "; each stands in locate.json"]
 
 
-def intrinsics_warnings(intrinsics: DoubtedIntrinsics, rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
+def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     """Yield which cameras keep a focal length that was never measured."""
-    guessed = [row for row in rows if intrinsics.origins[row.camera] is not Origin.CALIBRATION]
+    guessed = [row for row in rows if row.origin != Origin.CALIBRATION.value]
     for how, what in (
         (
             "undetermined",

@@ -1,7 +1,7 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
-from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
     BundleAdjustment,
@@ -157,8 +157,8 @@ class LocateResult(Displayed):
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
 
-    intrinsics: DoubtedIntrinsics = field(default_factory=DoubtedIntrinsics)
-    """Cameras whose intrinsics were in doubt, and what became of them."""
+    intrinsics: RefinedIntrinsics
+    """What became of the lenses that were in doubt."""
     rigs: tuple[RefinedSensor, ...] = ()
     """The sensors that were refined in their rigs."""
     control_points: tuple[ControlPoint, ...] = ()

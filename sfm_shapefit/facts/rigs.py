@@ -1,11 +1,10 @@
 """What a refinement of rigs made of them: how far each sensor turned and moved, and how sure that is."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
 
-from sfm_shapefit.adjustment.free_sensors import SensorSigma
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.record import Record
@@ -31,31 +30,26 @@ class RefinedSensor(Record):
         )
 
 
-def refined_rigs(
-    given: Images, found: Images, sigmas: Mapping[int, SensorSigma]
-) -> tuple[RefinedSensor, ...]:
-    """Return a row for each sensor that was refined, by the ids of their cameras.
+def refined_rigs(given: Images, found: Images, sigmas: FloatArray) -> tuple[RefinedSensor, ...]:
+    """Return a row for each sensor that was refined.
 
     Args:
         given, found: the same images with their sensors before and after.
-        sigmas: standard deviations of the refined sensors, which are those that have a row.
+        sigmas: (l, 2) standard deviations of place and rotation in rad; NaN for those that have no row.
     """
-    rows = []
-    for k, lens in enumerate(found.lenses):
-        if lens.id in sigmas:
-            before, after = (images.sensors for images in (given, found))
-            moved = sensor_centers(after)[k] - sensor_centers(before)[k]
-            turn = before.rotations[k].T @ after.rotations[k]
-            rows.append(
-                RefinedSensor(
-                    camera=lens.id,
-                    turned_deg=float(rotation_angles_deg(turn[None])[0]),
-                    moved=float(np.linalg.norm(moved)),
-                    distance=float(np.linalg.norm(sensor_centers(after)[k])),
-                    turn_sigma_deg=float(np.degrees(sigmas[lens.id].turn_rad)),
-                    place_sigma=sigmas[lens.id].place,
-                )
+    rows, before, after = [], given.sensors, found.sensors
+    for k in np.flatnonzero(np.isfinite(sigmas[:, 0])).tolist():
+        turn = before.rotations[k].T @ after.rotations[k]
+        rows.append(
+            RefinedSensor(
+                camera=found.lenses[k].id,
+                turned_deg=float(rotation_angles_deg(turn[None])[0]),
+                moved=float(np.linalg.norm(sensor_centers(after)[k] - sensor_centers(before)[k])),
+                distance=float(np.linalg.norm(sensor_centers(after)[k])),
+                turn_sigma_deg=float(np.degrees(sigmas[k, 1])),
+                place_sigma=float(sigmas[k, 0]),
             )
+        )
     return tuple(rows)
 
 

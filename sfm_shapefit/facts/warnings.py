@@ -1,6 +1,6 @@
 """What the user should know beyond the tables, a sentence each."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
-from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.solver.options import Status
 
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
@@ -133,17 +133,16 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         )
 
 
-def focal_warnings(
-    images: Images, doubts: tuple[FocalDoubt, ...], tried: Collection[int] = ()
-) -> Iterator[str]:
-    """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
+def focal_warnings(lenses: Sequence[Lens], doubts: tuple[FocalDoubt, ...], tried: BoolArray) -> Iterator[str]:
+    """Yield which cameras' matches prefer another focal length; of `tried` ones (l,) none was found."""
     for doubt in doubts:
         advice = "--intrinsics focal lets it change"
-        if doubt.camera in tried:
+        if tried[doubt.camera]:
             advice = "the adjustment could not tell, so calibrate that camera"
-        focal_px = next(lens.focal_px for lens in images.lenses if lens.id == doubt.camera)
+        lens = lenses[doubt.camera]
+        focal_px = lens.focal_px
         yield (
-            f"the matches of camera {doubt.camera} prefer a focal length of about "
+            f"the matches of camera {lens.id} prefer a focal length of about "
             f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
             f"asked); its images stand wrong if that is so: {advice}"
         )

@@ -75,29 +75,31 @@ def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
     images, placement, directions = stand.source.images, stand.placement, stand.directions
     posed = posed_part(stand.place())
     links = stand.read_links(posed, clock.advance)
-    freedom = replace(stand.freedom, pull_rad=stand.given.pull_rad)
+    freedom = replace(stand.freedom.of(posed.frames, posed.lenses), pull_rad=stand.given.pull_rad)
     adjusted = adjust_placement(posed.images, links, options.structure, freedom, stand.given_poses(posed))
     del links
     similarity, centers = stand.gauge.similarity, np.empty((images.num_images, 3))
     centers[posed.rows] = adjusted.images.centers
     locations = (centers[placement.cameras] - similarity.translation) / similarity.scale
     source = stand.source
-    if not adjusted.freedom.holds_rotations or adjusted.lenses.sigmas or adjusted.sensors:
+    if not adjusted.freedom.holds_rotations or adjusted.is_refined.any() or adjusted.refines_sensors:
         source = source.at(images.turned(adjusted.images))
         corrected = posed.frames[np.broadcast_to(adjusted.freedom.singled_out(), len(posed.frames))]
         is_corrected = np.isin(images.frame_of, corrected)
         directions = _measure_again(source, directions, is_corrected, options.directions, clock)
         turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
         measured = _turn(placement.measured, directions, turns)
-        if adjusted.sensors:  # which stand elsewhere in their frames now
+        if adjusted.refines_sensors:  # which stand elsewhere in their frames now
             measured = rigid_parts(source.images, stand.given.rigid.fixed).apply(measured)
         placement = replace(placement, measured=measured)
+    intrinsics = stand.intrinsics.after(adjusted, posed.lenses)
+    freedom = adjusted.freedom.among(posed.frames, len(images.frames.ids))
     return stand._replace(
         source=source,
         directions=directions,
         placement=move_cameras(placement, locations),
-        freedom=adjusted.freedom.among(posed.frames, len(images.frames.ids)),
-        intrinsics=stand.intrinsics.after(adjusted.lenses, adjusted.freedom.lenses),
+        freedom=replace(freedom, focal=intrinsics.focal, distortion=intrinsics.distortion),
+        intrinsics=intrinsics,
         estimate=adjusted,
         scale=similarity.scale,
         adjustment=adjusted,

@@ -16,7 +16,7 @@ from sfm_shapefit.pipeline.components import pairs_among
 from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
-from sfm_shapefit.pipeline.map_run import MapRun, changed_parameters
+from sfm_shapefit.pipeline.map_run import MapRun
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.settle import settle
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, UselessPriorsError
@@ -34,15 +34,17 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
     ones among them; a placement that is wrong in places knows the focal length all the same. Where a
     camera is in several components, the one with most images counts.
     """
-    found: dict[int, tuple[float, ...]] = {}
+    found, is_found = run.images, np.zeros(len(run.images.lenses), dtype=np.bool_)
     for _, members, averaging in run.average_images(relative, {}):
         given = _given(run, run.pose(members, averaging.rotations), run.inputs)
         source = see_matches(run.matches, given.images, run.inputs, run.options)
         with suppress(UnsolvableError):
             with run.clock("first placement"):
                 first = adjust_first_placement(given, source, run.options, run.clock, thorough=False)
-            found = changed_parameters(first.adjusted) | found
-    return run.images.with_parameters(found)
+            adjusted, rows = first.adjusted, run.images.lenses_of(first.adjusted.images)
+            found = found.with_lenses_of(adjusted.images, adjusted.is_tried & ~is_found[rows])
+            is_found[rows] |= adjusted.is_tried
+    return found
 
 
 def locate_components(
@@ -83,7 +85,7 @@ def _locate_component(
         source = source.at(run.pose(members, first.rotations, first.adjusted))
         given = given._replace(
             rigid=find_rigid_parts(source.images, run.options.placement),
-            intrinsics=given.intrinsics.after(first.adjusted.lenses, first.adjusted.freedom.lenses),
+            intrinsics=given.intrinsics.after(first.adjusted, images.lenses_of(first.adjusted.images)),
         )
     with run.clock("locate"):
         found = _settle(run, source, _with_told(run, given, members), first)
@@ -113,7 +115,8 @@ def _settle(run: MapRun, source: MatchSource, given: Given, first: FirstPlacemen
 def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
     """Return what is known of a component's images before they are placed: nothing that sets a scale."""
     rigid = find_rigid_parts(images, run.options.placement)
-    return Given(run.read.template(images), images, inputs, rigid, np.inf, intrinsics=run.intrinsics)
+    intrinsics = run.intrinsics.part(run.images.lenses_of(images))
+    return Given(run.read.template(images), images, intrinsics, inputs, rigid, np.inf)
 
 
 def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:

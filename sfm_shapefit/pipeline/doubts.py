@@ -132,7 +132,7 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
 def question_focal_lengths(
     source: MatchSource, directions: PairDirections, threads: int
 ) -> tuple[FocalDoubt, ...]:
-    """Return the cameras whose matches prefer another focal length; their labels are COLMAP's camera ids.
+    """Return the cameras whose matches prefer another focal length, labelled by the rows of their lenses.
 
     Only where several cameras took the images: a single one has nothing to be compared with.
     """
@@ -147,8 +147,7 @@ def question_focal_lengths(
     for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         parts.append(_thin(images, batch, rows, _FOCAL_MATCHES[1]))
-    found = doubt_focal_lengths(join_rays(parts), images.rotations, lenses, threads)
-    return tuple(doubt._replace(camera=images.lenses[doubt.camera].id) for doubt in found)
+    return doubt_focal_lengths(join_rays(parts), images.rotations, lenses, threads)
 
 
 def _pairs_of_cameras(directions: PairDirections, camera_of: IntArray) -> IntArray:

@@ -61,7 +61,8 @@ def adjust_first_placement(
     stand = Stand.of(given, source, directions, placement, options)
     posed = posed_part(stand.place())
     links = partial(stand.read_links, posed, clock.advance)
-    adjusted = adjust_thinly(posed.images, links, options.structure, stand.freedom, thorough=thorough)
+    freedom = stand.freedom.of(posed.frames, posed.lenses)
+    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, thorough=thorough)
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(images.num_images), posed.rows)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray
-from sfm_shapefit.facts.intrinsics import NO_DOUBTS, DoubtedIntrinsics
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
@@ -23,6 +23,8 @@ class Given(NamedTuple):
     """What the images were read from."""
     images: Images
     """The images as they were read: what pulls, what is compared with, whose centers may set a scale."""
+    intrinsics: RefinedIntrinsics
+    """What may change of lenses in doubt, and what became of them so far."""
     inputs: Inputs
     rigid: Rigid
     pull_rad: float | None
@@ -32,8 +34,6 @@ class Given(NamedTuple):
     distances: tuple[KnownDistance, ...] = ()
     known: Known = NOTHING_KNOWN
     """What the user told of them beside."""
-    intrinsics: DoubtedIntrinsics = NO_DOUBTS
-    """Which intrinsics are in doubt, and what became of them so far."""
 
     @property
     def rule(self) -> GaugeRule:

@@ -1,17 +1,18 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
-from sfm_shapefit.adjustment.free_lenses import FreeLenses
-from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
+import numpy as np
+
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
 from sfm_shapefit.files.colmap.intrinsics import (
-    Origin,
     calibrate_view_graph,
-    doubt_lenses,
     find_uncalibrated,
-    with_focal_lengths,
+    in_doubt,
+    with_focal_length,
 )
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.freedom import IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Origin
 from sfm_shapefit.scene.matches import PairNames
 
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
@@ -22,8 +23,8 @@ def settle_intrinsics(
     file: DatabaseFile | None,
     wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
-) -> tuple[Images, DoubtedIntrinsics]:
-    """Return the images to start from, and which intrinsics the adjustments may change.
+) -> tuple[Images, RefinedIntrinsics]:
+    """Return the images to start from, lenses in doubt marked, and what adjustments may change of these.
 
     Args:
         images: as given.
@@ -35,20 +36,19 @@ def settle_intrinsics(
         InputError: if the database cannot be read.
     """
     guessed = {} if file is None else find_uncalibrated(file, images)
-    cameras = {lens.id: lens for lens in images.lenses}
-    origins = dict.fromkeys(cameras, Origin.CALIBRATION) if wanted in ("focal", "all") else {}
-    origins |= {i: found.origin for i, found in guessed.items()}
-    doubts = {} if wanted == "held" else doubt_lenses(cameras, origins)
-    factors = {}
+    lenses, factors = list(images.lenses), np.ones(len(images.lenses))
+    if wanted in ("focal", "all"):
+        lenses = [in_doubt(lens, Origin.CALIBRATION) for lens in lenses]
+    for k, found in guessed.items():
+        lenses[k] = in_doubt(images.lenses[k], found.origin)
     if file is not None and guessed and wanted != "held":
-        asked = [found.database_id for found in guessed.values()]
-        by_database = calibrate_view_graph(file, asked, left_out)
-        factors = {i: by_database[g.database_id] for i, g in guessed.items() if g.database_id in by_database}
-        factors = {i: factor for i, factor in factors.items() if 1.0 / _MOST_OFF <= factor <= _MOST_OFF}
-    intrinsics = DoubtedIntrinsics(
-        given={i: cameras[i] for i in origins},
-        origins=origins,
-        free=FreeLenses(doubts, distortion=wanted != "focal"),
-        view_graph=factors,
-    )
-    return with_focal_lengths(images, factors), intrinsics
+        by_database = calibrate_view_graph(file, [g.database_id for g in guessed.values()], left_out)
+        for k, found in guessed.items():
+            factors[k] = by_database.get(found.database_id, 1.0)
+        factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
+    is_free = [lens.origin is not None and lens.is_adjustable and wanted != "held" for lens in lenses]
+    by_view_graph = factors != 1.0
+    for k in np.flatnonzero(by_view_graph).tolist():
+        lenses[k] = with_focal_length(lenses[k], factors[k])
+    free = np.array(is_free, dtype=np.bool_)
+    return images.with_lenses(lenses), intrinsics_in_doubt(free, free & (wanted != "focal"), by_view_graph)

@@ -108,12 +108,9 @@ class _Evidence:
         priors: PositionPriors | None,
         see: Callable[[Images], View],
     ) -> None:
-        parameters = {
-            camera_id: camera.params.tolist()
-            for model in reversed(models)
-            for camera_id, camera in model.located.reconstruction.cameras.items()
-        }
-        self.models, self.images, self.priors = models, images.with_parameters(parameters), priors
+        for placed in (model.located.placed for model in reversed(models)):
+            images = images.with_lenses_of(placed, np.ones(len(placed.lenses), dtype=np.bool_))
+        self.models, self.images, self.priors = models, images, priors
         index = {image_id: k for k, image_id in enumerate(images.ids.tolist())}
         self.model_of_image = np.full(images.num_images, -1, dtype=np.int64)
         for number, model in enumerate(models):

@@ -99,12 +99,12 @@ def locate(
         told = Given(
             template,
             images,
+            intrinsics,
             inputs,
             rigid,
             pull_of_rotations(options.rotations),
             scale=options.gauge.scale,
             distances=options.gauge.known_distance,
             known=known,
-            intrinsics=intrinsics,
         )
         return settle(told, source, options, clock)

@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches
@@ -76,7 +76,7 @@ class MapRun(NamedTuple):
     read: UnposedImages
     images: Images
     """All of the database, at the origin."""
-    intrinsics: DoubtedIntrinsics
+    intrinsics: RefinedIntrinsics
     """Which of theirs are in doubt."""
     known: Known
     without: PairNames
@@ -135,8 +135,7 @@ class MapRun(NamedTuple):
 
     def share_of_doubted_lenses(self) -> float:
         """Return the share of images whose intrinsics are in doubt."""
-        is_doubted = np.array([lens.id in self.intrinsics.free.doubts for lens in self.images.lenses])
-        return float(np.mean(is_doubted[self.images.lens_of]))
+        return float(np.mean(self.intrinsics.focal[self.images.lens_of]))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]
@@ -178,13 +177,7 @@ class MapRun(NamedTuple):
         """
         images = self.images.part(members)
         if first is not None:
-            images = images.with_parameters(changed_parameters(first))
-            if first.sensors:
+            images = images.with_lenses_of(first.images, first.is_tried)
+            if first.refines_sensors:
                 images = images.with_sensors_of(first.images)
         return images.turned_to(rotations)
-
-
-def changed_parameters(adjusted: Estimate) -> dict[int, tuple[float, ...]]:
-    """Return the parameters of the lenses that were free, or turned out to be left open, by their ids."""
-    free = {*adjusted.lenses.sigmas, *adjusted.lenses.undetermined}
-    return {lens.id: lens.parameters for lens in adjusted.images.lenses if lens.id in free}

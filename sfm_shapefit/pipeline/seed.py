@@ -114,7 +114,7 @@ def _make_points(
         links = stand.read_links(posed, advance)
     with clock("bundle adjustment" if adjusts else "triangulation"):
         if adjusts:  # which triangulates at the poses of the start itself
-            freedom, given = stand.freedom.of(posed.frames), stand.given_poses(posed)
+            freedom, given = stand.freedom.of(posed.frames, posed.lenses), stand.given_poses(posed)
             adjusted, points = adjust_seed(posed.images, links, options.structure, freedom, given)
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         else:

@@ -20,7 +20,6 @@ from functools import partial
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.free_sensors import SensorSigma
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
@@ -128,7 +127,7 @@ def finish_piece(
     stand = started if first is not None and started.held is None else _adjust(started, options, clock)
     with clock("trust"):
         # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
-        asked = stand if given.intrinsics.free.doubts else started
+        asked = stand if given.intrinsics.may_change else started
         is_main = placed.placement.piece == 0  # the lenses of a further piece are asked with those of all
         focal_doubts = (
             question_focal_lengths(asked.source, asked.directions, clock.threads) if is_main else ()
@@ -143,9 +142,9 @@ def finish_piece(
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
-        intrinsics = intrinsics.after(seeded.adjusted.lenses, seeded.adjusted.freedom.lenses)
+        intrinsics = intrinsics.after(seeded.adjusted, before.lenses_of(seeded.adjusted.images))
     sensors = _refined_sensors(stand, first, seeded.adjusted)
-    focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
+    focal_doubts = tuple(one for one in focal_doubts if np.isnan(intrinsics.focal_sigmas[one.camera]))
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     images, source, directions = seeded.images, stand.source, stand.directions
     unsupported = [images.names[k] for k in np.flatnonzero(seeded.unsupported).tolist()]
@@ -178,8 +177,8 @@ def finish_piece(
         turned_deg=turned,
         timings_s=clock.seconds,
         warnings=(
-            *focal_warnings(source.images, focal_doubts, intrinsics.refined.undetermined),
-            *intrinsics_warnings(intrinsics, intrinsics.rows(images)),
+            *focal_warnings(source.images.lenses, focal_doubts, intrinsics.undetermined),
+            *intrinsics_warnings(intrinsics.rows(images)),
             *_collect_warnings(stand, judged, kept, seeded.points.num_points),
             *prior_warnings(prior_angles, directions.pairs, images.names),
             *_gauge_warnings(given.rule, gauge, centers, options.gauge.scale),
@@ -189,7 +188,7 @@ def finish_piece(
         fixed=given.rigid.fixed,
         distances=given.distances,
         prior_angles=prior_angles,
-        focal_doubts=focal_doubts,
+        focal_doubts=tuple(one._replace(camera=images.lenses[one.camera].id) for one in focal_doubts),
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
         control_points=brought.control_points,
@@ -241,20 +240,23 @@ def _choose(stand: Stand, judged: Judged, min_trust: float) -> tuple[BoolArray, 
     return kept, stand._replace(placement=judged, gauge=gauge)
 
 
-def _refined_sensors(
-    stand: Stand, first: FirstPlacement | None, adjusted: Estimate | None
-) -> dict[int, SensorSigma]:
-    """Return how well the sensors are known that moved in their rigs, by the last adjustment of each.
+def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estimate | None) -> FloatArray:
+    """Return how well sensors are known that moved in their rigs, by the last adjustment of each.
+
+    Standard deviations (l, 2) of place and rotation in rad; NaN for sensors that did not move.
 
     Raises:
         InputError: if they were to move, but nothing was adjusted.
     """
-    sensors: dict[int, SensorSigma] = {}
+    images = stand.given.images
+    sigmas = np.full((len(images.lenses), 2), np.nan)
     for done in (None if first is None else first.adjusted, stand.adjustment, adjusted):
-        sensors |= {} if done is None else done.sensors
-    if stand.freedom.has_sensors and not sensors:
+        if done is not None:
+            rows = images.lenses_of(done.images)
+            sigmas[rows] = np.where(np.isnan(done.sensor_sigmas), sigmas[rows], done.sensor_sigmas)
+    if stand.freedom.has_sensors and np.isnan(sigmas).all():
         raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
-    return sensors
+    return sigmas
 
 
 def _gauge_warnings(rule: GaugeRule, gauge: Gauge, centers: FloatArray, asked: Scale) -> Iterator[str]:

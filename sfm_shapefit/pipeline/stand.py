@@ -9,7 +9,7 @@ from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.executors import Advance
-from sfm_shapefit.facts.intrinsics import DoubtedIntrinsics
+from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
@@ -30,6 +30,8 @@ class PosedPart(NamedTuple):
     """(i,) their rows among all."""
     frames: IntArray
     """(f,) rows of their frames among all."""
+    lenses: IntArray
+    """(l,) rows of their lenses among all."""
 
 
 class Stand(NamedTuple):
@@ -44,7 +46,7 @@ class Stand(NamedTuple):
     """The map from the placement's locations to the frame that is worked in."""
     freedom: Freedom
     """What may move."""
-    intrinsics: DoubtedIntrinsics
+    intrinsics: RefinedIntrinsics
     held: KnownPositions | None = None
     """Priors that pull at the frames and hold the gauge by that, with the weights that they ended with."""
     estimate: Estimate | None = None
@@ -65,8 +67,9 @@ class Stand(NamedTuple):
     ) -> "Stand":
         """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
         gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
-        free = Freedom(lenses=given.intrinsics.free, has_sensors=given.frees_rigs(options.freedom.rigs))
-        return cls(given, source, directions, placement, gauge, free, given.intrinsics)
+        lenses, moves = given.intrinsics, given.frees_rigs(options.freedom.rigs)
+        freedom = Freedom(focal=lenses.focal, distortion=lenses.distortion, has_sensors=moves)
+        return cls(given, source, directions, placement, gauge, freedom, lenses)
 
     def place(self, kept: BoolArray | None = None) -> Images:
         """Return all images where they are placed, fixed ones as they were; NaN where neither.
@@ -112,4 +115,5 @@ def posed_part(images: Images) -> PosedPart:
     """Return those of some images that have a pose."""
     rows = np.flatnonzero(images.is_posed)
     rows = rows[np.argsort(images.ids[rows])]
-    return PosedPart(images.part(rows), rows, np.unique(images.frame_of[rows]))
+    frames, lenses = (np.unique(of[rows]) for of in (images.frame_of, images.lens_of))
+    return PosedPart(images.part(rows), rows, frames, lenses)

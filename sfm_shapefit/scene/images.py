@@ -13,7 +13,7 @@ an image of frame f through lens l, the coordinates
     x = R_l R_f (X - C_f) + t_l,        (R_l, t_l) = sensor_from_rig of the lens, the identity of a reference.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -191,17 +191,14 @@ class Images:
 
     def updated(self, part: "Images") -> "Images":
         """Return the images with frames, lenses and sensors as a part of them has them now."""
-        rows = np.searchsorted(self.frames.ids, part.frames.ids)
-        lenses = {lens.id: k for k, lens in enumerate(self.lenses)}
-        own = [lenses[lens.id] for lens in part.lenses]
-        frames, sensors, found = self.frames, self.sensors, list(self.lenses)
+        rows, own = np.searchsorted(self.frames.ids, part.frames.ids), self.lenses_of(part)
+        frames, sensors = self.frames, self.sensors
         moved = [frames.rotations.copy(), frames.centers.copy()]
         turned = [sensors.rotations.copy(), sensors.translations.copy()]
         moved[0][rows], moved[1][rows] = part.frames.rotations, part.frames.centers
         turned[0][own], turned[1][own] = part.sensors.rotations, part.sensors.translations
-        for k, lens in zip(own, part.lenses, strict=True):
-            found[k] = lens
-        return self.posed(*moved).with_sensors(*turned).with_lenses(found)
+        every = np.ones(len(own), dtype=np.bool_)
+        return self.posed(*moved).with_sensors(*turned).with_lenses_of(part, every)
 
     def turned(self, part: "Images") -> "Images":
         """Return the images with rotations, lenses and sensors of a part of them; frames stay in place."""
@@ -235,11 +232,16 @@ class Images:
         turns = sensors.transpose(0, 2, 1) @ rotations[first]
         return self.posed(turns, np.zeros((len(first), 3)))
 
-    def with_parameters(self, found: Mapping[int, Sequence[float]]) -> "Images":
-        """Return the images with other parameters of some lenses, by their ids."""
-        return self.with_lenses(
-            [replace(lens, parameters=tuple(found.get(lens.id, lens.parameters))) for lens in self.lenses]
-        )
+    def lenses_of(self, part: "Images") -> IntArray:
+        """Return which lenses those of a part of the images are, rows (l,)."""
+        return np.searchsorted([lens.id for lens in self.lenses], [lens.id for lens in part.lenses])
+
+    def with_lenses_of(self, part: "Images", chosen: BoolArray) -> "Images":
+        """Return the images with the `chosen` lenses (l,) of a part of them."""
+        lenses, rows = list(self.lenses), self.lenses_of(part).tolist()
+        for k in np.flatnonzero(chosen).tolist():
+            lenses[rows[k]] = part.lenses[k]
+        return self.with_lenses(lenses)
 
     def with_lenses(self, lenses: Sequence[Lens]) -> "Images":
         """Return the images with other parameters of their lenses."""

@@ -8,7 +8,7 @@ pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from enum import Enum
 
 import numpy as np
 
@@ -18,9 +18,8 @@ from sfm_shapefit.base.errors import InputError
 _FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
 
 
-NUM_VALUES = 8
-"""Parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2."""
-
+NUM_VALUES = 8  # parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2
+FOCAL_LENGTHS, DISTORTION = slice(0, 2), slice(4, NUM_VALUES)  # where they are among these parameters
 
 # For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
 _PLACES = {
@@ -30,14 +29,28 @@ _PLACES = {
     "RADIAL": (-1, _CX, _CY, _K1, _K2),
     "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
 }
+_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how the names of models with a single focal length begin
 
-
-# Newton steps that undo a distortion end when all are shorter, relative to the focal length.
+# Newton steps that undo a distortion, at most, and their length, relative to the focal length, below which
+# all have ended; double precision is reached.
 _MOST_STEPS, _STILL = 30, 1e-12
-_PIXELS_A_SLICE = 20_000  # whose arrays stay in the cache
+_PIXELS_A_SLICE = 20_000  # pixels undistorted at once; their arrays stay in the cache
 
-_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")
-"""How the names of models with a single focal length begin."""
+LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, the observations leave it open
+# Factor by which the errors that keypoints share make those of a focal length larger than the noise alone
+# does; measured on kitti-turn, driven straight ahead for the greatest part.
+_SHARED_NOISE = 7.0
+_CONTRADICTION = 10.0  # sigmas, of the noise and of what was given; as many are no chance
+# Factor of the focal length, and largest coefficient of the distortion; a lens beyond has run away.
+_MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
+
+
+class Origin(Enum):
+    """Where the intrinsics of a camera come from; the value names it in words."""
+
+    GUESS = "a guess"
+    EXIF = "EXIF data"
+    CALIBRATION = "given"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +70,14 @@ class Lens:
     width: int = 0
     """Of the pictures, in pixels; 0 if unknown, as is the height."""
     height: int = 0
+    origin: Origin | None = None
+    """Where its parameters came from; None if they are not in doubt."""
+    given: tuple[float, ...] = ()
+    """Parameters as they were given, of a lens in doubt."""
+    focal_sigma: float = 0.0
+    """Standard deviation of the given focal lengths, as a share of them; positive for a lens in doubt."""
+    distortion_sigma: float = 0.0
+    """Standard deviation of each coefficient of the given distortion; positive for a lens in doubt."""
 
     @property
     def is_adjustable(self) -> bool:
@@ -128,6 +149,35 @@ class Lens:
             unknown += 1
         return slots
 
+    def as_given(self) -> "Lens":
+        """Return the lens with the parameters that were given."""
+        return replace(self, parameters=self.given)
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the model has a distortion."""
+        return bool(self.own_values()[DISTORTION].any())
+
+    def information(self) -> FloatArray:
+        """Return the inverse variances of the OPENCV parameters as given, (8,); 0 for those always held."""
+        information = np.zeros(NUM_VALUES)
+        information[FOCAL_LENGTHS] = (self.focal_sigma * self.as_given().values()[FOCAL_LENGTHS]) ** -2.0
+        information[DISTORTION] = self.distortion_sigma**-2.0
+        return information
+
+    def is_credible(self, sigma: float) -> bool:
+        """Return whether an adjusted lens is to be believed, its focal length known to `sigma` by the noise.
+
+        It is to be known better than what was given, or to contradict that clearly. A lens that has run away,
+        beyond what any lens given so is off by, is not believed either.
+        """
+        ratio = self.values()[0] / self.as_given().values()[0]
+        sound = bool(np.abs(self.values()[DISTORTION]).max() <= _MOST_DISTORTION)
+        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
+        better = _SHARED_NOISE * sigma <= self.focal_sigma
+        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
+        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
+
 
 def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float) -> FloatArray:
     """Return the points (2, m) that a lens of focal length 1 maps to `distorted`; NaN where there is none."""
@@ -154,54 +204,3 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
     folds = np.roots([5.0 * k2, 3.0 * k1, 1.0])
     largest = min((float(s.real) for s in folds if s.imag == 0.0 and s.real > 0.0), default=np.inf)
     return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
-
-
-LARGEST_SIGMA = 0.02
-"""Of a focal length, as a share of it: beyond, the observations do not tell it."""
-
-
-# Errors that keypoints share make those of a focal length larger than the noise alone does: on kitti-turn,
-# driven straight ahead for the greatest part, seven times.
-_SHARED_NOISE = 7.0
-
-
-# So many standard deviations, of the noise and of what was given, are no chance.
-_CONTRADICTION = 10.0
-
-
-# By what factor a guess may be off, and the largest coefficient of a distortion.
-_MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
-
-
-FOCAL_LENGTHS, DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
-"""Where they are among the parameters of the OPENCV model."""
-
-
-class LensDoubt(NamedTuple):
-    """What was given of a lens, and how far it may be off."""
-
-    given: Lens
-    focal_sigma: float
-    """Standard deviation of its focal lengths, as a share of them."""
-    distortion_sigma: float
-    """Standard deviation of each coefficient of its distortion."""
-
-    def information(self) -> FloatArray:
-        """Return the inverse variances of the OPENCV parameters, (8,); 0 for those that are held anyway."""
-        information = np.zeros(NUM_VALUES)
-        information[FOCAL_LENGTHS] = (self.focal_sigma * self.given.values()[FOCAL_LENGTHS]) ** -2.0
-        information[DISTORTION] = self.distortion_sigma**-2.0
-        return information
-
-    def accepts(self, found: Lens, sigma: float) -> bool:
-        """Return whether an adjusted lens is to be believed, its focal length known to `sigma` by the noise.
-
-        It is to be known better than what was given, or to contradict that clearly. One that has run away,
-        beyond what any lens given so is off by, is not believed either.
-        """
-        ratio = found.values()[0] / self.given.values()[0]
-        sound = bool(np.abs(found.values()[DISTORTION]).max() <= _MOST_DISTORTION)
-        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
-        better = _SHARED_NOISE * sigma <= self.focal_sigma
-        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
-        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust
-from sfm_shapefit.adjustment.covariance import estimate_covariances
-from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
-from sfm_shapefit.scene.lens import LensDoubt
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_sigmas
+from sfm_shapefit.adjustment.freedom import Freedom
 from tests.adjustment.made import disturb, look_at, ring_problem
+from tests.structures import in_doubt
 
 OPTIONS = AdjustmentOptions(loss_scale_px=2.0, cost_tolerance=1e-9)
 TRUE_PX = 500.0
@@ -18,9 +18,9 @@ TRUE_PX = 500.0
 def doubted(problem, given_px, sigma, *, distortion=False):
     """All lenses of a problem in doubt, as given with another focal length, and the problem started there."""
     model, (_, *others) = problem.lenses[0].model, problem.lenses[0].parameters
-    given = Lens(model, (given_px, *others), id=7)
-    free = FreeLenses({7: LensDoubt(given, sigma, 0.1)}, distortion=distortion)
-    return free, free.apply(replace(problem, lenses=[given]))
+    given = in_doubt(Lens(model, (given_px, *others)), sigma)
+    free = Freedom(focal=np.ones(1, bool), distortion=np.full(1, distortion))
+    return free, free.apply(replace(problem, lenses=[given]), None)
 
 
 def solve(free, problem):
@@ -68,38 +68,42 @@ def test_what_the_points_do_not_tell_is_not_accepted():
     for problem, is_known in ((facing_a_wall(rng), False), (ring_problem(rng, noise_px=0.3), True)):
         free, start = doubted(problem, 510.0, 0.3)
         lens, sigma = solve(free, start)
-        assert free.doubts[7].accepts(lens, sigma) == is_known
-    doubt = LensDoubt(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)), 0.3, 0.1)
-    assert doubt.accepts(Lens("SIMPLE_RADIAL", (700.0, 320.0, 240.0, -0.3)), 0.001)
-    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (700.0, 320.0, 240.0, -3.0)), 0.001)
-    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (5000.0, 320.0, 240.0, 0.0)), 0.001)
-    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)), np.inf)
+        assert lens.is_credible(sigma) == is_known
+    given = in_doubt(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)))
+    for focal_px, k1, sigma, is_taken in (
+        (700.0, -0.3, 0.001, True),
+        (700.0, -3.0, 0.001, False),
+        (5000.0, 0.0, 0.001, False),
+        (500.0, 0.0, np.inf, False),
+    ):
+        assert replace(given, parameters=(focal_px, 320.0, 240.0, k1)).is_credible(sigma) == is_taken
     # What was calibrated stays if the noise alone makes an error of its size, and goes if it cannot be right.
-    calibrated = LensDoubt(Lens("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)), 0.01, 0.01)
+    calibrated = in_doubt(Lens("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)), 0.01, 0.01)
     for focal_px, sigma, is_taken in ((517.0, 0.005, False), (560.0, 0.005, True), (503.0, 0.001, True)):
-        assert calibrated.accepts(Lens("SIMPLE_PINHOLE", (focal_px, 320.0, 240.0)), sigma) == is_taken
+        assert replace(calibrated, parameters=(focal_px, 320.0, 240.0)).is_credible(sigma) == is_taken
 
 
 def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
     rng = np.random.default_rng(0)
     problem = ring_problem(rng, models=("SIMPLE_RADIAL", "SIMPLE_RADIAL"), noise_px=0.3)
-    given = Lens("SIMPLE_RADIAL", (520.0, 320.0, 240.0, 0.0), id=3)
+    given = in_doubt(Lens("SIMPLE_RADIAL", (520.0, 320.0, 240.0, 0.0)))
     start = replace(problem, lenses=[given, problem.lenses[1]])
+    first = np.array([True, False])
     for distortion in (False, True):
-        free = FreeLenses({3: LensDoubt(given, 0.3, 0.1)}, distortion=distortion)
-        found = adjust(free.apply(start), OPTIONS, **free.overrides()).problem.lenses
+        free = Freedom(focal=first, distortion=first & distortion)
+        found = adjust(free.apply(start, None), OPTIONS, **free.overrides()).problem.lenses
         assert found[1].parameters == problem.lenses[1].parameters
         assert (found[0].parameters[3] != 0.0) == distortion
         assert abs(found[0].parameters[0] - TRUE_PX) < 2.0
-    assert ALL_HELD.apply(start) is start
-    assert free.holding([3]).focal_held == {3}
+    assert Freedom().apply(start, None) is start
+    lenses = start.lenses
+    held = free.holding(first, lenses)
+    assert (held.focal.tolist(), held.distortion.tolist()) == ([False, False], [True, False])
     none = {"free_focal_lengths": False, "free_distortion": False}
-    assert free.holding([3]).holding([3]).overrides() == none
-    assert free._replace(distortion=False).holding([3]).overrides() == none
-    flat = FreeLenses(
-        {3: LensDoubt(Lens("SIMPLE_PINHOLE", (520.0, 320.0, 240.0)), 0.3, 0.1)}, distortion=True
-    )
-    assert flat.holding([3]).overrides() == none
+    assert held.holding(first, lenses).overrides() == none
+    assert Freedom(focal=first, distortion=first & False).holding(first, lenses).overrides() == none
+    flat = [in_doubt(Lens("SIMPLE_PINHOLE", (520.0, 320.0, 240.0))), lenses[1]]
+    assert free.holding(first, flat).overrides() == none
 
 
 def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
@@ -126,10 +130,10 @@ def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
     given_px = 510.0
     free, start = doubted(problem, given_px, 0.3, distortion=True)
     lens, sigma = solve(free, start)
-    assert not free.doubts[7].accepts(lens, sigma)
-    held = free.holding([7])
+    assert not lens.is_credible(sigma)
+    held = free.holding(np.ones(1, bool), start.lenses)
     options = replace(OPTIONS, **held.overrides())
-    found = adjust(held.apply(start), options).problem
+    found = adjust(held.apply(replace(start, lenses=[start.lenses[0].as_given()]), None), options).problem
     focal_px, _, _, k1 = found.lenses[0].parameters
     assert focal_px == given_px
     assert focal_sigmas(found, options)[0] == 0.0

@@ -10,14 +10,11 @@ import sfm_shapefit
 from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
-from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.freedom import GivenPoses
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.scene import lens
-from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
@@ -270,34 +267,35 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start = disturbed(truth)
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
-    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
-    found = adjusted_thinly(start, tracks, lenses=free)
+    free = {"focal": np.ones(1, bool), "distortion": np.ones(1, bool)}
+    found = adjusted_thinly(start, tracks, **free)
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
-    assert found.estimate.lenses.undetermined == ()
-    assert 0.0 < found.estimate.lenses.sigmas[1] < 0.01
+    assert not found.estimate.undetermined.any()
+    assert 0.0 < found.estimate.focal_sigmas[0] < 0.01
     monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
-    held = adjusted_thinly(start, tracks, lenses=free)
-    assert held.estimate.lenses.undetermined == (1,)
-    assert 1 not in held.estimate.lenses.sigmas
+    held = adjusted_thinly(start, tracks, **free)
+    assert held.estimate.undetermined.all()
+    assert held.estimate.freedom.distortion.all()
+    assert not held.estimate.is_refined.any()
     given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
     assert kept[:3] == given[:3]
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
-    again = adjusted_thinly(start, tracks, lenses=held.estimate.freedom.lenses)
+    again = adjusted_thinly(start, tracks, focal=np.zeros(1, bool), distortion=np.ones(1, bool))
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
     monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
-    held = adjusted_thinly(start, tracks, lenses=free)
-    assert held.estimate.lenses.undetermined == (1,)
+    held = adjusted_thinly(start, tracks, **free)
+    assert held.estimate.undetermined.all()
     assert held.reconstruction.camera(1).params.tolist() == given
 
 
 def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monkeypatch):
     truth = scene("PINHOLE")
     start = disturbed(truth)
-    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
+    free = {"focal": np.ones(1, bool), "distortion": np.ones(1, bool)}
     monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
-    found = adjusted_placement(start, matches_of(truth), lenses=free)
-    assert found.estimate.lenses.undetermined == (1,)
+    found = adjusted_placement(start, matches_of(truth), **free)
+    assert found.estimate.undetermined.all()
     given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))
     assert kept == given
 

@@ -2,19 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sfm_shapefit.adjustment import Lens
-from sfm_shapefit.adjustment.estimate import RefinedLenses
-from sfm_shapefit.adjustment.free_lenses import FreeLenses
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.facts.intrinsics import (
     CameraIntrinsics,
-    DoubtedIntrinsics,
     describe_intrinsics,
+    intrinsics_in_doubt,
     intrinsics_warnings,
 )
-from sfm_shapefit.files.colmap.intrinsics import Origin
-from sfm_shapefit.scene.lens import LensDoubt
+from sfm_shapefit.scene.lens import Origin
 
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):
@@ -76,24 +76,36 @@ def test_many_cameras_are_told_in_one_sentence():
     )
 
 
-def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
-    doubt = LensDoubt(Lens("SIMPLE_RADIAL", (1000.0, 600.0, 450.0, 0.0)), 0.3, 0.1)
-    known = DoubtedIntrinsics(
-        origins={1: Origin.GUESS, 2: Origin.GUESS, 3: Origin.CALIBRATION},
-        free=FreeLenses({1: doubt, 2: doubt, 3: doubt}, distortion=True),
-        view_graph={1: 1.1},
+def estimate_of(freedom, sigmas, undetermined):
+    """An adjustment's answer, as far as lenses go."""
+    return Estimate(
+        images=None,
+        freedom=freedom,
+        focal_sigmas=np.array(sigmas),
+        undetermined=np.array(undetermined),
+        sensor_sigmas=np.full((len(sigmas), 2), np.nan),
     )
-    assert [known.how(camera) for camera in (1, 2)] == ["view graph", "held"]
-    held = known.free.holding([2, 3])
-    after = known.after(RefinedLenses({1: 0.01}, (2, 3)), held)
-    after = after.after(RefinedLenses({1: 0.005}, (3,)), held.holding([3]))
-    assert set(after.free.doubts) == {1, 2}
-    assert after.free.with_free_focal() == [1]
-    assert after.refined.undetermined == (2, 3)
-    assert [after.how(camera) for camera in (1, 2, 3)] == ["adjusted", "undetermined", "undetermined"]
-    assert after.refined.sigmas == {1: 0.005}
-    rows = [row(1), row(2, "undetermined"), row(3, "undetermined")]
-    (warning,) = intrinsics_warnings(after, rows)  # what was calibrated needs none
+
+
+def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
+    lens = Lens("SIMPLE_RADIAL", (1000.0, 600.0, 450.0, 0.0))
+    every, nan = np.ones(3, bool), np.nan
+    known = intrinsics_in_doubt(every, every, np.array([True, False, False]))
+    assert known.may_change
+    assert [known.how(k) for k in (0, 1)] == ["view graph", "held"]
+    held = Freedom(focal=every, distortion=every).holding(np.array([False, True, True]), [lens] * 3)
+    after = known.after(estimate_of(held, [0.01, nan, nan], [False, True, True]), np.arange(3))
+    # The second adjustment is one of the first and the last lens alone.
+    part = held.of(np.arange(0), np.array([0, 2])).holding(np.array([False, True]), [lens] * 2)
+    after = after.after(estimate_of(part, [0.005, nan], [False, True]), np.array([0, 2]))
+    assert after.focal.tolist() == [True, False, False]
+    assert after.distortion.tolist() == [True, True, False]
+    assert after.undetermined.tolist() == [False, True, True]
+    assert [after.how(k) for k in range(3)] == ["adjusted", "undetermined", "undetermined"]
+    np.testing.assert_array_equal(after.focal_sigmas, [0.005, nan, nan])
+    assert [after.part(np.array([2, 0])).how(k) for k in range(2)] == ["undetermined", "adjusted"]
+    rows = [row(1), row(2, "undetermined"), replace(row(3, "undetermined"), origin="given")]
+    (warning,) = intrinsics_warnings(rows)  # what was calibrated needs none
     assert warning.startswith(
         "camera 2 kept a focal length that was never measured, which the matches do not"
     )

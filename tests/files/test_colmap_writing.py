@@ -13,17 +13,14 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import LocateOptions, locate
-from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
-from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.files.colmap.seed import build_seed, write_model
 from sfm_shapefit.files.colmap.template import template_of
-from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
@@ -532,16 +529,15 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     seed, matches = seeded(original)
     fixed = bundle_adjusted(seed, matches)
     assert fixed.reconstruction.camera(3).params[0] == 808.0
-    doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
-    freedom = Freedom(lenses=FreeLenses(doubts, distortion=False))
-    found = bundle_adjusted(seed, matches, freedom=freedom)
+    ids = np.array(sorted(original.cameras))
+    found = bundle_adjusted(seed, matches, freedom=Freedom(focal=ids == 3))
     for camera_id, camera in found.reconstruction.cameras.items():
         if camera_id == 3:
             assert camera.params[0] == pytest.approx(800.0, rel=5e-4)
         else:
             assert camera.params.tolist() == original.camera(camera_id).params.tolist()
-    assert set(found.estimate.lenses.sigmas) == {3}
-    assert found.estimate.lenses.sigmas[3] < 0.01
+    assert found.estimate.is_refined.tolist() == (ids == 3).tolist()
+    assert found.estimate.focal_sigmas[ids == 3] < 0.01
 
 
 def test_adjusted_points_satisfy_the_same_filters():

@@ -6,14 +6,14 @@ import pytest
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.intrinsics import (
-    Origin,
     calibrate_view_graph,
-    doubt_lenses,
     find_uncalibrated,
-    with_focal_lengths,
+    with_focal_length,
 )
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
+from sfm_shapefit.scene.lens import Origin
 from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 
 MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5}
@@ -41,11 +41,16 @@ def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, 
     path = database_with(tmp_path, model, params, prior)
     images = read_from(path, read_images).images
     found = {camera: one.origin for camera, one in read_from(path, find_uncalibrated, images).items()}
-    assert found == ({} if origin is None else {1: origin})
+    assert found == ({} if origin is None else {0: origin})
     # A model whose intrinsics are not the database's got them elsewhere.
     assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0").images) == {}
-    doubts = doubt_lenses({lens.id: lens for lens in images.lenses}, found)
-    assert set(doubts) == (set() if model == "OPENCV_FISHEYE" else set(found))
+    marked, may_change = read_from(path, lambda file: settle_intrinsics(images, file, "auto"))
+    assert [lens.origin for lens in marked.lenses] == [origin]
+    assert may_change.focal.tolist() == [origin is not None and model != "OPENCV_FISHEYE"]
+    kept, stays = read_from(path, lambda file: settle_intrinsics(images, file, "held"))
+    assert [lens.origin for lens in kept.lenses] == [origin]
+    assert kept.lenses[0].parameters == images.lenses[0].parameters
+    assert not stays.may_change
 
 
 @pytest.mark.parametrize(("num_calibrated", "doubted"), [(0, 8), (4, 4), (5, 0)])
@@ -73,7 +78,7 @@ def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
     assert all(read_from(path, calibrate_view_graph, [1]) == factors for _ in range(5))  # to the bit
     assert fingerprint(tmp_path) == before
     images = read_from(path, read_images).images
-    found = with_focal_lengths(images, factors).lenses[0].parameters
+    found = with_focal_length(images.lenses[0], factors[1]).parameters
     np.testing.assert_allclose(found, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
     assert images.lenses[0].parameters[0] == 1150.0
 

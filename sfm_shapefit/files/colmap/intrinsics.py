@@ -15,7 +15,7 @@ import sqlite3
 import tempfile
 from collections.abc import Collection, Mapping
 from contextlib import closing
-from enum import Enum
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,17 +28,8 @@ from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Lens, LensDoubt
+from sfm_shapefit.scene.lens import Lens, Origin
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
-
-
-class Origin(Enum):
-    """Where the intrinsics of a camera come from; the value names it in words."""
-
-    GUESS = "a guess"
-    EXIF = "EXIF data"
-    CALIBRATION = "given"
-
 
 _FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}
 _DISTORTION_SIGMAS = {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
@@ -63,7 +54,7 @@ class Uncalibrated(NamedTuple):
 
 
 def find_uncalibrated(database: DatabaseFile, images: Images) -> dict[int, Uncalibrated]:
-    """Return the lenses of images that are the very ones which a database guessed, by their id.
+    """Return the lenses of images that are the very ones which a database guessed, by their rows (l,).
 
     Args:
         database: has them.
@@ -78,16 +69,16 @@ def find_uncalibrated(database: DatabaseFile, images: Images) -> dict[int, Uncal
     found: dict[int, Uncalibrated] = {}
     for number, name in zip(images.lens_of.tolist(), images.names, strict=True):
         lens = images.lenses[number]
-        if lens.id not in found and name in rows:
+        if number not in found and name in rows:
             database_id, width, height, params, prior = rows[name]
             if np.array(lens.parameters, dtype="<f8").tobytes() == params:
-                found[lens.id] = Uncalibrated(_origin(camera_of(lens), width, height, prior), database_id)
+                found[number] = Uncalibrated(_origin(camera_of(lens), width, height, prior), database_id)
     origins = [one.origin for one in found.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
         # A calibration leaves the distortion 0 where the images do not tell it; EXIF leaves it 0 everywhere.
         known.add(Origin.EXIF)
-    return {camera: one for camera, one in found.items() if one.origin not in known}
+    return {number: one for number, one in found.items() if one.origin not in known}
 
 
 def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Origin:
@@ -100,24 +91,22 @@ def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Ori
     return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
 
 
-def doubt_lenses(lenses: Mapping[int, Lens], origins: Mapping[int, Origin]) -> dict[int, LensDoubt]:
-    """Return how far lenses may be off, by their ids, of those whose model can be adjusted."""
-    return {
-        lens_id: LensDoubt(lenses[lens_id], _FOCAL_SIGMAS[origin], _DISTORTION_SIGMAS[origin])
-        for lens_id, origin in sorted(origins.items())
-        if lenses[lens_id].is_adjustable
-    }
+def in_doubt(lens: Lens, origin: Origin) -> Lens:
+    """Return a lens of which it is told how far it may be off as it stands, by where it comes from."""
+    return replace(
+        lens,
+        origin=origin,
+        given=lens.parameters,
+        focal_sigma=_FOCAL_SIGMAS[origin],
+        distortion_sigma=_DISTORTION_SIGMAS[origin],
+    )
 
 
-def with_focal_lengths(images: Images, factors: Mapping[int, float]) -> Images:
-    """Return images whose focal lengths are some factor larger, by the ids of their lenses."""
-    found = {}
-    for lens in images.lenses:
-        if lens.id in factors:
-            params = np.array(lens.parameters)
-            params[camera_of(lens).focal_length_idxs()] *= factors[lens.id]
-            found[lens.id] = params.tolist()
-    return images.with_parameters(found)
+def with_focal_length(lens: Lens, factor: float) -> Lens:
+    """Return a lens whose focal length is some factor larger."""
+    params = np.array(lens.parameters)
+    params[camera_of(lens).focal_length_idxs()] *= factor
+    return replace(lens, parameters=tuple(params.tolist()))
 
 
 def differ_in_rays(one: Images, other: Images) -> bool:
