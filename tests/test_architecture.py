@@ -49,11 +49,11 @@ MOST_LINES = {
     "refinement": 1280,
     "report": 1710,
     "rotations": 2270,
-    "scene": 2020,
+    "scene": 2010,
     "solver": 4350,
     "synthetic": 2640,
     "synthetic/fixtures": 250,
-    "tracks": 1160,
+    "tracks": 1150,
 }
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
 

@@ -31,8 +31,9 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import FOCAL_LENGTHS
 
-_RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
-_COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest
+# Shares added to the diagonal, tried in turn; what nothing holds becomes large, not singular.
+_RIDGES = (0.0, 1e-12, 1e-10, 1e-8)
+_COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest; rounding leaves less
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,7 +85,7 @@ class GroundedSystem:
     layout: Layout
     factor: ReducedFactor
     inverses: FloatArray
-    """(k, 6) of the points' blocks, packed."""
+    """(k, 6) inverses of the points' blocks, packed."""
     free: FloatArray
     """(7, f) basis of the small similarities that nothing holds."""
     motions: FloatArray
@@ -154,7 +155,7 @@ def _two_nodes(problem: AdjustmentProblem, layout: Layout, unseen: BoolArray) ->
 
 
 def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None:
-    """Double as many diagonal entries of the nodes given as there are motions, chosen to tell these apart."""
+    """Double a diagonal entry of the given nodes for each motion, chosen to distinguish the motions."""
     count = motions.shape[2]
     if count == 0:
         return

@@ -21,12 +21,12 @@ class Estimate:
     freedom: Freedom
     """What moved, and what may move in later adjustments."""
     errors: RotationErrors | None = None
-    """What the matches said of them, if they were asked."""
+    """What the matches said of the given rotations, if they were asked."""
     covariances: FloatArray | None = None
-    """(i, 3, 3) of the centers, an image of a rig having its frame's, in squared units of the images; see
-    `shared_errors`. None where they are not known, as of models of more frames than are worth the time."""
+    """Covariances (i, 3, 3) of the centers, an image of a rig having its frame's, in squared units of the
+    images; see `shared_errors`. None where unknown, as for more frames than are worth the time."""
     scale_sigma: float | None = None
-    """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
+    """Relative standard deviation of the scale; None where it is not known, or nothing sets the scale."""
     focal_sigmas: FloatArray
     """(l,) standard deviations of the focal lengths that were free, as shares of them; NaN for the others."""
     undetermined: BoolArray

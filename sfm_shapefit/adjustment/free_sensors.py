@@ -1,4 +1,4 @@
-"""Sensors that may move in their rigs: how well the observations tell where they are."""
+"""Sensors that may move in their rigs: how well the observations determine their poses."""
 
 import math
 
@@ -11,10 +11,10 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.scene.images import Images
 
-# Errors that keypoints share make those of a sensor's pose larger than the noise alone does, as those of a
-# focal length (`scene.lens`).
+# Factor by which errors that keypoints share make those of a sensor's pose larger than the noise alone does;
+# that of a focal length (`scene.lens`).
 _SHARED_NOISE = 7.0
-_LARGEST_TURN_RAD = math.radians(1.0)
+_LARGEST_TURN_RAD = math.radians(1.0)  # rad; a sensor less sure of its rotation counts as left open
 _OPEN_SENSOR = (
     "the matches do not tell where {camera} is in its rig: its images see too little that others see too, or "
     "the rig never turns; leave out rigs=free, or give more frames"

@@ -31,7 +31,7 @@ class GivenPoses(NamedTuple):
     """What is known of the poses of frames beside the pixels."""
 
     rotations: FloatArray | None = None
-    """(f, 3, 3) those that were given; None: those of the start."""
+    """Rotations (f, 3, 3) as they were given; None: those of the start."""
     fixed: BoolArray | None = None
     """(f,) frames whose poses stay what they are to the last bit; none if None."""
     centers: KnownPositions | None = None
@@ -122,7 +122,7 @@ class Freedom:
         )
 
     def among(self, frames: IntArray, count: int) -> "Freedom":
-        """Return the freedom of so many frames, of which it has some; the others have the usual one."""
+        """Return the freedom of `count` frames; those that are not among `frames` have the usual one."""
         pull, doubt = self.pull_rad, self.doubt_rad
         if isinstance(pull, np.ndarray):
             pull = np.full(count, self.least_pull_rad)

@@ -22,10 +22,10 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.laplacian.dense import one_blas_thread
 
-_DIMENSION = 7
-_NONE = 1e-10  # share of the largest: what holds less holds nothing
-_MAX_ROUNDS = 100
-_ROUNDING = 1e-12  # of a sum of squares
+_DIMENSION = 7  # motions of a similarity; three shifts, three turns, one scaling
+_NONE = 1e-10  # share of the largest singular value; what holds less holds nothing
+_MAX_ROUNDS = 100  # Gauss-Newton steps; each solves for seven unknowns
+_ROUNDING = 1e-12  # relative rise of a sum of squares; so little is its rounding
 
 
 def small_similarities(rotations: FloatArray, centers: FloatArray, origin: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
 
 
 def _resized(problem: AdjustmentProblem, values: Values, size: float) -> FloatArray:
-    """Return the translations of all sensors (c, 3), those of free ones so many times as long."""
+    """Return the translations of all sensors (c, 3), of free ones longer by a factor."""
     is_free = problem.free_sensors() >= 0
     return np.where(is_free[:, None], size * values.sensor_translations, values.sensor_translations)
 

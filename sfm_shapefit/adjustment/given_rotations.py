@@ -1,4 +1,4 @@
-"""How exact given rotations are, as far as the matches tell: held, or weighted by a standard deviation.
+"""How exact given rotations are, by what the matches say: held, or weighted by a standard deviation.
 
 With rotations free, an adjustment turns each frame by some d_f from where it was given. Part of that is the
 error of the given rotation, and part is chance. To tell them apart, the points are drawn into two halves, and
@@ -38,27 +38,23 @@ from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 
-# A frame that sees fewer points in a half says nothing.
-_FEWEST_POINTS = 10
-_FEWEST_FRAMES = 3
+_FEWEST_POINTS = 10  # points of a frame in each half; fewer do not determine its turn
+_FEWEST_FRAMES = 3  # frames with enough points; the medians of fewer say nothing
 # The halves end at this relative fall of the cost: what is left is far below the spread between them.
 _FALL = 1e-4
 # What unknowns leave of the errors, at least; points of two views leave a quarter.
 _LEAST_REDUNDANCY = 0.1
-# Of a normal error in the plane, the median length over the standard deviation per axis.
+# Median length of a normal error in the plane, in standard deviations per axis; (2 log 2)^1/2.
 _MEDIAN_LENGTH = 1.1774
-# Of a normal error in space, the median square over the mean.
+# Median square of a normal error in space over its mean; that of a chi-square of three degrees.
 _MEDIAN_SQUARE = 0.7887
-# Median agreements over chance between which one draw of halves does not decide, and the draws then.
+# Median agreements over chance between which one draw of halves does not decide, and the draws then; right
+# rotations exceed chance by up to 1.5 times (see the header).
 _UNSURE, _DRAWS = (0.5, 3.0), 3
-# Rotations that would be held but for others pull by this share of the chance.
-_NEARLY_HELD = 0.1
-# An agreement of so many times its chance is three standard deviations beyond 0.
-_CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
-# And one of so many times is ten, which is no chance: products of normal errors have long tails.
-_CERTAIN = 10.0 * 2.0 / np.sqrt(3.0)
-# Of a normal error in space, the mean square is once in 300 times larger than so many variances per axis.
-_RARE = 4.6
+_NEARLY_HELD = 0.1  # share of the chance by which others pull where some are wrong; they would be held
+_CLEAR = 3.0 * 2.0 / np.sqrt(3.0)  # agreement over chance; three standard deviations beyond 0
+_CERTAIN = 10.0 * 2.0 / np.sqrt(3.0)  # agreement over chance; ten of them, as such products have long tails
+_RARE = 4.6  # mean square of a normal error in space, in variances per axis; exceeded once in 300 times
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,18 +62,18 @@ class RotationErrors:
     """What the matches say of the given rotations; standard deviations per axis."""
 
     sigma_rad: float
-    """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
+    """Standard deviation of the given rotations; 0 where chance explains all that matches would change."""
     chance_rad: float
     """Median over the frames of what chance turns them by, all points together."""
     frame_sigmas_rad: FloatArray
-    """(n,) of the errors of each frame's rotation: the same, the median where chance explains it, or what the
-    halves clearly say of the frame."""
+    """(n,) standard deviations of each frame's rotation: the same, the median where chance explains it, or
+    what the halves clearly say of the frame."""
     are_wrong: BoolArray
-    """(n,) the frames that are wrong beyond all chance."""
+    """(n,) frames whose rotations are wrong beyond all chance."""
     noise_px: float
-    """Of an observation, from the median of all errors with free rotations."""
+    """Standard deviation of an observation, from the median of all errors with free rotations."""
     num_frames: int
-    """Frames that say anything."""
+    """Frames with enough points in both halves."""
 
     def decide(self, freedom: Freedom) -> Freedom:
         """Return the freedom of rotations: held, if freeing them would bring more noise than it takes.
@@ -144,13 +140,13 @@ class _Halves(NamedTuple):
     """What two halves of the points make of the rotations."""
 
     known: BoolArray
-    """(n,) the frames of which they say anything."""
+    """(n,) frames with enough points in both halves."""
     agreement: FloatArray
-    """(n,) of the two halves' turns; the mean square per axis of a frame's error, whatever the noise."""
+    """(n,) product of the halves' turns; mean square per axis of a frame's error, whatever the noise."""
     chance: FloatArray
-    """(n,) the variance per axis of what noise turns the frame by, all points together."""
+    """(n,) variance per axis of what noise turns the frame by, all points together."""
     median_error_px: float
-    """Of all observations."""
+    """Median error of all observations."""
 
     def ratio(self) -> float:
         """Return the median agreement of the frames over their median chance."""

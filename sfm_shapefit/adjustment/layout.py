@@ -22,8 +22,7 @@ from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.scene.lens import NUM_VALUES
 
-SLOTS = 6
-"""Unknowns of a node at most."""
+SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +34,7 @@ class Layout:
     node_of_lens: IntArray
     """(l,) -1 if it is held."""
     node_of_sensor: IntArray
-    """(s,) of each free sensor."""
+    """(s,) node of each free sensor."""
     sensor_bases: FloatArray
     """(s, 3, 3) whose columns are the directions, in axes of the rig, in which each sensor's center moves."""
     scale_sensor: int
@@ -48,9 +47,9 @@ class Layout:
     observation: IntArray
     """(m,) the order by points: row of the problem's observations that stands k-th here."""
     first_observation: IntArray
-    """(k + 1,) of each point."""
+    """(k + 1,) first observation of each point."""
     camera: IntArray
-    """(m,) of each observation."""
+    """(m,) camera of each observation."""
     pixels: FloatArray
     """(m, 2)"""
     frame_entry: IntArray
@@ -72,7 +71,7 @@ class Layout:
     """(q, 2) nodes that one observation ties."""
 
     first_entry: IntArray
-    """(k + 1,) of each point."""
+    """(k + 1,) first entry of each point."""
     entry_node: IntArray
     """(E,)"""
     entry_point: IntArray
@@ -162,7 +161,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
 
 
 def find_scale_sensor(problem: AdjustmentProblem) -> int:
-    """Return the free sensor farthest from the origin of its rig if nothing else tells the scale, or -1."""
+    """Return the free sensor farthest from the origin of its rig if nothing else sets the scale, or -1."""
     if problem.rig is None:
         return -1
     free, sizes = problem.rig.free_sensors(), np.linalg.norm(problem.rig.translations, axis=1)

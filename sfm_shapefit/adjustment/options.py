@@ -1,4 +1,4 @@
-"""Settings of an adjustment, and what it tells while it runs. Pure data, cheap to import."""
+"""Settings of an adjustment, and what it reports while it runs. Pure data, cheap to import."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ LinearSolver = Literal["auto", "dense", "sparse"]
 
 @dataclass(frozen=True, slots=True)
 class AdjustmentStep:
-    """What an adjustment tells its `on_iteration` callback after each iteration."""
+    """What an adjustment reports to its `on_iteration` callback after each iteration."""
 
     iteration: int
     """Number of iterations done, from 1."""

@@ -31,7 +31,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import NUM_VALUES, Lens
 
-_ORTHONORMAL = 1e-6  # largest entry of R R^T - I
+_ORTHONORMAL = 1e-6  # largest entry of R R^T - I; six printed digits leave less
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,9 +41,9 @@ class Rig:
     frame_of_camera: IntArray
     """(c,)"""
     rotations: FloatArray
-    """(c, 3, 3) of sensor_from_rig."""
+    """Rotations (c, 3, 3) of sensor_from_rig."""
     translations: FloatArray
-    """(c, 3) of sensor_from_rig, in units of the world."""
+    """Translations (c, 3) of sensor_from_rig, in units of the world."""
     free_sensor_of_camera: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """(c,) number of the sensor that each camera is, from 0, if its pose in the rig is unknown; -1 if it
     stays, as that of a reference has to. Empty: all stay."""

@@ -10,9 +10,10 @@ from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.base.jit import inner_kernel
 from sfm_shapefit.scene.lens import NUM_VALUES
 
-_LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
+_LEAST_DEPTH = 1e-8  # depth over the distance from the camera; a point of less is behind it
 
-# A row of a camera has its rotation, its frame's center, the shift and rotation of the sensor, and the lens.
+# Columns of a camera's row at which its frame's center, shift and rotation of its sensor, and its lens begin;
+# its rotation comes first.
 CENTER, SHIFT, SENSOR, LENS = 9, 12, 15, 24
 
 

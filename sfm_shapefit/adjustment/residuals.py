@@ -41,8 +41,7 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import NUM_VALUES
 
-CHUNKS = 4
-"""Into which the points are cut; each has sums of all nodes of its own."""
+CHUNKS = 4  # parts of the points; each has sums of all nodes of its own, so the bits depend on their number
 
 # Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
 # large. The error of either is rounding.
@@ -62,9 +61,9 @@ class Values:
     lenses: FloatArray
     """(l, 8) as OPENCV models."""
     sensor_rotations: FloatArray
-    """(c, 3, 3) of sensor_from_rig."""
+    """Rotations (c, 3, 3) of sensor_from_rig."""
     sensor_translations: FloatArray
-    """(c, 3) of sensor_from_rig."""
+    """Translations (c, 3) of sensor_from_rig."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,10 +95,11 @@ def linearize(
 
     Args:
         layout, values: what is adjusted, and where.
-        loss_scale_px: of the Cauchy loss; None for squares.
+        loss_scale_px: scale of the Cauchy loss; None for squares.
         workers: share the chunks.
-        least_curvature: of the loss along a residual, as a share of its weight. 1 gives reweighted squares,
-            a bound of the loss from above; less lets it bend as it does, down to that share.
+        least_curvature: least curvature of the loss along a residual, as a share of its weight. 1 gives
+            reweighted squares, a bound of the loss from above; less lets it bend as it does, down to that
+            share.
     """
     num_nodes, num_links = layout.num_nodes, len(layout.links)
     nodes = np.zeros((CHUNKS, num_nodes, SLOTS, SLOTS))
@@ -413,7 +413,7 @@ def _add_link(by_point: Any, by_turn: Any, weighted: Any, links: Any, link: int)
 
 @inner_kernel
 def _add_block(by_first: Any, weighted: Any, links: Any, link: int) -> None:
-    """Add an observation to a link of its lens with its sensor; `weighted` is M J of the latter."""
+    """Add an observation to a link of its lens with its sensor; `weighted` is M J of the sensor."""
     for a in range(SLOTS):
         for c in range(SLOTS):
             links[link, a, c] += by_first[0, a] * weighted[0, c] + by_first[1, a] * weighted[1, c]
@@ -431,7 +431,7 @@ def _multiply(m00: float, m01: float, m11: float, jacobian: Any, weighted: Any) 
 def _differentiate_by_sensor(by_center: Any, by_turn: Any, bases: Any, sensor: int, by_sensor: Any) -> None:
     """Write the derivatives of the pixel by the unknowns of a sensor (2, 6), from those in axes of the rig.
 
-    Those by the center are still those of the point, of the other sign.
+    By the center they are still those by the point, of the other sign.
     """
     c0, c1, c2, d0, d1, d2 = by_center
     for q in range(3):

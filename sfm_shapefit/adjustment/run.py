@@ -18,7 +18,7 @@ matches that agree with the poses, anew for each solve.
 
 Points of two images take part where the poses are fine, though no model gets them: a wrong match of these
 goes unnoticed in a model, while here it is one of many that the loss weighs. On photographs a fifth to two
-fifths of all observations are of no longer tracks, and each such match tells the cameras one thing. Chosen
+fifths of all observations are of no longer tracks, and each such match constrains the cameras once. Chosen
 on castle-P19 (mean error 0.0254 without, 0.0238 with them), Herz-Jesus-P8 (0.0036, both) and a rendered
 street (0.0116, 0.0114). From rotations that were given (`adjust_placement`) a first solve may be far off,
 and takes checked points alone.
@@ -62,26 +62,27 @@ from sfm_shapefit.tracks.triangulation import (
     triangulate_tracks,
 )
 
-# Of the Cauchy loss, in pixel thresholds, for the errors to choose from.
+# Scales of the Cauchy loss, in pixel thresholds; the errors choose among them (see the header).
 _SCALES = (0.0625, 0.125, 0.25)
-# Of the two solves of all tracks, and of the one after a placement: the relative falls to end at.
+# Relative falls of the cost at which the two solves of all tracks end; a solve after a placement ends at the
+# second.
 FIRST_FALL, LAST_FALL = 1e-3, 1e-5
-# Of the thin solve: the limit of its tracks, and the scale of its loss, in pixel thresholds.
+# Limit of the tracks of a thin solve and scale of its loss, in pixel thresholds, and the relative fall of its
+# cost; coarse poses lose their observations to a narrower limit.
 _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Damping at first, relative to the curvature of single cameras. A row of n bends with about n^-4 of
 # that: after the usual 1e-4, the fine solve of 2,500 cameras ends 5 % short of its minimum, and a made row of
 # 100 keeps 0.4 of its bend; after 1e-8, neither. Only where a solve has gone before: from averaged rotations
 # castle-P19 would end in another minimum, four cameras lost.
 _FIRST_DAMPING, _NEAR_DAMPING = AdjustmentOptions().first_damping, 1e-8
-# Of the fine one after it: so many times as many tracks hold each image. With 1, the median errors of six
-# real scenes are 1.0 to 1.3 times those with 3, and of a facade of 300 images 1.6 times; 6 is no better.
+# Tracks that hold each image in a fine solve, in those of the thin one. With 1, the median errors of six real
+# scenes are 1.0 to 1.3 times those with 3, and of a facade of 300 images 1.6 times; 6 is no better.
 _FINE_TIMES = 3
-# Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
+# Share of the observations of `_THIN_LIMIT` that the threshold finds too; with less, poses are coarse.
 _FINE = 0.9
-# So often lenses are held that turn out to be left open, and all is solved for again.
+# Solves repeated with lenses held that were left open; each takes as long as the first.
 _MOST_REPETITIONS = 2
-# With more frames, the standard deviations would take longer than all the rest.
-MOST_FRAMES = 2_000
+MOST_FRAMES = 2_000  # frames; the standard deviations of more would take longer than all the rest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -89,7 +90,7 @@ class AdjustmentRun:
     """An adjustment on its way: a solve gives the next one, and the problem that it solved."""
 
     images: Images
-    """Where they stand."""
+    """The images where they stand now."""
     links: Links | None
     """By the lenses of the images; None once they were given back, and nothing is triangulated any more."""
     options: StructureOptions
@@ -99,13 +100,13 @@ class AdjustmentRun:
     checked_length: int
     """Fewest observations of a point that a model may have."""
     focal_sigmas: FloatArray
-    """(l,) those of `Estimate`."""
+    """(l,) see `Estimate`."""
     undetermined: BoolArray
-    """(l,) those of `Estimate`."""
+    """(l,) see `Estimate`."""
     loss_scale_px: float = 1.0
-    """That of the last solve."""
+    """Scale of the loss in the last solve."""
     iterations: int = 0
-    """Of all solves."""
+    """Steps of all solves."""
     converged: bool = False
 
     @property
@@ -116,9 +117,11 @@ class AdjustmentRun:
     def triangulate(
         self, widening: float, *, checked: bool = False
     ) -> tuple[ObservedTracks, TriangulatedPoints]:
-        """Return the tracks and points at the poses of the images, at so many pixel thresholds.
+        """Return the tracks and points at the poses of the images.
 
-        Checked: only points that the model may have; without, points of two images too.
+        Args:
+            widening: largest error of an observation, in pixel thresholds.
+            checked: whether only points that the model may have count; else points of two images too.
         """
         limits = PointLimits(
             max_error_px=widening * self.options.max_reprojection_error_px,

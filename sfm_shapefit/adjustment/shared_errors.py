@@ -47,20 +47,22 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
 
-_MOST_GROUPS = 64
-_FEWEST_OF_A_GROUP = 8
-_DEGREE = 3
+_MOST_GROUPS = 64  # groups of neighboring points; each is one more right side for the factor
+_FEWEST_OF_A_GROUP = 8  # points of a group; fewer would share no noise
+_DEGREE = 3  # degree of the polynomials of a smooth field; ten coefficients for each axis
+# Draws of smooth fields and turns; a variance from as many has a standard deviation of (2 / 24)^1/2 = 29 %.
 _SAMPLES = 24
-# Each smooth field of a doubted lens, of the median error.
+# Smooth field of a doubted lens, in median errors; between what two sets with truth call for, see the header.
 _CALIBRATION_OF_ERROR = 0.45
-# A field is visible if this share of its energy is left in the residuals.
-_VISIBLE = 0.05
-# So many standard deviations beyond noise the visible part must be for calibration to be doubted at all, and
-# to be doubted fully.
+_VISIBLE = 0.05  # share of a field's energy left in the residuals; a field of less cannot be read off them
+# Standard deviations beyond noise of the visible part, from which calibration is doubted at all, and fully;
+# three are rare by chance, five are no chance.
 _DOUBT, _CERTAIN = 3.0, 5.0
-# Lenses with the most observations that are tested, and the fewest observations of one.
+# Lenses that are tested, those of most observations; each takes twenty right sides.
 _MOST_LENSES = 8
+# Observations of a tested lens; ten for each of the twenty coefficients of its fields.
 _FEWEST_OF_A_LENS = 200
+# Steps to the fixed point of a likelihood; each costs next to nothing.
 _LIKELIHOOD_STEPS = 30
 
 
@@ -69,14 +71,14 @@ class CenterErrors:
     """What is known of the errors of adjusted centers."""
 
     covariances: FloatArray
-    """(n, 3, 3) of the frames' centers, squared units of the world; 0 for fixed frames, NaN where no point
-    is seen."""
+    """Covariances (n, 3, 3) of the frames' centers, squared units of the world; 0 for fixed frames, NaN where
+    no point is seen."""
     calibration_px: float
-    """Of each smooth field of an image's errors, root of the mean square; 0 where the lenses fit."""
+    """Root of the mean square of each smooth field of an image's errors; 0 where the lenses fit."""
     lens_errors_px: FloatArray
     """(l,) the same of the fields that all images of a lens share."""
     scale_sigma: float | None
-    """Relative standard deviation of the scale; None where nothing in the problem tells it. From a tenth on,
+    """Relative standard deviation of the scale; None where nothing in the problem sets it. From a tenth on,
     the covariances leave errors of the scale out: they are then those of the shape, in whatever scale."""
     evidence: float
     """By how many standard deviations smooth errors of the lenses exceed noise; the largest of all."""
@@ -197,7 +199,7 @@ class _Pulls:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the pulls (N, 6, s) of fields (c, 2, t, s) and turns (n, 3, s), and, if wanted, squares.
 
-        Those are the products of fields and residuals among one another as the points leave them.
+        The squares are the products of fields and residuals among one another as the points leave them.
         """
         layout, count = self.system.layout, fields.shape[3]
         by_field = np.zeros((layout.num_nodes, SLOTS, count))
@@ -253,7 +255,7 @@ class _LensErrors(NamedTuple):
     evidence: float
     """By how many standard deviations what the fields explain exceeds noise."""
     variance: float
-    """Of each coefficient of the fields, px^2."""
+    """Variance of each coefficient of the fields, px^2."""
 
 
 def _doubt(evidence: float) -> float:

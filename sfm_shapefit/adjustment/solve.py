@@ -34,15 +34,16 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12
-_LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e12  # range of mu; rounding drowns what lies beyond
+_LEAST_GAIN = 1e-3  # share of the predicted decrease; a step of less is refused
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
-_NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
-_LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
-_STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
-_EXACT_PX = 1e-10  # rms residual that is rounding
-_LEAST_LEFT = 0.25  # of two observations, what their point leaves
-_BEHIND_PX = 1e6  # what a point behind its camera counts as where frames are compared
+_NEAR = 1e-2  # relative fall of the cost by a step; from less on the minimum is near, and the loss may bend
+# Share of a residual's weight that the loss keeps along it near the minimum; the system stays positive.
+_LEAST_CURVATURE = 0.3
+_STATIONARY = 1e-6  # gradient norm; at less, steps that rounding refuses mean a minimum
+_EXACT_PX = 1e-10  # rms residual in pixels; less is rounding
+_LEAST_LEFT = 0.25  # share of the squares that a point leaves of its errors; that of two observations
+_BEHIND_PX = 1e6  # error in pixels of a point behind its camera where frames are compared; it outweighs all
 
 
 class Ending(enum.Enum):
@@ -264,7 +265,7 @@ class _Run:
         self.problem, self.options = problem, options
         self.workers = Workers(options.threads)
         self.layout = lay_out(problem, options)
-        hand_back_memory()  # of what the layout was made of, before the largest arrays come
+        hand_back_memory()  # what the layout was made of goes before the largest arrays come
         self.factor: ReducedFactor = choose_factor(self.layout, options)
         self.values = values_of(problem)
         self.damping, self.growth = options.first_damping, 2.0

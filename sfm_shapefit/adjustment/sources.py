@@ -15,10 +15,9 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 
 Links = MatchedKeypoints | ObservedTracks
-"""Matches, from which tracks are joined anew at each pose, or the tracks of a model."""
+"""Matches, from which tracks are joined anew at each pose; or the tracks of a model."""
 
-# Matches that are looked at together.
-_MATCHES_A_SLICE = 1_000_000
+_MATCHES_A_SLICE = 1_000_000  # matches renumbered at once; more would take a second array of all
 
 
 def collect_matches(

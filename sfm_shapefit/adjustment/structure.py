@@ -88,7 +88,7 @@ def triangulate(
         joined = matched.join(poses, limit_px)
         if limit_px < joining_limits[-1]:  # two keypoints may find a third one in the next joining
             sizes = np.diff(joined.offsets)
-        else:  # of two keypoints 2 if they have no other partner, 3 or more if one has
+        else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
         tasks, done = _cut_tracks(matched, joined, chosen, poses, limits), 0

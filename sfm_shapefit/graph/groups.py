@@ -116,7 +116,7 @@ class RigidGroups:
         return np.asarray(ends[:, 0] != ends[:, 1])
 
     def with_separate(self, count: int) -> "RigidGroups":
-        """Return the groups with so many further nodes, such as 3D points, each a group of its own."""
+        """Return the groups with further nodes, such as 3D points, each a group of its own."""
         labels = self.num_groups + np.arange(count)
         return RigidGroups(
             group_of=np.concatenate([self.group_of, labels]),
@@ -146,5 +146,5 @@ class RigidGroups:
 
 
 def separate(num_nodes: int, dimension: int) -> RigidGroups:
-    """Return so many nodes, each a group of its own."""
+    """Return `count` nodes, each a group of its own."""
     return RigidGroups(group_of=np.arange(num_nodes), offsets=np.zeros((num_nodes, dimension)))

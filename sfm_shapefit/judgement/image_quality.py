@@ -13,7 +13,7 @@ from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
-_CELLS = 8  # cells per side of the picture; its coverage is the share of these with a point
+_CELLS = 8  # cells per side of the picture; its coverage is the share of cells with a point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

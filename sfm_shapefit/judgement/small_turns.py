@@ -46,7 +46,7 @@ class Corrections(NamedTuple):
     cameras: IntArray
     """The cameras whose correction is larger than was asked for."""
     sigmas_rad: FloatArray
-    """Standard deviation of each axis of the corrections of these."""
+    """Standard deviations per axis of the corrections."""
 
 
 def solve_corrections(

@@ -151,7 +151,7 @@ class _Votes:
     weights: FloatArray
 
     def of_groups(self, labels: IntArray) -> "_Votes":
-        """Return the votes between the groups of these labels (n,) in place of their nodes."""
+        """Return the votes between groups of nodes, by their labels (n,)."""
         pairs = labels[self.pairs]
         outer = pairs[:, 0] != pairs[:, 1]
         return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])

@@ -77,7 +77,7 @@ def matched_shares(
 
 
 class _Image(NamedTuple):
-    """The keypoints of an image that are matched at all, as other images do not tell of the rest."""
+    """Keypoints of an image that are matched at all; other images say nothing of the rest."""
 
     pixels: FloatArray
     """(2, k)"""

@@ -43,7 +43,7 @@ _FEWEST_MATCHES = 24  # matches of a pair that can be a witness; fewer are chanc
 _FEWEST_POINTS = 6  # points that both models have; from fewer no start is drawn
 _LEAST_RIVAL_SHARE = 0.25  # share of the best join's pairs; from here on another join is a rival
 _MOST_AGAINST = 3.0  # pairs that contradict the best join, per agreeing pair; beyond, it is refused
-# Turns that single pairs suggest agree up to here; so many groups of them are tried.
+# Turns that single pairs suggest agree up to the first; the second is how many groups of them are tried.
 _SAME_TURN_DEG = 5.0
 _MOST_TURNS = 8  # groups of turns that are tried; bounds the time where single pairs scatter
 _LARGEST_SCALE_SIGMA = 0.05  # relative standard deviation of the scale; above, the join is refused

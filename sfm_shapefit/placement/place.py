@@ -60,7 +60,7 @@ class Placement(Displayed):
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     agreement: AngularAgreement
-    """Which of these edges agree with these locations."""
+    """Which edges agree with the locations."""
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
     unit: float | None

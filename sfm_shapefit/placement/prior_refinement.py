@@ -25,7 +25,7 @@ class Pulled(NamedTuple):
     placement: Placement
     """Refined on directions and priors together."""
     gauge: Gauge
-    """That of before; its statement says by how much the priors moved cameras."""
+    """Gauge as before; its statement says by how much the priors moved cameras."""
     anchors: KnownPositions
     """The priors by the placement's cameras, in its gauge but for the axes, which are the input's; each has
     the weight that it ended with: a wrong one has none."""

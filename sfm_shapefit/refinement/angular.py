@@ -45,7 +45,7 @@ from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor
 
 KERNEL_WIDTH = 3.0
-"""k: a residual of so many standard deviations counts half of what it can."""
+"""k, in standard deviations; a residual of k counts half of what it can."""
 
 DAMPING = DampingRange()
 """Damping of the steps, relative to the damping matrix of `AngularTerms`."""

@@ -168,7 +168,7 @@ def weigh_blocks(
 
 @kernel
 def turn_cameras(turns: Any, steps: Any, limit: float) -> float:
-    """Replace R_i by R_i exp(s_i), steps (n, 3) limited to so many radians; return the longest one."""
+    """Replace R_i by R_i exp(s_i), steps (n, 3) of limited length; return the longest one."""
     longest = 0.0
     for i in range(len(turns)):
         s0, s1, s2 = steps[i, 0], steps[i, 1], steps[i, 2]

@@ -44,21 +44,17 @@ _ON_A_LINE = (
     "across the line are a lower bound"
 )
 
+# Errors of relative poses in degrees up to which the area under the recall is given; from fine to coarse.
 AUC_THRESHOLDS_DEG = (0.5, 1.0, 5.0, 10.0)
-"""Errors of relative poses up to which the area under the recall is given."""
+# Position errors at which recall is always given, as shares of the reference's extent; three to a decade.
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
-"""Position errors at which recall is always given, as fractions of the reference's extent."""
-
-# So many of the worst cameras are named.
-_WORST = 10
-# Fewer centers never determine a similarity.
-_MIN_COMMON = 3
+_WORST = 10  # worst cameras that are named; more would hide the figures above them
+_MIN_COMMON = 3  # centers in common; fewer never determine a similarity
 # Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
 # failed on some sets of 7 and 11 cameras.
 _CAP_OF_SPREAD = 0.5
-# Centers count as a line if the ratio of their second to their first singular value is smaller.
-_COLLINEAR_RATIO = 1e-3
-# Published references printed with 6 digits are off by 2e-6 in R R^T - I.
+_COLLINEAR_RATIO = 1e-3  # second over first singular value of the centers; with less they are a line
+# Largest entry of R R^T - I; published references printed with 6 digits are off by 2e-6.
 _ORTHOGONALITY_TOLERANCE = 1e-4
 
 
@@ -175,7 +171,7 @@ class Evaluation(Displayed):
     recalls: tuple[Recall, ...]
     """Recall at the relative thresholds, then at the absolute ones that were asked for."""
     relative_pose_errors_deg: FloatArray
-    """(p,) of the pairs of common cameras: the larger of the angles of rotation and translation direction."""
+    """(p,) errors of pairs of common cameras: the larger of the angles of rotation and direction."""
     relative_pose_aucs: tuple[RelativePoseAuc, ...]
     """The area under the recall of these errors at 0.5, 1, 5 and 10 degrees."""
     trajectory: TrajectoryErrors | None

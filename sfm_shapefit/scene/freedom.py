@@ -9,8 +9,7 @@ Adjust = Literal["none", "seed", "full"]
 IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
 RigFreedom = Literal["held", "free"]
 
-# With more cameras, the adjustment would take longer than all the rest.
-_MOST_ADJUSTED_CAMERAS = 2_000
+_MOST_ADJUSTED_CAMERAS = 2_000  # cameras; the adjustment of more would take longer than all the rest
 
 
 @explained
@@ -50,7 +49,7 @@ class FreedomOptions(Settings):
                 self.refuse_held(name, getattr(self, name))
 
     def adjusts_cameras(self, num_cameras: int) -> bool:
-        """Return whether so many placed cameras are adjusted, unless the optimum is wanted as it is."""
+        """Return whether `num_cameras` placed cameras are adjusted, unless the optimum is wanted as it is."""
         return self.adjust != "none" and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def refuse_held(self, name: str, value: object) -> None:

@@ -1,4 +1,4 @@
-"""What a user tells of the images beside the matches: positions, control points, gravity; types only."""
+"""What a user knows of the images beside the matches: positions, control points, gravity; types only."""
 
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
@@ -43,9 +43,8 @@ class PositionPriors:
         return len(self.known.indices)
 
 
-FEWEST_CONTROL_POINTS = 3
-# Points within this share of their length from a line say nothing of the turn about it.
-_THIN = 1e-3
+FEWEST_CONTROL_POINTS = 3  # control points; fewer leave the axes open
+_THIN = 1e-3  # width over length of control points; thinner ones say nothing of the turn about their line
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -56,7 +55,7 @@ class ControlPoints:
     positions: FloatArray
     """(k, 3) in axes and units of their own."""
     is_check: BoolArray
-    """(k,) those that only check the model."""
+    """(k,) points that only check the model."""
     points: IntArray
     """(m,) the point of each mark, ascending."""
     images: IntArray
@@ -83,13 +82,13 @@ class ControlPoints:
         return np.bincount(self.points, minlength=len(self.names)) > 1
 
     def why_too_few(self) -> str:
-        """Return why these points cannot tell scale and axes, a clause; empty if they can."""
+        """Return why the points cannot set scale and axes, a clause; empty if they can."""
         usable = self.seen_twice() & ~self.is_check
         return why_too_few(self.positions[usable], "have marks in two images of the model")
 
 
 def why_too_few(positions: FloatArray, what: str) -> str:
-    """Return why points (k, 3) that are all there is cannot tell scale and axes, or nothing if they can."""
+    """Return why points (k, 3) alone cannot set scale and axes, a clause; empty if they can."""
     if len(positions) < FEWEST_CONTROL_POINTS:
         return f"{len(positions)} of the control points {what}, and scale and axes need three"
     lengths = principal_lengths(positions)
@@ -110,9 +109,9 @@ class MarkedViews(NamedTuple):
     rows: IntArray
     """(r,) the marks in placed images, by their place in `ControlPoints`, ascending."""
     views: IntArray
-    """(r,) the placed image of each of these marks."""
+    """(r,) placed image of each mark."""
     on_plane: FloatArray
-    """(r, 2) normalized coordinates of each of these marks; NaN where it has no ray ahead."""
+    """(r, 2) normalized coordinates of each mark; NaN where it has no ray ahead."""
 
 
 class Gravity(NamedTuple):
@@ -133,7 +132,7 @@ class Gravity(NamedTuple):
     def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
         """Return the gravities of frames, by the frame (n,) and sensor_from_rig (n, 3, 3) of each image.
 
-        Of a frame with several the most certain counts: sensors of one rig share their errors.
+        The most certain of several in a frame counts: sensors of one rig share their errors.
         """
         turned = np.einsum("kba,kb->ka", sensor_rotations[self.indices], self.directions)
         frames = frame_of_image[self.indices]
@@ -145,7 +144,7 @@ class Gravity(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Known:
-    """What a user tells of images beside the matches."""
+    """What a user knows of images beside the matches."""
 
     priors: PositionPriors | None = None
     control: ControlPoints | None = None

@@ -57,9 +57,9 @@ class Sensors:
     """Where each lens is in its rig; arrays are read-only."""
 
     rotations: FloatArray
-    """(l, 3, 3) of sensor_from_rig, exactly the identity for a reference; NaN where unknown."""
+    """Rotations (l, 3, 3) of sensor_from_rig, exactly the identity for a reference; NaN where unknown."""
     translations: FloatArray
-    """(l, 3) of sensor_from_rig, exactly 0 for a reference; NaN where unknown."""
+    """Translations (l, 3) of sensor_from_rig, exactly 0 for a reference; NaN where unknown."""
     rig_of: IntArray
     """(l,) number of the rig."""
     is_reference: BoolArray
@@ -94,9 +94,9 @@ class Images:
     lens_of: IntArray
     """(i,)"""
     frames: Frames
-    """Those of the images: each has at least one."""
+    """Frames of the images; each has at least one."""
     lenses: tuple[Lens, ...]
-    """(l,) those of the images, ascending by id."""
+    """(l,) lenses of the images, ascending by id."""
     sensors: Sensors
 
     def __post_init__(self) -> None:

@@ -31,8 +31,8 @@ _PLACES = {
 }
 _ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how the names of models with a single focal length begin
 
-# Newton steps that undo a distortion, at most, and their length, relative to the focal length, below which
-# all have ended; double precision is reached.
+# Newton steps that undo a distortion at most, and their length over the focal length at which they end;
+# double precision is reached.
 _MOST_STEPS, _STILL = 30, 1e-12
 _PIXELS_A_SLICE = 20_000  # pixels undistorted at once; their arrays stay in the cache
 
@@ -68,7 +68,7 @@ class Lens:
     id: int = 0
     """COLMAP's id of the camera."""
     width: int = 0
-    """Of the pictures, in pixels; 0 if unknown, as is the height."""
+    """Width of the pictures, in pixels; 0 if unknown, as is the height."""
     height: int = 0
     origin: Origin | None = None
     """Where its parameters came from; None if they are not in doubt."""

@@ -29,12 +29,10 @@ PairNames = frozenset[tuple[str, str]]
 
 KeypointNumbers = IntArray | UInt32Array
 
-KEPT_MATCHES = 1_000_000
-"""So many are kept with their rays, in 80 MB."""
-
+KEPT_MATCHES = 1_000_000  # matches that are kept with their rays; they take 80 MB
+# Matches of a database; of more, none is kept while points are made of them. To read 30 million again takes a
+# twentieth of the time of a run, and to keep them an eighth of its memory.
 MOST_BESIDE_TRACKS = 16_000_000
-"""Of a database with more, none is kept while points are made of them: to read 30 million again takes a
-twentieth of the time of a run, and to keep them an eighth of its memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,7 +120,7 @@ class Reading(NamedTuple):
     larger batches come from the system and go back to it each time, and its zeros cost as much as what is
     written over them."""
     rays_bytes: int = 1_000_000_000
-    """Of the rays of keypoints that are kept for the next pair."""
+    """Bytes of the rays of keypoints that are kept for the next pair."""
     keeps: bool = True
     """Whether matches that were read are kept."""
 
@@ -138,9 +136,9 @@ class Matches(ABC):
     """The matches between some images of an open file, whatever their poses."""
 
     names: tuple[str, ...]
-    """Of the images, ascending."""
+    """Names of the images, ascending."""
     missing_names: tuple[str, ...] = ()
-    """Those of them that the file does not have."""
+    """Names that the file does not have."""
     pairs: IntArray
     """(p, 2) images (i, j), i < j, that have matches; ascending."""
     num_matches: IntArray
@@ -193,7 +191,7 @@ class Matches(ABC):
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
         """Return the matches of pairs (k,), ascending: how many each has, and the keypoints (M, 2) of all.
 
-        Those of a pair ascend, and each stands once. With `keep` they are not read again.
+        The matches of a pair ascend, and each stands once. With `keep` they are not read again.
 
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
@@ -240,7 +238,7 @@ class View:
         self.num_pairs, self.num_matches = len(self.rows), int(self._counts.sum())
         count_of = dict(zip(matches.names, matches.num_keypoints.tolist(), strict=True))
         self.num_keypoints = np.array([count_of.get(name, 0) for name in images.names], dtype=np.int64)
-        """(n,) of each image."""
+        """(n,) keypoints of each image."""
         self._rotations, self._focal_lengths_px = images.rotations, images.focal_lengths_px
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._rays_bytes = 0
@@ -313,7 +311,7 @@ class View:
         return self._batches(np.flatnonzero((ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])), 1)
 
     def parts(self, max_matches: int) -> Sequence[MatchPart]:
-        """Return all pairs, in their order, in parts of about so many matches; see `Matches.parts`."""
+        """Return all pairs, in their order, in parts of about equally many matches; see `Matches.parts`."""
         totals = np.append(0, np.cumsum(self._counts))
         count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
         bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
@@ -332,7 +330,7 @@ class View:
         return np.flatnonzero(chosen)
 
     def _tell(self, batches: Iterator[AnyMatches], advance: Advance) -> Iterator[AnyMatches]:
-        """Yield batches, and tell of pairs while they are consumed."""
+        """Yield batches, and report the pairs as they are consumed."""
         done = 0
         for batch in batches:
             yield batch

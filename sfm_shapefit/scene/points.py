@@ -40,11 +40,11 @@ class Points:
         return np.repeat(np.arange(self.num_points), self.lengths())
 
     def count_seen(self, num_images: int) -> IntArray:
-        """Return how many observations each of so many images has, (i,)."""
+        """Return how many observations each image has, (i,)."""
         return np.bincount(self.images, minlength=num_images).astype(np.int64)
 
     def rows_of_images(self, num_images: int) -> list[IntArray]:
-        """Return the observations of each of so many images, ascending."""
+        """Return the observations of each image, ascending."""
         order = np.argsort(self.images, kind="stable")
         return np.split(order, np.searchsorted(self.images[order], np.arange(1, num_images)))
 

@@ -21,9 +21,8 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity, normalized, rotation_angles_deg
 from sfm_shapefit.base.record import Record
 
-MOST_COMPARED_PAIRS = 2_000_000
-"""Of more pairs so many are drawn, by a fixed seed."""
-# Cameras that are closer, relative to the extent of all, have no direction from one to the other.
+MOST_COMPARED_PAIRS = 2_000_000  # pairs of cameras; as many are drawn of more, by a fixed seed
+# Distance of two cameras over the extent of all; closer ones have no direction from one to the other.
 _COINCIDENT = 1e-9
 
 
@@ -71,7 +70,7 @@ def area_under_recall(errors: FloatArray, num_missing: int, thresholds: Sequence
     """Return the area under the recall of errors (k,) up to each threshold, divided by it.
 
     Args:
-        errors: of what there is.
+        errors: those that are known.
         num_missing: how many more there should be; their errors are infinite.
         thresholds: positive.
     """

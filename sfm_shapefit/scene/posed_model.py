@@ -28,7 +28,7 @@ class PosedModelFile:
 
     cameras: tuple[Intrinsics, ...]
     names: tuple[str, ...]
-    """(n,) of the posed images."""
+    """(n,) names of the posed images."""
     camera_of: IntArray
     """(n,) index of each image's camera."""
     rotations: FloatArray

@@ -15,7 +15,7 @@ from sfm_shapefit.tracks.options import StructureOptions
 
 
 def filter_points(points: Points, images: Images, pictures: Pictures, options: StructureOptions) -> Points:
-    """Return the points that satisfy the options, with what of their observations does, and their errors.
+    """Return the points that satisfy the options, their observations that do, and their errors.
 
     Args:
         points: of the images.

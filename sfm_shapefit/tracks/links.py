@@ -94,7 +94,7 @@ class ObservedTracks:
         return JoinedRows(self.offsets, np.arange(len(self.cameras)))
 
     def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
-        """Return tracks of these observations."""
+        """Return tracks that consist of rows of the observations."""
         rows = joined.rows
         return replace(
             self,

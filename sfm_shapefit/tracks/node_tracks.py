@@ -6,8 +6,8 @@ between the cameras cannot: on a straight road all baselines are parallel, rays 
 
 A track is a connected component of observations under matches that agree with their pair's direction; one
 that meets an image twice is wrong and dropped. Where there are too many matches to hold, only those of a
-random share of the keypoints are kept, and with them whole stars of matches around these. Of the tracks, a
-covering set is chosen: so many that every camera, if it can, sees a given number of them.
+random share of the keypoints are kept, and with them whole stars of matches around these. A covering set of
+the tracks is chosen: so many that every camera, if it can, sees a given number of them.
 """
 
 from dataclasses import dataclass
@@ -23,15 +23,14 @@ from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
 
-# These are about 3 tracks started per camera, of 6 views each: what determines a straight road.
+# Observations per camera; about 3 tracks started per camera, of 6 views each, determine a straight road.
 _PER_CAMERA = 20
-# A small scene can afford so many observations, in all and per camera.
+# Observations that a small scene is given, in all and per camera at most; it can afford them.
 _IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
-_MIN_VIEWS = 3
-# The keypoints of so many matches are held at a time, in 0.4 GB.
-_MAX_MATCHES = 10_000_000
-# Rays farther apart gain nothing more, and are often wrong.
-_WIDEST_RAD = 0.5
+_MIN_VIEWS = 3  # views of a track; two of them are no more than the pair's own direction
+_MAX_MATCHES = 10_000_000  # matches whose keypoints are held at a time; they take 0.4 GB
+_WIDEST_RAD = 0.5  # angle between rays; wider ones gain nothing more, and are often wrong
+# Odd multiplier of the hash; 2^64 over the golden ratio, the increment of splitmix64.
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -160,7 +159,7 @@ def _collect(places: Int32Array, begins: IntArray, parents: IntArray, rays: Floa
     seen = places[keypoints].astype(np.int64)
     camera = np.searchsorted(begins, keypoints, side="right") - 1
     track = number_trees(parents, seen)[seen]
-    order = np.argsort(track, kind="stable")  # of a track by ascending camera, as keypoints are
+    order = np.argsort(track, kind="stable")  # each track by ascending camera, as keypoints are
     track, camera, seen = track[order], camera[order], seen[order]
     lengths = np.bincount(track)
     repeated = np.zeros(len(lengths), dtype=np.bool_)
@@ -222,7 +221,7 @@ def join_points(
 
     Args:
         graph: n cameras and their directions.
-        covariance: (m, 2, 2) of these.
+        covariance: (m, 2, 2) of the directions.
         tracks: what to add.
         pixel_angles: (n,) angle of one pixel of each camera in radians.
         noise_px: standard deviation of an observation, per axis.

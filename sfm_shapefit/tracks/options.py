@@ -7,8 +7,7 @@ from sfm_shapefit.base.settings import Settings, explained, option
 
 PointNodes = Literal["auto", "never", "always"]
 
-# With more cameras, the points would multiply the time of the solve.
-_MAX_CAMERAS_WITH_POINTS = 5_000
+_MAX_CAMERAS_WITH_POINTS = 5_000  # cameras; with more, the points would multiply the time of the solve
 
 
 @explained
@@ -24,11 +23,11 @@ class NodeOptions(Settings):
     )
 
     def uses_points(self, num_cameras: int) -> bool:
-        """Return whether 3D points join the view graph of so many cameras."""
+        """Return whether 3D points join the view graph of `num_cameras` cameras."""
         return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
-        """Say whether 3D points join the view graph of so many cameras, and why."""
+        """Say whether 3D points join the view graph of `num_cameras` cameras, and why."""
         if self.points == "never":
             return "no, as asked"
         if self.points == "always":

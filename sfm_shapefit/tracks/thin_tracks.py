@@ -20,14 +20,14 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel
 
-_LONG = 6
-_WANTED, _WANTED_IN_ALL = 200, 20_000
+_LONG = 6  # views; longer tracks come no earlier, see the header
+_WANTED, _WANTED_IN_ALL = 200, 20_000  # observations per image, and in all; small scenes can afford more each
 # Observations beyond which a track may be far longer than the others, and how many times as long as nine
-# tenths of them it is then.
+# tenths of them it is then; see the header.
 _MAYBE_JOINED, _FAR_LONGER = 100, 4.0
-# The finalizer of splitmix64 (Steele, Lea and Flood 2014).
+# Multipliers that scramble bits; the finalizer of splitmix64 (Steele, Lea and Flood 2014).
 _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
-_TURN = np.uint64(0x9E3779B97F4A7C15)
+_TURN = np.uint64(0x9E3779B97F4A7C15)  # multiplier of the second coordinate; the increment of splitmix64
 
 
 def choose_thin_tracks(

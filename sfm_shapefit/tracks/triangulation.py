@@ -27,15 +27,11 @@ from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints,
 
 # Observations between which Python can be interrupted: about 0.1 s.
 _SLICE = 100_000
-# Pairs of observations that are tried for each point, and Gauss-Newton steps.
-_PAIRS = 15
-_STEPS = 5
-# Of the distance of a point that a step may go before the steps end.
-_STILL = 1e-9
-# Keypoints of a track for each of its images, from which it is a chain of several points.
-_CHAIN = 1.5
-# Of so many rays one makes the widest angle with another, nearly always.
-_WIDE_AMONG = 64
+_PAIRS = 15  # pairs of observations that are tried for each point; all of six observations
+_STEPS = 5  # Gauss-Newton steps for a point; they begin within the limit of its observations
+_STILL = 1e-9  # length of a step over the distance of the point; the steps end with a shorter one
+_CHAIN = 1.5  # keypoints of a track for each of its images; with more it is a chain of several points
+_WIDE_AMONG = 64  # rays; one of as many makes the widest angle with another, nearly always
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,13 +39,13 @@ class PointLimits:
     """What a point must satisfy."""
 
     max_error_px: float
-    """Of an observation."""
+    """Largest error of an observation."""
     min_angle_deg: float
-    """Between the rays of two of its observations."""
+    """Least angle between the rays of two of its observations."""
     min_length: int
-    """Its fewest observations."""
+    """Fewest observations."""
     most_points: int = 50
-    """So many points a track may be of: wrong matches join true tracks to long chains."""
+    """Points that a track may be of: wrong matches join true tracks to long chains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,7 +60,7 @@ class TriangulatedPoints:
     """(m,) the point of each observation of the tracks, -1 for those that are of none."""
 
     def of_length(self, least: int) -> "TriangulatedPoints":
-        """Return the points with so many observations; those of the others are of none."""
+        """Return the points with at least that many observations; the observations of others are of none."""
         seen = self.points_seen
         kept = np.bincount(seen[seen >= 0], minlength=len(self.points)) >= least
         place = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1)

@@ -28,7 +28,7 @@ _KEYPOINT_BITS = np.uint64(32)  # bits of a keypoint's number; a match is one nu
 _KEYPOINT_MASK = np.uint64(2**32 - 1)  # bits of the second keypoint; the first stands above them
 
 _CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
-"""Configurations without a direction, by COLMAP: not verified (0, 1, 7), a pure turn, several motions."""
+"""COLMAP's configurations without a direction: not verified (0, 1, 7), pure turn (5), several motions (8)."""
 
 # Stored translations are 1, or of the scene's size; shorter ones mean "none".
 _MIN_TRANSLATION = 1e-12
