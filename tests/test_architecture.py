@@ -45,7 +45,7 @@ MOST_LINES = {
     "laplacian": 2060,
     "pairs": 1550,
     "pipeline": 5330,
-    "placement": 1960,
+    "placement": 1970,
     "refinement": 1280,
     "report": 1710,
     "rotations": 2270,

@@ -56,7 +56,7 @@ def adjust_first_placement(
     measured = measure(source, options.directions, clock, wanted)
     graph, directions = given.rigid.apply(build_graph(images, measured)), measured.directions
     del measured  # arrays of all pairs
-    placement = next(place_cameras(graph, options.placement, options.nodes, clock))
+    placement = next(place_cameras(graph, options.placement, options.nodes, clock, certified=False))
     del graph
     stand = Stand.of(given, source, directions, placement, options)
     posed = posed_part(stand.place())

@@ -114,6 +114,8 @@ def place_cameras(
     nodes: NodeOptions,
     clock: Clock,
     near: Near | None = None,
+    *,
+    certified: bool = True,
 ) -> Iterator[Placement]:
     """Place the rigid pieces of a graph; with rigid groups, 3D points take part only where they are needed.
 
@@ -121,7 +123,9 @@ def place_cameras(
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     hand_back_memory()  # what the graph was made of is gone
-    placed = partial(place_pieces, options=options, near=near, on_iteration=clock.iteration)
+    placed = partial(
+        place_pieces, options=options, near=near, certified=certified, on_iteration=clock.iteration
+    )
     if measured.groups is None or not measured.num_points or nodes.points == "always":
         yield from placed(measured)
         return

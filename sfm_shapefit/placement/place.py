@@ -55,8 +55,8 @@ class Placement(Displayed):
     piece: int
     """The one that is placed: 0, the largest, or one of the further ones."""
     certified: SolverResult
-    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to its
-    edge `edges[e]`."""
+    """The ShapeFit optimum, with a certificate if one was asked for. Row k belongs to node `nodes[k]` of the
+    graph, row e of the dual to its edge `edges[e]`."""
     refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     agreement: AngularAgreement
@@ -151,6 +151,7 @@ def place_pieces(
     options: PlacementOptions,
     *,
     near: Near | None = None,
+    certified: bool = True,
     on_iteration: OnIteration | None = None,
 ) -> Iterator[Placement]:
     """Place the rigid pieces of a measured graph, each with a scale of its own, most cameras first.
@@ -160,6 +161,7 @@ def place_pieces(
         options: settings.
         near: a piece all of whose cameras are there is solved for its certificate only: they stay where the
             adjustment has them.
+        certified: False proves nothing, for locations that are only a start; see `solve`.
         on_iteration: called after each iteration of the largest piece's solve, on graphs where that costs
             little; returning False ends the solve there, and the placement goes on from the last iterate.
 
@@ -172,10 +174,19 @@ def place_pieces(
             rigid groups to one another, or see `solve`.
     """
     pieces = _split(measured, options)
-    yield _place_piece(measured, pieces, 0, options, near, on_iteration)
+    how = _How(options, near, certified)
+    yield _place_piece(measured, pieces, 0, how, on_iteration)
     for k in range(1, count_large(pieces, measured.num_cameras)):
         with suppress(UnsolvableError):
-            yield _place_piece(measured, pieces, k, options, near)
+            yield _place_piece(measured, pieces, k, how)
+
+
+class _How(NamedTuple):
+    """How pieces are placed; see `place_pieces`."""
+
+    options: PlacementOptions
+    near: Near | None
+    certified: bool
 
 
 @one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
@@ -183,17 +194,16 @@ def _place_piece(
     measured: MeasuredGraph,
     pieces: list[RigidPiece],
     k: int,
-    options: PlacementOptions,
-    near: Near | None = None,
+    how: _How,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
     """Solve piece k, refine it robustly, and see which directions agree."""
     part, _ = measured.part(pieces[k].edges)
-    solved, history = _solve_part(part, options, on_iteration)
-    nodes = pieces[k].nodes
+    solved, history = _solve_part(part, how, on_iteration)
+    nodes, near = pieces[k].nodes, how.near
     centers = None if near is None else near.locations[nodes[nodes < measured.num_cameras]]
     if near is None or centers is None or not np.isfinite(centers).all():
-        refined = refine_starts(part, solved, options)
+        refined = refine_starts(part, solved, how.options, certified=how.certified)
     else:
         refined = stay_near(part, solved, centers, near.refined)
     unit = None if part.groups is None else measure_unit(part, refined.locations)
@@ -232,10 +242,11 @@ def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiec
 
 
 def _solve_part(
-    part: MeasuredGraph, options: PlacementOptions, on_iteration: OnIteration | None
+    part: MeasuredGraph, how: _How, on_iteration: OnIteration | None
 ) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
     """Return the optimum of the convex program, and the iterations that led to it."""
     history: list[IterationInfo] = []
+    options = how.options.solver
 
     def watch(info: IterationInfo) -> bool | None:
         history.append(info)
@@ -243,9 +254,9 @@ def _solve_part(
 
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
     if part.groups is not None:
-        solved = solve_groups(part.graph, part.groups, options.solver, watched)
+        solved = solve_groups(part.graph, part.groups, options, watched, certified=how.certified)
     else:
-        solved = solve(part.graph, options.solver, on_iteration=watched)
+        solved = solve(part.graph, options, on_iteration=watched, certified=how.certified)
     return solved, tuple(history)
 
 

@@ -134,18 +134,19 @@ class _Problem(NamedTuple):
 
 
 def refine_starts(
-    measured: MeasuredGraph, solved: SolverResult, options: PlacementOptions
+    measured: MeasuredGraph, solved: SolverResult, options: PlacementOptions, *, certified: bool = True
 ) -> RefinedPlacement:
     """Return the locations to keep for a solved graph.
 
     Args:
         measured: connected and parallel rigid, or rigid groups that are tied to one another, in which case
             every pair joins two of them.
-        solved: its certified ShapeFit solution.
+        solved: its ShapeFit solution.
         options: which starts, and whether to refine.
+        certified: compute the bound of the second start, too, where that takes little.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    lud, second = _find_second_start(measured, options.solver.num_threads())
+    lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
     problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
@@ -195,13 +196,16 @@ def _plan_normal_solver(
         return None
 
 
-def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult | None, FloatArray | None]:
+def _find_second_start(
+    measured: MeasuredGraph, threads: int, certified: bool
+) -> tuple[LudResult | None, FloatArray | None]:
     """Return LUD's solution after a few steps, which groups have none of, and its locations, if usable."""
     graph, classes, groups = measured.graph, measured.classes, measured.groups
     if groups is None:
         if not has_second_start(graph):
             return None, None
-        certified, weighted = graph.num_edges <= _LUD_CERTIFIED_PAIRS, _weight_points(graph, classes)
+        certified = certified and graph.num_edges <= _LUD_CERTIFIED_PAIRS
+        weighted = _weight_points(graph, classes)
         lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)

@@ -18,7 +18,7 @@ from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
-from sfm_shapefit.solver.program import normalize_locations, scale_functional
+from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 
@@ -53,6 +53,7 @@ def solve(
     options: SolverOptions | None = None,
     *,
     on_iteration: OnIteration | None = None,
+    certified: bool = True,
     **overrides: Any,
 ) -> SolverResult:
     """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
@@ -67,6 +68,7 @@ def solve(
         graph: n cameras, m pairs, directions in any dimension d >= 2.
         options: solver settings, see `help(SolverOptions)`; defaults if None.
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
+        certified: False proves nothing of the locations, for those that are only a start.
         **overrides: single options by name: `solve(graph, tol=1e-6)`.
 
     Returns:
@@ -84,7 +86,7 @@ def solve(
     _refuse_undetermined(graph)
     choice, threads = choose_method(graph, options), options.num_threads()
     prove = partial(certify, graph, tol=options.tol, uniqueness=options.uniqueness, threads=threads)
-    return run_choice(graph, choice, options, on_iteration, prove, start)
+    return run_choice(graph, choice, options, on_iteration, prove if certified else None, start)
 
 
 def run_choice(
@@ -92,19 +94,23 @@ def run_choice(
     choice: Choice,
     options: SolverOptions,
     on_iteration: OnIteration | None,
-    prove: Callable[[FloatArray, FloatArray], Certificate],
+    prove: Callable[[FloatArray, FloatArray], Certificate] | None,
     start: float,
 ) -> SolverResult:
     """Run the chosen solver and return its answer; the solve began at `start`, by `time.perf_counter()`.
 
-    `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
-    UnsolvableError if the locations are not finite or point against the directions.
+    `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d); None:
+    of none. UnsolvableError if the locations are not finite or point against the directions.
     """
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)
     run = SolverRun(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
     locations = normalize_locations(graph, run.locations)
-    certificate = prove(locations, run.dual)
+    if prove is not None:
+        certificate = prove(locations, run.dual)
+    else:  # nothing but what always holds
+        value, none = objective(graph, locations), np.zeros_like(run.dual)
+        certificate = Certificate(objective=value, dual_bound=0.0, dual=none, equality_residual=0.0)
     status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
     if certificate.gap <= options.tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
         status = Status.CONVERGED

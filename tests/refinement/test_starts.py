@@ -206,3 +206,13 @@ def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
     pair_level, ray_level = joint.refined.levels_deg  # 0.01 and 0.001 rad over sqrt(3), and some excess
     assert pair_level == pytest.approx(0.33, rel=0.5)
     assert ray_level == pytest.approx(0.033, rel=0.5)
+
+
+def test_a_second_start_without_a_bound_stands_where_the_one_with_it_stands(expander):
+    graph = MeasuredGraph(expander.view_graph)
+    solved, options = solve(expander.view_graph), PlacementOptions()
+    proved, start = (
+        refine_starts(graph, solved, options, certified=certified) for certified in (True, False)
+    )
+    assert (start.locations == proved.locations).all()
+    assert start.lud.dual_bound == 0.0 < proved.lud.dual_bound

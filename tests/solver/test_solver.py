@@ -244,3 +244,14 @@ def test_uniqueness_is_certified_where_it_holds_and_not_where_it_does_not():
     result = solve(ViewGraph(5, edges, directions, [100.0] * 6 + [1.0] * 4))
     assert result.converged
     assert result.unique is False
+
+
+def test_a_start_that_is_not_certified_has_the_same_locations_and_proves_nothing():
+    graph, _ = problem(5, sigma=0.05)
+    proved, start = solve(graph), solve(graph, certified=False)
+    assert (start.locations == proved.locations).all()
+    assert start.objective == pytest.approx(proved.objective, rel=1e-14)
+    assert start.dual_bound == 0.0 < proved.dual_bound
+    assert start.unique is None
+    assert not start.dual.any()
+    assert start.status is Status.INACCURATE

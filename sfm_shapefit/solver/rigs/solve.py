@@ -28,6 +28,8 @@ def solve_groups(
     groups: RigidGroups,
     options: SolverOptions | None = None,
     on_iteration: OnIteration | None = None,
+    *,
+    certified: bool = True,
 ) -> SolverResult:
     """Solve ShapeFit over groups, with a certificate.
 
@@ -39,6 +41,7 @@ def solve_groups(
         groups: groups of its nodes, tied to one another by the pairs between them (`largest_tied`).
         options: solver settings; the methods are "newton", which "auto" means, and "conic", else InputError.
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
+        certified: as in `solve`.
 
     Raises:
         UnsolvableError: if no pair joins two groups, the pairs do not determine the groups, or a factor over
@@ -60,7 +63,8 @@ def solve_groups(
         dual[outer] = dual_between
         return certify_groups(graph, groups, locations, dual, uniqueness=options.uniqueness)
 
-    return run_choice(between, _choose_method(between, unit, options), options, on_iteration, prove, start)
+    choice = _choose_method(between, unit, options)
+    return run_choice(between, choice, options, on_iteration, prove if certified else None, start)
 
 
 def refuse_admm(options: SolverOptions) -> None:
