@@ -4,6 +4,7 @@
     write_result(found, "out")
     mapped = map_database("database.db")                    # the same from the matches alone
     pairs  = relative_rotations("database.db")              # of every two images, and how well each is known
+    judged = check("sparse/0")                              # whether any COLMAP model can be used
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     errors = evaluate(found.reconstruction, "truth")
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.judgement.options import TrustOptions
     from sfm_shapefit.pairs.options import DirectionOptions
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
+    from sfm_shapefit.pipeline.check import CheckResult, check
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.evaluate import evaluate
     from sfm_shapefit.pipeline.inspect import inspect
@@ -56,6 +58,7 @@ _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "adjustment.options": ("AdjustmentOptions",),
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
+    "pipeline.check": ("CheckResult", "check"),
     "pipeline.convert": ("convert",),
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),
@@ -92,6 +95,7 @@ __all__ = [
     "AveragedRotations",
     "AveragingOptions",
     "Certificate",
+    "CheckResult",
     "DirectionOptions",
     "FreedomOptions",
     "GaugeOptions",
@@ -117,6 +121,7 @@ __all__ = [
     "average_rotations",
     "bundle_adjust",
     "certify",
+    "check",
     "convert",
     "evaluate",
     "hear_pycolmap",

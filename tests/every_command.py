@@ -22,7 +22,7 @@ COMMANDS = """
     map data_synthetic/ring8/database.db {out}/mapped -q
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
-    report {out}/located
+    check {out}/located --report {out}/check.html
     convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q
     synth {out}/drive --shape drive --num-images 6 --num-points 300

@@ -176,8 +176,8 @@ def test_the_command_line_starts_without_the_heavy_dependencies():
 def test_only_the_command_that_is_called_is_loaded():
     code = "import sys; from sfm_shapefit.cli.root import load_commands; load_commands(sys.argv[1:]); "
     code += "print(*sorted(set(map('sfm_shapefit.cli.{}'.format, sys.argv[-1].split())) & set(sys.modules)))"
-    every = "convert evaluate inspect locate map place report synth warm_up"
-    for words, loaded in (("locate", "locate"), ("--version report", "report"), ("warm-up", "warm_up")):
+    every = "check convert evaluate inspect locate map place synth warm_up"
+    for words, loaded in (("locate", "locate"), ("--version check", "check"), ("warm-up", "warm_up")):
         done = run_python("-c", code, *words.split(), every)
         assert done.stdout.split() == [f"sfm_shapefit.cli.{loaded}"]
     for words in ("--help", "locat"):

@@ -5,8 +5,7 @@ class Lud(Record):
 
     iterations: Annotated[int, "Steps of the solver."]
 
-lud.summary()              # plain values, as they stand in JSON
-Lud.read(lud.summary())    # the same record again
+lud.summary()    # plain values, as they stand in JSON
 """
 
 import enum
@@ -58,17 +57,6 @@ class Record:
         """Return the record of a source's attributes; None of None."""
         return None if source is None else cls.taken_from(source)
 
-    @classmethod
-    def read(cls, values: Mapping[str, Any]) -> Self:
-        """Return the record of plain values; keys that are unknown are passed over.
-
-        Raises:
-            TypeError, ValueError, AttributeError: if a key without a default is missing, or a value is of
-                another kind.
-        """
-        kinds = hints_of(cls)  # type: ignore[arg-type]  # a class can be hashed
-        return cls(**{name: _typed(values[name], kind) for name, kind in kinds.items() if name in values})
-
     def summary(self) -> dict[str, Any]:
         """Return plain values, as they stand in JSON."""
         return {item.name: plain(getattr(self, item.name)) for item in fields(self)}
@@ -92,22 +80,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _typed(value: Any, kind: Any) -> Any:
-    """Return a plain value as a value of a type."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _typed(value, inner[0])
-    if origin is types.UnionType:
-        return None if value is None else _typed(value, inner[0])
-    if origin in (list, tuple):
-        return origin(_typed(item, inner[0]) for item in value)
-    if origin is dict:
-        return {key: _typed(item, inner[1]) for key, item in value.items()}
-    if isinstance(kind, type) and issubclass(kind, enum.Enum):
-        return kind(value)
-    return kind.read(value) if isinstance(kind, type) and issubclass(kind, Record) else value
 
 
 def dumps(summary: dict[str, Any], *, only_ascii: bool = False) -> str:

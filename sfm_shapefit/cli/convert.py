@@ -9,8 +9,9 @@ from sfm_shapefit.base.display import row
 from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
+from sfm_shapefit.pipeline.convert import FORMATS, convert
 
-_FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv", "glb", "ply")
+_DESCRIBED = "; ".join(f"{name}: {one.help}" for name, one in FORMATS.items())
 
 
 @app.command(
@@ -32,8 +33,7 @@ def convert_command(
         str | None,
         typer.Option(
             "--format",
-            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory), csv, or glb or "
-            "ply (a mesh); by default that of OUT's suffix: none, .json, .tum or .txt, .csv, .glb, .ply.",
+            help=f"{_DESCRIBED}. By default that of OUT's suffix; a folder if it has none.",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
@@ -42,11 +42,9 @@ def convert_command(
     """Write MODEL, COLMAP's or OpenSfM's, in another format."""
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
-    if target_format is not None and target_format not in _FORMATS:
-        raise typer.BadParameter(f"--format must be one of {', '.join(_FORMATS)}, got {target_format!r}")
+    if target_format is not None and target_format not in FORMATS:
+        raise typer.BadParameter(f"--format must be one of {', '.join(FORMATS)}, got {target_format!r}")
     with report_errors(target):
-        from sfm_shapefit.pipeline.convert import convert
-
-        written = convert(source, target, target_format=target_format, overwrite=overwrite)  # type: ignore[arg-type]
+        written = convert(source, target, target_format=target_format, overwrite=overwrite)
         if not quiet:
             print_table(str(source), [row("format", written), row("written to", str(target))])

@@ -6,8 +6,8 @@ what people are to see of it is one more line in `scene_rows` (terminal, report 
 
 import math
 import shlex
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, Literal, Self
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from sfm_shapefit.facts.placed import (
     IN_MEMORY,
     SCHEMA_VERSION,
     Facts,
-    GraphFacts,
     InputFacts,
     Options,
     PlacedFacts,
@@ -39,6 +38,7 @@ from sfm_shapefit.facts.scene import (
     describe_line,
     describe_loops,
 )
+from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
@@ -193,6 +193,13 @@ class FactsOfModel(Facts):
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
 
+    @property
+    def points_statement(self) -> str:
+        """How many points there are, and how far they are off their keypoints."""
+        if not self.num_points:
+            return "none"
+        return f"{self.num_points}, mean error {self.mean_reprojection_error_px:.2f} px"
+
 
 class ModelFacts(FactsOfModel, PlacedFacts):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
@@ -261,13 +268,6 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         said = self.adjustment.statement if self.adjustment else ""
         return super().expert_sentences() + ([f"{said[:1].upper()}{said[1:]}."] if said else [])
 
-    @property
-    def points_statement(self) -> str:
-        """How many points there are, and how far they are off their keypoints."""
-        if not self.num_points:
-            return "none"
-        return f"{self.num_points}, mean error {self.mean_reprojection_error_px:.2f} px"
-
     def told(self, left_out: Sequence[str], centers: str) -> Telling:
         """Return what the terminal says.
 
@@ -327,11 +327,13 @@ def next_of_model(grade: Grade, source: str, *, is_adjusted: bool) -> NextStep:
     )
 
 
-class ExaminedFacts(FactsOfModel):
-    """A model that was only looked at, not placed."""
+class CheckedFacts(FactsOfModel):
+    """What `sfm-shapefit check --json` prints: a model that was judged as it stands, not placed."""
 
     examined: Annotated[Literal[True], "Its positions were looked at as they stand."] = True
-    median_track_length: Annotated[float | None, "Of the 3D points."]
+    median_track_length: Annotated[
+        float | None, "Median number of images that see a 3D point; null if there are none."
+    ]
 
     @property
     def next_step(self) -> NextStep:
@@ -345,8 +347,17 @@ class ExaminedFacts(FactsOfModel):
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located")
 
+    def told(self, cameras: Sequence[CameraRow]) -> Telling:
+        """Return what the terminal says; `cameras` are rows of all images, with what is weak about them."""
+        weak = [f"{row.name}: {row.reason}" for row in cameras if row.reason]
+        figures = [*self.key_rows()[:2], row("points", self.points_statement), Row("weak", weak)]
+        figures += [row("matches", self.inputs.directions)]
+        return Telling(
+            counted(self.num_images, "image"), figures, elsewhere="see --report", step=self.next_step
+        )
 
-class JoinedFacts(ExaminedFacts):
+
+class JoinedFacts(CheckedFacts):
     """joined_0/locate.json, of models of `map` that were joined: looked at, not placed anew."""
 
     models: Annotated[list[str], "The folders of the models in it."]
@@ -414,14 +425,3 @@ class MapFacts(Record):
     left_out: Annotated[dict[str, str], "Images in no model, and why."]
     timings_s: Timings
     warnings: Warnings
-
-
-def read_facts(values: Mapping[str, Any]) -> Facts:
-    """Return what stands in a locate.json.
-
-    Raises:
-        TypeError, ValueError, AttributeError: if it is not as this version writes it.
-    """
-    if values.get("examined"):
-        return JoinedFacts.read(values)
-    return (GraphFacts if "graph" in values["inputs"] else ModelFacts).read(values)

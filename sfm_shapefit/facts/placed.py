@@ -455,7 +455,7 @@ class GraphFacts(PlacedFacts):
         """What to do next."""
         return NextStep(
             "Next: the positions are in cameras.csv; look at them from all sides.",
-            "sfm-shapefit report {out}",
+            "open {out}/cameras.csv",
         )
 
     def told(self, left_out: Sequence[str], locations: str) -> Telling:

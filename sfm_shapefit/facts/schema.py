@@ -9,7 +9,7 @@ from typing import Any
 
 from sfm_shapefit.base.record import schema_of
 from sfm_shapefit.facts.inspected import Inspection
-from sfm_shapefit.facts.model import JoinedFacts, MapFacts, ModelFacts
+from sfm_shapefit.facts.model import CheckedFacts, JoinedFacts, MapFacts, ModelFacts
 from sfm_shapefit.facts.placed import GraphFacts
 from sfm_shapefit.scene.evaluation import EvaluationFacts, PositionFacts
 
@@ -21,6 +21,7 @@ _COMMANDS = {
     "inspect": Inspection,
     "evaluate": EvaluationFacts,
     "evaluate_table": PositionFacts,
+    "check": CheckedFacts,
     "map": MapFacts,
     "joined": JoinedFacts,
 }
@@ -36,7 +37,7 @@ def output_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Output of sfm-shapefit",
         "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
-        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), map. "
+        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), check, map. "
         "joined is the locate.json of models that map has joined.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
         "$defs": definitions,

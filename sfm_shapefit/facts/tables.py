@@ -6,11 +6,11 @@
 import csv
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -86,18 +86,9 @@ class PairRow:
     """Angle between the direction and the baseline of the position priors, where both cameras have one."""
 
 
-TableRow = TypeVar("TableRow", CameraRow, PairRow)
 _ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
 """Of the columns of a vector, one per axis, or per two axes."""
-_PARSERS: dict[Any, Callable[[str], Any]] = {
-    str: str.__str__,
-    bool: "true".__eq__,
-    int: int,
-    float: lambda cell: float(cell or "nan"),
-    int | None: lambda cell: int(cell) if cell else None,
-}
-"""How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
 
 
 def write_rows(
@@ -117,28 +108,18 @@ def write_rows(
     _write_csv(columns, map(cells, rows), path)
 
 
-def read_rows(row_type: type[TableRow], dimension: int, path: Path) -> list[TableRow]:
-    """Return the rows that `write_rows` wrote.
+def read_trust(path: Path) -> dict[str, float]:
+    """Return the trust of the cameras in a cameras.csv by their names; NaN where it is empty.
 
     Raises:
-        InputError: if it is no ordinary file.
-        OSError, ValueError, KeyError, TypeError: if it cannot be read, or a cell is not as it should be.
+        InputError: if the file cannot be read.
     """
     refuse_irregular_file(path)
-
-    columns = {item.name: columns_of_field(item.name, dimension) for item in fields(row_type)}
-
-    def value(cells: dict[str, str], name: str, kind: Any) -> Any:
-        if name not in _PREFIXES:
-            return _PARSERS[kind](cells[name])
-        numbers = [cells[column] for column in columns[name]]
-        return tuple(map(float, numbers)) if all(numbers) else ()
-
-    with path.open(newline="", encoding="utf-8") as stream:
-        return [
-            row_type(**{item.name: value(cells, item.name, item.type) for item in fields(row_type)})
-            for cells in csv.DictReader(stream)
-        ]
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            return {cells["name"]: float(cells["trust"] or "nan") for cells in csv.DictReader(stream)}
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise InputError(f"{path} is damaged or of another version ({error}); run locate again") from error
 
 
 def columns_of_field(name: str, dimension: int) -> list[str]:

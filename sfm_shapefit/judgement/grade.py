@@ -39,10 +39,10 @@ from sfm_shapefit.placement.place import SMALLEST_PIECE
 
 UNCERTAIN_SHARE = 0.05
 """Share of the extent of all; a larger standard deviation of a camera counts as large."""
-_MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
+MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
 # Share of observations that contradict, and share that sees a point: see the header.
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
-_LEAST_PAIRS = 0.25  # share of agreeing pairs; below, the model is not to be used
+LEAST_PAIRS = 0.25  # share of agreeing pairs; below, the model is not to be used
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
 _LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
@@ -130,11 +130,11 @@ def judge_model(
 def _reasons_against(placement: Judged, shares: Shares) -> Iterator[str]:
     """Yield why a model should not be used; a share that is not known is no reason."""
     level = placement.assessment.level_deg
-    if level > _MOST_LEVEL_DEG:
+    if level > MOST_LEVEL_DEG:
         yield f"the directions are {level:.0f} degrees off the cameras"
     if shares.contradicting >= _MOST_CONTRADICTING:
         yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
-    if shares.pairs < _LEAST_PAIRS:
+    if shares.pairs < LEAST_PAIRS:
         yield f"only {shares.pairs:.0%} of the pairs agree"
     if shares.kept < _LEAST_KEPT:
         yield f"only {shares.kept:.0%} of the placed cameras are trusted"

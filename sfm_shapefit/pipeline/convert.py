@@ -1,56 +1,59 @@
 """`convert`: a model of any format that is read, written in any format that is written.
 
-    colmap        a folder, binary            .../            cameras, images, points3D, rigs, frames
-    colmap-txt    a folder, text
-    nerf          transforms.json             .json           nerfstudio, instant-ngp
-    tum           trajectory                  .tum, .txt      evo, SLAM tools
-    csv           name, center, rotation      .csv
-    mesh          scene of pyramids, points   .glb, .ply      3D viewers; an output's cameras have their trust
-
-Only COLMAP's formats hold all points; a mesh shows as many as `report.html` does.
+Only COLMAP's formats hold all points; a mesh shows as many as `report.html` does, and an output's cameras in
+the colors of their trust. A new format is a line of `FORMATS`, and the file of the function that it names.
 """
 
 import os
 import secrets
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, NamedTuple
 
 from sfm_shapefit.base.atomic_folder import MARKER, atomic_folder
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.other_programs import posed_model_of, reconstruction_of
-from sfm_shapefit.files.colmap.seed import write_model
-from sfm_shapefit.files.nerf import nerf_text
-from sfm_shapefit.files.opensfm import read_opensfm
-from sfm_shapefit.files.tum import poses_csv, tum_text
 
 if TYPE_CHECKING:
     import pycolmap
 
     from sfm_shapefit.report.drawing import Drawing
 
-Format = Literal["colmap", "colmap-txt", "nerf", "tum", "csv", "glb", "ply"]
 
-_BY_SUFFIX: dict[str, Format] = {
-    **{"": "colmap", ".json": "nerf", ".tum": "tum", ".txt": "tum", ".csv": "csv"},
-    **{".glb": "glb", ".ply": "ply"},
+class ExportFormat(NamedTuple):
+    """A format in which models are written."""
+
+    help: str
+    """What it is, for the help of `convert`."""
+    suffixes: tuple[str, ...] = ()
+    """Suffixes of files that have this format where none is named."""
+    text_of: str = ""
+    """Function that makes the text of a file from the posed images, as module:function of `files`."""
+
+
+FORMATS = {
+    "colmap": ExportFormat("a folder", ("",)),
+    "colmap-txt": ExportFormat("a folder of text files"),
+    "nerf": ExportFormat("transforms.json of nerfstudio and instant-ngp", (".json",), "nerf:nerf_text"),
+    "tum": ExportFormat("a trajectory for evo and SLAM tools", (".tum", ".txt"), "tum:tum_text"),
+    "csv": ExportFormat("name, center and rotation of each camera", (".csv",), "tum:poses_csv"),
+    "glb": ExportFormat("a mesh of cameras and points for 3D viewers", (".glb",)),
+    "ply": ExportFormat("the same in the model's own axes", (".ply",)),
 }
-_TEXTS = {"nerf": nerf_text, "tum": tum_text, "csv": poses_csv}
 
 
 def convert(
     source: "pycolmap.Reconstruction | Path | str",
     target: Path | str,
     *,
-    target_format: Format | None = None,
+    target_format: str | None = None,
     overwrite: bool = False,
-) -> Format:
+) -> str:
     """Write the posed images of a model in another format.
 
     Args:
         source: a COLMAP folder, which may be an output, a reconstruction, or OpenSfM's reconstruction.json.
         target: the file, or for COLMAP's formats the folder, to be made.
-        target_format: by the suffix of `target` if None.
+        target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
 
     Returns:
@@ -59,39 +62,54 @@ def convert(
     Raises:
         InputError: if the source cannot be read, the format cannot hold it, or the target exists already.
     """
+    # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.files.colmap.model import read_model
+    from sfm_shapefit.files.colmap.other_programs import posed_model_of, reconstruction_of
+    from sfm_shapefit.files.colmap.seed import write_model
+    from sfm_shapefit.files.opensfm import read_opensfm
+
     path = Path(target)
-    if target_format is None:
-        if path.suffix.lower() not in _BY_SUFFIX:
-            raise InputError(f"{path} has no known suffix; give the format: {', '.join(get_args(Format))}")
-        target_format = _BY_SUFFIX[path.suffix.lower()]
+    name = target_format or _format_of(path)
+    if name not in FORMATS:
+        raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
     protect = [source] if isinstance(source, Path | str) else []
     if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
         source = reconstruction_of(read_opensfm(Path(source)), source)
-    if target_format in ("glb", "ply"):
+    if name in {"glb", "ply"}:
         from sfm_shapefit.report.mesh import mesh_bytes
 
-        _write_file(mesh_bytes(_drawing_of(source), target_format), path, overwrite=overwrite)
-        return target_format
+        _write_file(mesh_bytes(_drawing_of(source), name), path, overwrite=overwrite)
+        return name
     model = read_model(source).reconstruction
-    if target_format in _TEXTS:
-        text = _TEXTS[target_format](posed_model_of(model))
+    if FORMATS[name].text_of:
+        module, _, function = FORMATS[name].text_of.partition(":")
+        text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(posed_model_of(model))
         _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
-        return target_format
+        return name
     with atomic_folder(path, protect=protect) as folder:
-        write_model(model, folder, text=target_format == "colmap-txt")
-    return target_format
+        write_model(model, folder, text=name == "colmap-txt")
+    return name
+
+
+def _format_of(path: Path) -> str:
+    """Return the format of a file by its suffix."""
+    for name, one in FORMATS.items():
+        if path.suffix.lower() in one.suffixes:
+            return name
+    raise InputError(f"{path} has no known suffix; give the format: {', '.join(FORMATS)}")
 
 
 def _drawing_of(source: "pycolmap.Reconstruction | Path | str") -> "Drawing":
     """Return what a mesh shows of a model: of an output with the trust of its cameras."""
-    from sfm_shapefit.report.read_back import draw_model, read_output
+    from sfm_shapefit.facts.tables import read_trust
+    from sfm_shapefit.files.colmap.model import read_model
+    from sfm_shapefit.report.results import draw_model
 
     if not isinstance(source, Path | str) or not (Path(source) / MARKER).is_file():
-        return draw_model(read_model(source))
-    drawing, _ = read_output(Path(source))
-    if drawing.noun == "node":
+        return draw_model(read_model(source), {})
+    if not any((Path(source) / f"images{suffix}").exists() for suffix in (".bin", ".txt")):
         raise InputError(f"{source} is of a bare graph and has no model; its report.html has the scene")
-    return drawing
+    return draw_model(read_model(source), read_trust(Path(source) / "cameras.csv"))
 
 
 def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:

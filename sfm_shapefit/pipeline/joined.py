@@ -1,6 +1,6 @@
 """What is said of models that were joined: scale, verdict, and rows for cameras and pairs, as of one model.
 
-Nothing is placed anew. The joined model is looked at as `report MODEL` looks at any, pairs between the models
+Nothing is placed anew. The joined model is judged as `check MODEL` judges any, pairs between the models
 too, and what its models know of their own cameras is kept: who is not trusted, and why, and how well a center
 is known. Errors of a join come on top, as if they moved each camera of the model that was joined alike:
 
@@ -9,6 +9,7 @@ is known. Errors of a join come on top, as if they moved each camera of the mode
 The verdict is no better than that of any of the models.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.pipeline.check import check_source
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
@@ -83,24 +85,20 @@ def tell_group(
         told: what is known of the images beside.
         clock: what it takes is added to its seconds.
     """
-    # Here, since it draws on the report, which the other commands do without.
-    from sfm_shapefit.pipeline.examine import examine_source
-
     located, known = models[next(iter(group.world_from))].located, told.distances
     gauge, rescale = _choose_scale(group, located.gauge, known)
     group = _rescaled(group, rescale)
     model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
     inputs = replace(inputs_from(database), left_out=told.left_out)
     own = Clock(clock.progress)
-    found = examine_source(model, see_matches(matches, model.images, inputs), located.options.directions, own)
-    weak = tuple(row.name for row in found.cameras if row.placed and row.reason)
+    found = check_source(model, see_matches(matches, model.images, inputs), located.options.directions, own)
     cameras = list(_camera_rows(found.cameras, group, models))
     seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     first = next(iter(group.world_from))
     facts = JoinedFacts(
         inputs=inputs.facts,
         options=flat_values(located.options) | {"known_distance": tuple(known)},
-        verdict=_judge(weak, seen.verdict.reasons, group, models),
+        verdict=_judge(seen.verdict, group, models),
         models=[str(number) for number in group.world_from],
         joins=[join.facts(f"joined_{first}") for join in group.joins],
         num_images=len(cameras),
@@ -165,19 +163,19 @@ def _rescaled(group: JoinedGroup, similarity: Similarity | None) -> JoinedGroup:
 
 
 def _camera_rows(
-    examined: Sequence[CameraRow], group: JoinedGroup, models: Sequence[MappedModel]
+    checked: Sequence[CameraRow], group: JoinedGroup, models: Sequence[MappedModel]
 ) -> Iterator[CameraRow]:
     """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
     own = {row.name: (row, number) for number in group.world_from for row in models[number].located.cameras}
     variances = _variances_of_joins(group)
-    for seen in examined:
+    for seen in checked:
         if not seen.placed:
             continue
         row, number = own[seen.name]
         sigma, correlation = _errors(row, group.world_from[number], variances[number])
         reasons = [reason for reason in (row.reason, seen.reason) if reason]
         yield replace(seen, reason="; ".join(reasons), trust=row.trust, sigma=sigma, correlation=correlation)
-    placed = {row.name for row in examined if row.placed}
+    placed = {row.name for row in checked if row.placed}
     for name, (row, _) in own.items():
         if name not in placed:
             yield CameraRow(name=name, reason=row.reason, trust=row.trust)
@@ -206,14 +204,12 @@ def _errors(
     return tuple(sigmas.tolist()), tuple(correlations_of(covariance)[0].tolist())
 
 
-def _judge(
-    weak: Sequence[str], reasons: tuple[str, ...], group: JoinedGroup, models: Sequence[MappedModel]
-) -> ModelVerdict:
+def _judge(seen: ModelVerdict, group: JoinedGroup, models: Sequence[MappedModel]) -> ModelVerdict:
     """Return the verdict: what was seen of the joined model, and those of its models."""
     verdicts = {number: models[number].located.verdict for number in group.world_from}
     grades = [verdict.grade for verdict in verdicts.values()]
-    grades += [Grade.DO_NOT_USE] if reasons else [Grade.LOOK] if weak else []
-    worst = max(grades, key=list(Grade).index)
-    cameras = dict.fromkeys([*(name for verdict in verdicts.values() for name in verdict.cameras), *weak])
+    worst = max([seen.grade, *grades], key=list(Grade).index)
+    named = (verdict.cameras for verdict in (*verdicts.values(), seen))
+    cameras = dict.fromkeys(itertools.chain.from_iterable(named))
     said = tuple(f"model {k}: {reason}" for k, verdict in verdicts.items() for reason in verdict.reasons)
-    return ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*reasons, *said))
+    return ModelVerdict(grade=worst, cameras=tuple(cameras), reasons=(*seen.reasons, *said))

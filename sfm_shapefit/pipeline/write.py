@@ -120,7 +120,7 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
 def draw_page(found: LocateResult | GraphResult) -> str:
     """Return the page of a result's report, as notebooks show it."""
     from sfm_shapefit.report.page import report_html
-    from sfm_shapefit.report.read_back import draw_result
+    from sfm_shapefit.report.results import draw_result
 
     return report_html(draw_result(found), found.facts)
 
@@ -131,11 +131,8 @@ draw_pages_by(draw_page)
 def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
     """Write report.html."""
     from sfm_shapefit.report.page import write_report
-    from sfm_shapefit.report.read_back import draw_result, read_output
+    from sfm_shapefit.report.results import draw_joined, draw_result
     from sfm_shapefit.report.thumbnails import thumbnails_of
 
-    if isinstance(found, JoinedModel):
-        drawing, facts = read_output(folder)
-    else:
-        drawing, facts = draw_result(found), found.facts
-    write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))
+    drawing = draw_joined(found) if isinstance(found, JoinedModel) else draw_result(found)
+    write_report(drawing, found.facts, folder / "report.html", thumbnails_of(drawing, options.images))

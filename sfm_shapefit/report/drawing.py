@@ -339,7 +339,7 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
 def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
     row_of = {name: k for k, name in enumerate(cameras.names)}
     ends = np.array([(row_of[row.name1], row_of[row.name2]) for row in rows], dtype=np.int64).reshape(-1, 2)
-    dimension = max((len(row.direction) for row in rows), default=3)
+    dimension = max((len(row.direction) for row in rows), default=0) or 3
     nothing = (np.nan,) * dimension
     directions = np.array([row.direction or nothing for row in rows]).reshape(-1, dimension)
     return Pairs(

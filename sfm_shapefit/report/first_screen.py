@@ -6,7 +6,7 @@ from pathlib import PurePath
 import numpy as np
 
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.facts.model import ExaminedFacts, FactsOfModel, ModelFacts
+from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, ModelFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.report.drawing import Drawing, PairClass
@@ -66,7 +66,7 @@ def _headline(drawing: Drawing, facts: Facts) -> str:
 
 
 def _sentence(drawing: Drawing, facts: Facts) -> str:
-    reasons, is_examined = "; ".join(facts.verdict.reasons), isinstance(facts, ExaminedFacts)
+    reasons, is_checked = "; ".join(facts.verdict.reasons), isinstance(facts, CheckedFacts)
     reasons = shorten(reasons[:1].upper() + reasons[1:], 4 * MAX_TEXT)
     if facts.verdict.grade is Grade.GOOD:
         agree = int(np.sum(drawing.pairs.classes == PairClass.AGREES))
@@ -75,9 +75,7 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
         if against:
             verb = "contradicts" if against == 1 else "contradict"
             set_aside = (
-                ""
-                if isinstance(facts, ExaminedFacts)
-                else f" and {'is' if against == 1 else 'are'} set aside"
+                "" if isinstance(facts, CheckedFacts) else f" and {'is' if against == 1 else 'are'} set aside"
             )
             others = f"{against:,} {verb} them{set_aside}"
         return (
@@ -90,7 +88,7 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
     more = f" and {len(cameras) - _NAMED:,} more" if len(cameras) > _NAMED else ""
     named = f"{', '.join(cameras[:_NAMED])}{more}"
     verb = "is" if len(cameras) == 1 else "are"
-    if is_examined:
+    if is_checked:
         return f"{named} {verb} weak; the others show no weakness."
     others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
     return f"{named} may be wrong or {verb} left out; {others}."
@@ -161,6 +159,6 @@ def _shift_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
 
 
 def _track_tile(facts: Facts) -> Iterator[dict[str, str]]:
-    if isinstance(facts, ExaminedFacts) and facts.median_track_length is not None:
+    if isinstance(facts, CheckedFacts) and facts.median_track_length is not None:
         length = f"{facts.median_track_length:.3g}"
         yield _tile(length, "images see a 3D point (median)", "The median track length.")

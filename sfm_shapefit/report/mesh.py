@@ -6,7 +6,7 @@
 Both formats hold float32.
 """
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,8 @@ _PYRAMID = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 
 """Faces around an apex, 0, and four corners."""
 
 
-def mesh_bytes(drawing: Drawing, file_type: Literal["glb", "ply"]) -> bytes:
-    """Return the cameras and the points of a drawing as a file."""
+def mesh_bytes(drawing: Drawing, file_type: str) -> bytes:
+    """Return the cameras and the points of a drawing as a file of type glb or ply."""
     mesh = _scene(drawing) if file_type == "glb" else _one_mesh(drawing)
     exported: bytes = mesh.export(file_type=file_type)
     return exported

@@ -20,9 +20,10 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import database_in
 from sfm_shapefit.report.first_screen import tiles
-from sfm_shapefit.report.read_back import read_output
+from sfm_shapefit.report.results import draw_result
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
 from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, edit_database, fingerprint
@@ -55,8 +56,9 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
 
 
 def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
-    result, out = ring_run
-    drawing, facts = read_output(out)
+    result, _ = ring_run
+    found = locate(RING_MODEL)
+    drawing, facts = draw_result(found), found.facts
     known = {"pair_error_deg": 0.25, "pair_error_px": 7.0, "sigma": 0.5, "sigma_of_extent": 0.125}
     figures = facts.figures
     facts = replace(facts, figures=replace(figures, **known))
@@ -108,7 +110,7 @@ def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
     assert "solve" not in listed
-    assert run("report", "-h").stdout.startswith("Usage:")
+    assert run("check", "-h").stdout.startswith("Usage:")
 
 
 def test_help_lists_commands_in_groups_the_most_used_first():

@@ -27,7 +27,7 @@ from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
-from sfm_shapefit.report.read_back import read_output
+from sfm_shapefit.report.results import draw_joined
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -404,7 +404,6 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     assert any("is in no model" in warning for warning in found.warnings)
     sfm_shapefit.write_map_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
-    assert "give one of them, such as" in run("report", tmp_path / "out", code=3).output
 
 
 def test_images_in_no_model_are_told_their_own_reason(tmp_path):
@@ -623,7 +622,9 @@ APART = "they are in models 0 and 1, which are not joined"
 
 def check_joined_folder(folder, found):
     """A joined model says of itself what others do, and its commands work."""
-    drawing, facts = read_output(folder)
+    (joined,) = found.joined
+    drawing, facts = draw_joined(joined), joined.facts
+    assert facts.summary() == json.loads((folder / "locate.json").read_text("utf-8"))
     assert problems(facts.summary(), "joined") == []
     assert facts.known_distances[0].found == pytest.approx(3.0)
     assert "0001.jpg and 0008.jpg are 3 apart" in facts.scale
@@ -651,9 +652,7 @@ def check_joined_folder(folder, found):
             )
     assert len(drawing.pairs.classes) > sum(len(model.located.pairs) for model in found.models)
     assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
-    before = (folder / "report.html").read_text("utf-8")
-    run("report", folder)
-    assert (folder / "report.html").read_text("utf-8") == before
+    assert (folder / "report.html").is_file()
     assert "bundle_adjuster" in banner(drawing, facts)["command"]
 
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from sfm_shapefit import convert
-from sfm_shapefit.facts.tables import CameraRow, read_rows
+from sfm_shapefit.facts.tables import read_trust
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.report.mesh import mesh_bytes, trust_colors
 from tests.drawings import make_drawing
@@ -72,7 +72,8 @@ def test_convert_writes_a_model_in_its_own_axes_and_an_output_with_its_trust(tmp
     np.testing.assert_allclose(apexes[order[1]], model.centers[order[0]], atol=1e-4)
     trust = [np.nan] * model.num_images
     if is_output:
-        trust = [row.trust for row in read_rows(CameraRow, 3, source / "cameras.csv") if row.placed]
+        trusts = read_trust(source / "cameras.csv")
+        trust = [trusts[name] for name in model.images.names]
     expected = trust_colors(np.array(trust))
     np.testing.assert_array_equal(colors[: 5 * model.num_images : 5, :3], expected)
 

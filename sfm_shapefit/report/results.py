@@ -1,0 +1,78 @@
+"""Drawings of what was placed, joined or judged."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.result import GraphResult, LocateResult
+from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.judgement.image_quality import ImageQuality
+from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+
+
+def draw_result(found: LocateResult | GraphResult) -> Drawing:
+    """Return the drawing of a placed model or bare graph."""
+    placement, poses, points = found.placement, None, None
+    if isinstance(found, LocateResult):
+        poses, points = poses_of(found.images, [row.name for row in found.cameras]), found.reconstruction
+        if found.gauge.axes is not None:
+            poses = replace(poses, rotations=poses.rotations @ found.gauge.axes.T)
+    # NaN stands for the cameras that the certified optimum does not place.
+    certified = np.full((len(found.cameras), placement.graph.dimension), np.nan)
+    certified[placement.cameras] = placement.certified.locations[: len(placement.cameras)]
+    return replace(
+        build_drawing(found.cameras, found.pairs, poses=poses, points=points, certified=certified),
+        dimension=placement.graph.dimension,
+        input_is_aligned=isinstance(found, LocateResult) and found.gauge.scale == "input",
+        history=tuple((info.iteration, info.objective, info.dual_bound) for info in placement.history),
+    )
+
+
+def draw_joined(found: JoinedModel) -> Drawing:
+    """Return the drawing of models that were joined."""
+    return _draw_as_it_stands(read_model(found.reconstruction), found.cameras, found.pairs)
+
+
+def draw_checked(
+    model: ColmapModel, cameras: Sequence[CameraRow], pairs: Sequence[PairRow], quality: ImageQuality
+) -> Drawing:
+    """Return the drawing of a model that was judged, with how well points hold each of its images."""
+    drawing = _draw_as_it_stands(model, cameras, pairs)
+    points = replace(
+        drawing.points, errors_px=quality.point_errors_px, track_lengths=quality.point_track_lengths
+    )
+    return replace(drawing, further=tuple(_columns(quality, len(cameras))), points=points)
+
+
+def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
+    """Return the drawing of a model's posed images and points, without pairs; `trust` is by image name."""
+    images = model.images
+    rows = [
+        CameraRow(name=name, placed=True, center=tuple(center), trust=trust.get(name, math.nan))
+        for name, center in zip(images.names, images.centers.tolist(), strict=True)
+    ]
+    return build_drawing(rows, [], poses=poses_of(images, images.names), points=model.reconstruction)
+
+
+def _draw_as_it_stands(model: ColmapModel, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Drawing:
+    """Return the drawing of a model that is the input itself, so that there is nothing to compare it with."""
+    poses = poses_of(model.images, [row.name for row in cameras])
+    poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
+    return build_drawing(cameras, pairs, poses=poses, points=model.reconstruction)
+
+
+def _columns(quality: ImageQuality, num_cameras: int) -> Iterator[CameraColumn]:
+    """Yield what the table of cameras shows beside the usual."""
+    columns = (
+        ("Points", "3D points that it observes", quality.num_points),
+        ("Reproj. px", "Mean reprojection error, in pixels", quality.errors_px),
+        ("Tracks", "Median number of images that see its points", quality.track_lengths),
+        ("Cover %", "Share of the picture in which it sees points", 100 * quality.coverage),
+    )
+    for title, hint, values in columns:
+        unposed = np.full(num_cameras - len(values), np.nan)
+        yield CameraColumn(title, hint, np.concatenate([values, unposed]))

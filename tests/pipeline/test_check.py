@@ -1,0 +1,161 @@
+"""`check MODEL`: the verdict on any COLMAP model as it stands, which is left as it is."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.judgement.image_quality import image_quality
+from sfm_shapefit.pipeline.check import check
+from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.first_screen import banner
+from tests.facts.test_schema import problems
+from tests.program import run, run_refused
+from tests.scenes import COURTYARD, RING, fingerprint
+from tests.structures import pictures_of
+
+
+def test_quality_is_that_of_the_models_own_observations():
+    model = read_model(RING / "sparse" / "0")
+    reconstruction, images = model.reconstruction, model.images
+    pictures = pictures_of(reconstruction, images)
+    quality = image_quality(points_of(reconstruction, images), images, pictures)
+    mean = np.sum(quality.num_points * quality.errors_px) / quality.num_points.sum()
+    assert mean == pytest.approx(reconstruction.compute_mean_reprojection_error(), rel=0.05)  # by point there
+    image = reconstruction.image(int(model.images.ids[3]))
+    seen = [point for point in image.points2D if point.has_point3D()]
+    lengths = [reconstruction.points3D[point.point3D_id].track.length() for point in seen]
+    assert quality.num_points[3] == len(seen)
+    assert quality.track_lengths[3] == np.median(lengths)
+    camera = image.camera
+    cells = {(int(8 * p.xy[0] / camera.width), int(8 * p.xy[1] / camera.height)) for p in seen}
+    assert quality.coverage[3] == pytest.approx(len(cells) / 64)
+
+
+def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path):
+    found = check(RING / "sparse" / "0")
+    drawing, facts = found.drawing, found.facts
+    assert facts.verdict.statement == "good"
+    assert not (drawing.pairs.classes == PairClass.CONTRADICTS).any()
+    assert "image_undistorter" in banner(drawing, facts)["command"]
+
+    moved = pycolmap.Reconstruction(RING / "sparse" / "0")
+    image = moved.image(sorted(moved.reg_image_ids())[2])
+    pose = image.frame.rig_from_world
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
+    moved.write(tmp_path)
+    found = check(tmp_path, RING / "database.db")
+    drawing, facts = found.drawing, found.facts
+    assert facts.verdict.cameras == (image.name,)
+    row = drawing.cameras.names.index(image.name)
+    assert "pairs contradict where it stands" in drawing.cameras.reasons[row]
+    assert "its reprojection error is" in drawing.cameras.reasons[row]
+    wrong = drawing.pairs.cameras[drawing.pairs.classes == PairClass.CONTRADICTS]
+    assert len(wrong) > 0
+    assert (wrong == row).any(axis=1).all()
+    assert "locate" in banner(drawing, facts)["command"]
+
+
+def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
+    before = fingerprint(RING)
+    page = tmp_path / "ring.html"
+    result = run("check", RING / "sparse" / "0", "--report", page, code=0)
+    assert f"open {page}" in result.output
+    assert "Share of the picture in which it sees points" in page.read_text(encoding="utf-8")
+    assert "exists already" in run_refused("check", RING / "sparse" / "0", "--report", page)
+    run("check", RING / "sparse" / "0", "--report", page, "--overwrite", code=0)
+    assert fingerprint(RING) == before
+
+
+def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_path):
+    facts = check(COURTYARD / "truth", COURTYARD / "database.db").facts  # a quarter of its pairs is wrong
+    assert len(facts.verdict.cameras) <= 1
+    moved = pycolmap.Reconstruction(COURTYARD / "truth")
+    image = moved.image(sorted(moved.reg_image_ids())[7])
+    pose = image.frame.rig_from_world
+    away = pose.translation + 0.002 * 15.5 * np.array([0.6, 0.0, 0.8])  # 0.2 % of the extent
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, away)
+    moved.write(tmp_path)
+    found = check(tmp_path, COURTYARD / "database.db")
+    drawing, facts = found.drawing, found.facts
+    assert image.name in facts.verdict.cameras
+    assert "its reprojection error is" in drawing.cameras.reasons[drawing.cameras.names.index(image.name)]
+
+
+def spoiled(folder, place=None, *, points=True, num_posed=None, names=None):
+    """Write ring8's model with other centers or names, or without points or poses; return its folder."""
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    ids = sorted(model.reg_image_ids())
+    for image in map(model.image, ids):
+        rotation, center = image.frame.rig_from_world.rotation, image.projection_center()
+        center = center if place is None else place(center)
+        image.frame.rig_from_world = pycolmap.Rigid3d(rotation, -rotation.matrix() @ center)
+        image.name = names(image.name) if names else image.name
+    for point in [] if points else list(model.points3D):
+        model.delete_point3D(point)
+    for image_id in ids[num_posed:] if num_posed is not None else []:
+        model.deregister_frame(model.image(image_id).frame_id)
+    folder.mkdir()
+    model.write(folder)
+    return folder
+
+
+RNG = np.random.default_rng(0)
+WRONG = {
+    "negated": ({"place": np.negative}, "degrees off"),
+    "random": ({"place": lambda _: RNG.normal(size=3)}, "degrees off"),
+    "mirrored": ({"place": lambda center: center * [-1.0, 1.0, 1.0]}, "degrees off"),
+    "all centers equal": ({"place": lambda _: np.full(3, 2.0)}, "at the same place"),
+    "all centers zero": ({"place": np.zeros_like}, "at the same place"),
+}
+
+
+@pytest.mark.parametrize("with_database", [True, False])
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_model_is_not_to_be_used(tmp_path, name, with_database):
+    how, words = WRONG[name]
+    database = ["--database", RING / "database.db"] if with_database else []
+    model = spoiled(tmp_path / "model", **how)
+    told = run("check", model, *database, "--strict", "--report", tmp_path / "page.html", code=4)
+    assert "verdict: do not use" in told.stdout
+    assert words in told.stdout
+    assert (tmp_path / "page.html").is_file()
+    assert run("check", model, *database, "-q", code=0).output == ""
+
+
+def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
+    model = RING / "sparse" / "0"
+    others = run("check", model, "--database", COURTYARD / "database.db", "--strict", code=4)
+    assert "do not use" in others.stdout
+    alone = spoiled(tmp_path / "alone", points=False)
+    assert "no two of its images have matches" in run("check", alone, "--strict", code=4).stdout
+    strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
+    database = ("--database", RING / "database.db")
+    assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
+
+
+def test_a_model_without_points_is_told_once_and_judged_by_its_pairs(tmp_path):
+    found = check(spoiled(tmp_path / "model", points=False), RING / "database.db")
+    assert found.verdict.statement.startswith("look: it has no 3D points")
+    assert found.verdict.cameras == ()
+    assert set(found.table("cameras")["reason"]) == {""}
+
+
+def test_a_model_of_one_image_or_none_is_refused_in_a_sentence(tmp_path):
+    for count, words in ((1, "only one image"), (0, "no image")):
+        model = spoiled(tmp_path / str(count), num_posed=count)
+        assert words in run_refused("check", model)
+    assert "holds no COLMAP model" in run_refused("check", tmp_path)
+    assert f"{tmp_path / 'missing'} does not exist" in run_refused("check", tmp_path / "missing")
+
+
+def test_json_has_the_figures_and_pictures_need_a_page(tmp_path):
+    facts = json.loads(run("check", RING / "sparse" / "0", "--json", code=0).stdout)
+    assert problems(facts, "check") == []
+    assert facts["verdict"]["grade"] == "good"
+    assert "--report" in run_refused("check", RING / "sparse" / "0", "--images", tmp_path)
+    page = ("--report", tmp_path / "page.html", "--images", tmp_path)
+    assert "has none of the images" in run_refused("check", RING / "sparse" / "0", *page)

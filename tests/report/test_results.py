@@ -1,0 +1,46 @@
+"""Results that are drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.pipeline.locate import locate
+from sfm_shapefit.report.drawing import PairClass, input_centers
+from sfm_shapefit.report.results import draw_result
+from tests.drawings import make_drawing
+from tests.program import run
+from tests.scenes import BUNDLED, FACADE
+
+
+def test_locate_writes_a_report_unless_told_otherwise(tmp_path):
+    result = run("locate", FACADE / "sparse" / "0", tmp_path / "out", "--no-report", code=0)
+    assert "report.html" not in result.stdout
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_what_is_drawn_of_a_result_is_what_its_facts_count():
+    found = locate(FACADE / "sparse" / "0")
+    drawing, facts = draw_result(found), found.facts
+    assert int(drawing.cameras.placed.sum()) == facts.num_placed
+    assert int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS)) == facts.pairs["outlier"]
+    assert np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).all()
+    assert len(drawing.points.positions) > 0
+
+
+def test_a_bare_graph_has_its_report_too(tmp_path):
+    result = run("place", BUNDLED / "graph40.txt", tmp_path / "out", code=0)
+    assert "report.html" in result.stdout
+    assert f"open {tmp_path / 'out'}/cameras.csv" in result.stdout
+    assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_inputs_centers_are_brought_into_the_outputs_units():
+    drawing, _ = make_drawing()
+    cameras, placed = drawing.cameras, drawing.cameras.placed
+    for centers, seen in ((100.0 * cameras.centers + 7.0, True), (np.zeros_like(cameras.centers), False)):
+        poses = replace(cameras.poses, centers=centers)
+        other = replace(drawing, cameras=replace(cameras, poses=poses), input_is_aligned=False)
+        found = input_centers(other)
+        assert (found is not None) == seen
+        if seen:
+            np.testing.assert_allclose(found[placed], cameras.centers[placed], atol=1e-6)
