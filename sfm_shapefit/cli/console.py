@@ -23,26 +23,22 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130
-NAMES_SHOWN = 8
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130  # exit codes; see the header
+NAMES_SHOWN = 8  # lines under one label of a table; the files have all
 
-# With less address space, loading the libraries or their first call fails (measured).
-_LIBRARIES_BYTES = 850_000_000
-# Each thread of the linear algebra library has a stack and work space.
-_THREAD_BYTES = 50_000_000
+_LIBRARIES_BYTES = 850_000_000  # bytes of address space; with less, loading the libraries fails (measured)
+_THREAD_BYTES = 50_000_000  # bytes; stack and work space of a thread of the linear algebra library
 
 _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
-"""How Python, C++ and the dynamic linker say that there is no memory."""
+"""Words of Python, C++ and the dynamic linker for a lack of memory."""
 
 _COMPILING = "compiling kernels, once; they are kept on disk"
 
 _WARNING_STYLE = "bold yellow"
 _GRADE_STYLES = {"good": "bold green", "look": "bold yellow", "do not use": "bold red"}
 
-# Where there is no terminal, so often.
-_SAID_EVERY_S = 2.0
-# An interrupt that was lost comes again after this time; native code has returned by then.
-_AGAIN_S = 0.02
+_SAID_EVERY_S = 2.0  # seconds between lines of progress where there is no terminal; logs stay short
+_AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code has returned by then
 
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
@@ -53,8 +49,8 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
     """Turn every known error into one sentence on stderr and its exit code.
 
     Args:
-        out: what the block makes, in one step. Whether an interrupt came before or after that step is seen
-            from what stands there: a new output is another folder, also where it replaces one.
+        out: the folder or file that the block makes, in one step. An interrupt after that step finds another
+            folder there than before, also where the output replaces one.
     """
     before = _identity(out)
     try:
@@ -84,7 +80,7 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
 
 
 def _identity(path: Path | None) -> tuple[int, int] | None:
-    """Return what tells a file or folder from any other that exists; None if there is none."""
+    """Return device and number of a file or folder, by which it is known; None if there is none."""
     try:
         status = None if path is None else path.stat()
     except OSError:
@@ -108,7 +104,7 @@ def _interrupt(number: int, _frame: object) -> None:
 
 
 def repeat_lost_interrupts() -> None:
-    """Let an interrupt that a callback of native code loses, with a traceback on stderr, come again."""
+    """Repeat an interrupt that a callback of native code loses with no more than a traceback on stderr."""
     otherwise = sys.unraisablehook
 
     def again(lost: "sys.UnraisableHookArgs") -> None:
@@ -199,7 +195,7 @@ def _say_nothing(*_what: Any) -> None:
 
 
 def say_now_and_then() -> "Tell":
-    """Return what says on stderr how many kernels are compiled, every few seconds."""
+    """Return a function that says on stderr, every few seconds, how many kernels are compiled."""
     said, said_at = 0, time.monotonic()
 
     def tell(done: int, total: int) -> None:
@@ -220,9 +216,9 @@ def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
     """Print a two-column table on stdout; warnings have a color where the terminal has.
 
     Args:
-        title: what stands above it.
+        title: line above the table.
         rows: labels and lines; those without lines are left out.
-        elsewhere: where more lines stand than are shown; if empty, all are shown.
+        elsewhere: file or flag that has the lines beyond the first few; if empty, all are shown.
     """
     from rich.console import Console
     from rich.table import Table

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.scene.evaluation import Evaluation, PositionEvaluation, PositionFacts, Recall
     from sfm_shapefit.scene.pose_errors import ErrorSummary
 
-_ROUNDING = 1e-9
-"""Errors in degrees, and in the extent, that are no more than rounding."""
-_WORST_SHOWN = 3
+_ROUNDING = 1e-9  # degrees, and share of the extent; smaller errors are rounding, and shown as 0
+_WORST_SHOWN = 3  # cameras with the largest errors that the terminal names; --csv has all
 _TABLES = {".csv", ".txt"}
 
 

@@ -39,7 +39,7 @@ PriorsFile = Annotated[
         metavar="FILE|FOLDER|database",
         help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; the "
         "folder of the images, for the GPS positions of their EXIF data; or the database's own pose priors. "
-        "Those that have standard deviations pull the cameras by them.",
+        "Priors with standard deviations pull the cameras accordingly.",
     ),
 ]
 
@@ -87,25 +87,24 @@ _METAVARS: dict[Any, str] = {
     int | None: "INTEGER",
     float | None: "NUMBER",
 }
-"""What stands for a flag's value in the help, by the field's name or else by its type."""
+"""Placeholder of a flag's value in the help, by the field's name or else by its type."""
 
 _REPEATED = {"known_distance": (str, str, float)}
-"""Flags of several values that may be repeated, of which typer knows none, and the types of their values."""
+"""Repeatable flags of several values, which typer has no way to declare, and the types of these values."""
 
 _WORDS_OR_NUMBERS = {"rotations"}
-"""Flags that take a word or a number, of which typer knows none either."""
+"""Flags that take a word or a number; typer has no way to declare these either."""
 
-# No argument of a program can hold this.
-_JOINT = "\0"
+_JOINT = "\0"  # between the values of one flag; no argument of a program can hold it
 
 _EARLIER_NAMES: dict[str, str] = {}
-"""Flags that are taken beside their present names, without standing in any help."""
+"""Earlier names of flags, still accepted but in no help, and the present ones."""
 
 
 _GONE = {
     "refine_with_priors": "priors that have standard deviations pull the cameras by themselves now",
 }
-"""What to say of options that are no more, by their names."""
+"""Advice for options that no longer exist, by their names."""
 
 
 _FIRST_SCREEN = {
@@ -139,9 +138,7 @@ class OutputFlags(Settings):
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")
-    verbose: bool = option(
-        False, "Show all there is to say, with the seconds of each stage, and pycolmap's messages."
-    )
+    verbose: bool = option(False, "Show every detail, the seconds of each stage, and pycolmap's messages.")
 
 
 class GroupedCommand(TyperCommand):

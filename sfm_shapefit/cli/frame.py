@@ -31,13 +31,12 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
 
 
-_NOTICED_S = 1.0
-"""Seconds of compiling that are worth a word."""
+_NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
 
 @dataclass(slots=True, kw_only=True)
 class Run(Generic[S]):
-    """A command at work: what it was told, and what it has to show in the end."""
+    """A command at work: its options, and the result that it shows in the end."""
 
     options: S
     flags: OutputFlags
@@ -48,7 +47,7 @@ class Run(Generic[S]):
     is_unusable: bool = False
     started: float = field(default_factory=time.perf_counter)
     compiling: "CompileTime | None" = None
-    """What counts the seconds that are spent compiling."""
+    """Seconds spent compiling so far."""
 
     @property
     def writing(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from sfm_shapefit.scene.given import ControlPoints
 class ControlPoint(Record):
     """A ground control point, and where the model has it."""
 
-    name: Annotated[str, "As the file calls it, or else its coordinates."]
+    name: Annotated[str, "Name in the file, or else its coordinates."]
     use: Annotated[
         Literal["control", "check", "unused"],
         "Whether it sets scale and axes, only checks the model, or contradicts the others or has no place.",
@@ -24,7 +24,7 @@ class ControlPoint(Record):
     error: Annotated[float | None, "Length of the residual."]
     error_px: Annotated[float | None, "Mean distance of its marks from the point in the model, in pixels."]
     num_marks: Annotated[int, "Images of the model in which it is marked."]
-    num_agreeing_marks: Annotated[int, "Of these, placed ones whose marks agree."]
+    num_agreeing_marks: Annotated[int, "Placed images among these whose marks agree."]
 
     @property
     def cells(self) -> list[str]:
@@ -42,7 +42,7 @@ class ControlPoint(Record):
 def control_rows(
     known: ControlPoints, found: TriangulatedControl, fit: ControlFit | str
 ) -> list[ControlPoint]:
-    """Return what stands of each point in locate.json."""
+    """Return the row of each point in locate.json."""
     fitted = fit if isinstance(fit, ControlFit) else None
     rows = []
     for k, name in enumerate(known.names):

@@ -1,4 +1,4 @@
-"""What `inspect` tells: a view graph diagnosed without solving, and what placing it would take."""
+"""Result of `inspect`: the diagnosis of a view graph before any solve, and the memory of a run."""
 
 from typing import Annotated
 
@@ -7,8 +7,7 @@ from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.placement.diagnosis import Diagnosis
 
-_SIZES = 8
-"""Components whose sizes are told."""
+_SIZES = 8  # components whose sizes the terminal lists; --json has all
 
 
 class Forecast(Record):
@@ -27,12 +26,12 @@ class Forecast(Record):
 class Inspection(Record, Displayed, repr=False):
     """What `sfm-shapefit inspect --json` prints."""
 
-    directions: Annotated[str, "Where they come from, and why."]
+    directions: Annotated[str, "Origin of the directions, and why this one was chosen."]
     num_images: Annotated[int, "Images or nodes of the input, with a rotation or without."]
     statuses: Annotated[dict[str, int], "Pairs by the sentence that says what became of them."]
     points: Annotated[str, "Whether 3D points join the graph, and why."]
     diagnosis: Annotated[Diagnosis, "What the view graph says before anything is solved."]
-    expected: Annotated[Forecast | None, "What locate will take; null for a bare graph."] = None
+    expected: Annotated[Forecast | None, "Memory that locate will take; null for a bare graph."] = None
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."] = (
         "none: every image is a frame of its own"
     )

@@ -1,4 +1,4 @@
-"""What became of intrinsics that were in doubt: which, why, how they changed, and how sure that is."""
+"""Intrinsics that were in doubt: which and why, how they changed, and how sure that is."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -13,8 +13,8 @@ from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Origin
 
-_NAMED = 3
-_UNCHANGED = 1e-12
+_NAMED = 3  # cameras; more in doubt are told together, as a list of them is not read
+_UNCHANGED = 1e-12  # relative change of a parameter; less is rounding
 
 _FOUND = ("adjusted", "view graph")
 
@@ -27,12 +27,12 @@ class CameraIntrinsics(Record):
     camera: Annotated[int, "Its id in the model."]
     num_images: Annotated[int, "Placed images that it took."]
     model: Annotated[str, "COLMAP's name of its model."]
-    origin: Annotated[str, "Where what was given comes from: a guess, EXIF data, or given."]
+    origin: Annotated[str, "Origin of the given parameters: a guess, EXIF data, or a calibration."]
     decided_by: Annotated[
         How,
-        "What decided about its focal length: the adjustments; the fundamental matrices alone; the matches "
-        "do not tell it, so that it stays as given, and only the distortion may change; it was not to be "
-        "changed.",
+        "What decided about its focal length: the adjustments; the fundamental matrices alone; nothing, as "
+        "the matches leave it undetermined, so that it stays as given and only the distortion may change; "
+        "or the user, who wants it held.",
     ]
     given_focal_px: Annotated[float, "Mean focal length as given."]
     focal_px: Annotated[float, "Mean focal length of the output."]
@@ -45,7 +45,7 @@ class CameraIntrinsics(Record):
         """What the camera was given, what it has, and why."""
         head = f"camera {self.camera}: focal length {self.given_focal_px:,.1f} px ({self.origin})"
         if self.decided_by == "undetermined":
-            return f"{head} kept, the matches do not tell it{self._distortion()}"
+            return f"{head} kept, as the matches do not determine it{self._distortion()}"
         if self.decided_by == "held":
             return f"{head} kept"
         by = "by the view graph" if self.decided_by == "view graph" else "by adjustment"
@@ -54,7 +54,7 @@ class CameraIntrinsics(Record):
 
     @property
     def change(self) -> float:
-        """By which share the focal length became larger."""
+        """Growth of the focal length as a share of the given one."""
         return self.focal_px / self.given_focal_px - 1.0
 
     def _distortion(self) -> str:
@@ -153,7 +153,7 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     if changes:
         low, middle, high = np.quantile(changes, [0.0, 0.5, 1.0])
         parts = [f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%})"]
-    parts += [f"{unknown} kept what was given, as the matches do not tell it"] if unknown else []
+    parts += [f"{unknown} kept the given one, as the matches do not determine it"] if unknown else []
     parts += [f"{held} were not to be changed"] if held else []
     return ["; ".join(parts) + "; each stands in locate.json"]
 
@@ -164,7 +164,7 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     for how, what in (
         (
             "undetermined",
-            "which the matches do not tell: the scene is flat, or the camera hardly turns and shifts",
+            "which the matches do not determine: the scene is flat, or the camera hardly turns and shifts",
         ),
         ("held", "which stays as it is: --intrinsics auto, and an adjustment, would refine it"),
     ):

@@ -38,11 +38,11 @@ class MappedModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JoinedModel:
-    """Models in one world, and what can be said of them together."""
+    """Models in one world, and the evidence for them together."""
 
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
-    """Their numbers; the world is that of the first, scaled if known distances between them tell."""
+    """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
     cameras: Sequence[CameraRow]
     """One row per image of these models."""
     pairs: Sequence[PairRow]
@@ -63,7 +63,7 @@ class MapResult(Displayed):
     database: Path
     options: MapOptions
     models: tuple[MappedModel, ...]
-    """Those with most placed cameras first."""
+    """Models of the database, most placed cameras first."""
     num_images: int
     num_pairs: int
     """Pairs with a relative rotation."""

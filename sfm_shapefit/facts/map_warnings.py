@@ -9,10 +9,8 @@ from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
 from sfm_shapefit.facts.scene import describe_repeated_pairs, describe_rival_pairs
 from sfm_shapefit.placement.options import KnownDistance
 
-# A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
-# 0.89), an image if a smaller share of its own does.
-_ALARMING_SHARE = 0.7
-_DOUBTFUL_SHARE = 0.25
+_ALARMING_SHARE = 0.7  # share of a model's agreeing pairs; below, warn (castle-P30: 0.97, lego100: 0.89)
+_DOUBTFUL_SHARE = 0.25  # share of an image's agreeing pairs; below, its averaged rotation is doubtful
 
 
 def map_warnings(

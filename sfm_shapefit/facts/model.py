@@ -70,17 +70,17 @@ class EvidenceShares(Record):
 
     pairs: Annotated[
         float | None,
-        "Of the pairs of its cameras that say anything of a direction; null where none does.",
+        "Share of the pairs of its cameras that say anything of a direction; null where none does.",
     ]
     observations: Annotated[
         float | None,
-        "Of the keypoints matched in two or more of its other images, the share that sees a 3D point; null "
+        "Share that sees a 3D point, of the keypoints matched in two or more of its other images; null "
         "without a database.",
     ]
     contradicting: Annotated[
         float | None,
-        "Of the same, the share that sees none and most of whose matches miss the epipolar lines of the "
-        "cameras.",
+        "Share that sees none and most of whose matches miss the epipolar lines of the cameras, of the "
+        "same keypoints.",
     ]
 
 
@@ -93,7 +93,7 @@ class PlacementAdjustment(Record):
         float | None, "Standard deviation per axis by which they were weighted; null if they were not."
     ]
     chance_deg: Annotated[
-        float | None, "By how much chance would turn them per axis; null if the matches were not asked."
+        float | None, "Turn per axis that chance explains; null if the matches were not asked."
     ]
 
     @classmethod
@@ -116,8 +116,8 @@ class RotationRefinement(Record):
 
     num_updated: Annotated[int, "Cameras that turned."]
     num_kept: Annotated[int, "Cameras that keep the rotation of the input."]
-    median_change_deg: Annotated[float, "By how much those that turned did."]
-    max_change_deg: Annotated[float, "By how much the camera turned that did most."]
+    median_change_deg: Annotated[float, "Median angle by which those turned."]
+    max_change_deg: Annotated[float, "Largest angle by which a camera turned."]
 
     @classmethod
     def of_turns(cls, turned_deg: FloatArray | None) -> Self | None:
@@ -190,7 +190,9 @@ class FactsOfModel(Facts):
 
     inputs: Annotated[ModelInputs, "What was read."]
     num_points: Annotated[int, "3D points."]
-    mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
+    mean_reprojection_error_px: Annotated[
+        float | None, "Mean reprojection error of these points; null if there are none."
+    ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
 
     @property
@@ -218,11 +220,11 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale_sigma: Annotated[
         float | None,
-        "Relative standard deviation of a scale that rigs, priors, known distances or control points tell; "
-        "else null.",
+        "Relative standard deviation of a scale that comes from rigs, priors, known distances or control "
+        "points; else null.",
     ]
     known_distances: Annotated[
-        tuple[DistanceFacts, ...], "What was told of distances, and what the model has."
+        tuple[DistanceFacts, ...], "Distances that the user gave, and those in the model."
     ]
     control_points: Annotated[tuple[ControlPoint, ...], "Ground control points, with their residuals."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
@@ -239,11 +241,11 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     num_doubtful_pairs: Annotated[
         int, "Pairs of doubtful_pairs.csv: used, but with far smaller scores than others."
     ]
-    loops: Annotated[tuple[Loop, ...], "Of the videos among the images of `map`."]
+    loops: Annotated[tuple[Loop, ...], "Loops of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if nothing was adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
-    join: Annotated[JoinFacts | None, "Of a model of `map` beside the largest; else null."]
+    join: Annotated[JoinFacts | None, "Join of a model of `map` beside the largest; else null."]
 
     @property
     def next_step(self) -> NextStep:
@@ -364,7 +366,7 @@ class JoinedFacts(CheckedFacts):
     joins: Annotated[list[JoinFacts], "How they were joined."]
     scale_sigma: Annotated[float | None, "Relative standard deviation of the scale; null if not known."]
     known_distances: Annotated[
-        tuple[DistanceFacts, ...], "What was told of distances, and what the model has."
+        tuple[DistanceFacts, ...], "Distances that the user gave, and those in the model."
     ]
     datum: Annotated[EarthDatum | None, "Where the origin is on Earth; null if that is not known."]
 

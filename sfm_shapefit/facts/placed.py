@@ -36,28 +36,25 @@ UNITS = {
     "fixed": "of the fixed cameras' units",
     "control points": "of the control points' units",
 }
-"""What a standard deviation is given in, by the choice of the scale."""
+"""Unit of a standard deviation, by the choice of the scale."""
 SOLVER_UNITS = "of the solver's units"
 NOISE_ONLY = "matching noise only"
-"""How a statement begins that standard deviations leave out errors of rotations and calibration."""
+"""Beginning of a statement that standard deviations leave out errors of rotations and calibration."""
 IN_MEMORY = "in memory"
-"""What stands in locate.json in the place of a model's path where there is none."""
-SCHEMA_VERSION: Literal[1] = 1
+"""Stand-in for the path of a model without one, in locate.json."""
+SCHEMA_VERSION: Literal[1] = 1  # number in each JSON output; within it keys are added, never renamed
 
-_MOST_DEG = 89.0
-"""Largest angle in degrees that is told in pixels."""
-_CAP_OF_SIZE = 0.5
-"""Distance, as a share of the spread of all, above which a camera has no say in a fitted similarity."""
-_SAME = 1e-9
-"""Distance, as a share of the spread, below which two positions differ by rounding only."""
+_MOST_DEG = 89.0  # degrees, largest angle given in pixels; its tangent is finite
+_CAP_OF_SIZE = 0.5  # share of the spread of all; a camera farther off has no say in a fitted similarity
+_SAME = 1e-9  # share of the spread; positions that are closer differ by rounding only
 _OTHERS = {True: ", and no other is as good", False: ", but others may be as good", None: ""}
-_QUANTILES = (25, 50, 75, 90)
-_ANGLES_DEG = (1, 2, 5, 10, 30, 90)
+_QUANTILES = (25, 50, 75, 90)  # percent of the pairs; their residuals stand in locate.json
+_ANGLES_DEG = (1, 2, 5, 10, 30, 90)  # degrees; the share of pairs beyond each stands in locate.json
 _NOT_SOLVED = "free: its directions determine no placement"
 
 Options = Annotated[dict[str, Any], "The settings of the run, a key per option of the command."]
 Timings = Annotated[dict[str, float], "Wall-clock seconds per stage."]
-Versions = Annotated[dict[str, str], "Of the packages that the answer depends on."]
+Versions = Annotated[dict[str, str], "Versions of the packages that the answer depends on."]
 Warnings = Annotated[list[str], "What the user should know, a sentence each."]
 Version = Annotated[Literal[1], "Keys are added, never renamed, within a version."]
 
@@ -76,7 +73,7 @@ class KeyFigures(Record):
         "Median over the placed cameras of the largest standard deviation along the axes; null if not known.",
     ]
     sigma_of_extent: Annotated[float | None, "The same as a share of the extent of the placed cameras."]
-    sigma_unit: Annotated[str, "What sigma is given in, to follow the number."]
+    sigma_unit: Annotated[str, "Unit of sigma, to follow the number."]
 
     @classmethod
     def of_cameras(
@@ -192,7 +189,7 @@ class Delivered(Record):
     statement: Annotated[str, "Both in words."]
     from_certified_median: Annotated[
         float | None,
-        "Of the distances from the certified optimum after the similarity that fits best, as a share of the "
+        "Median distance from the certified optimum after the similarity that fits best, as a share of the "
         "scene's radius; null where there is no distance.",
     ]
     from_certified_max: Annotated[float | None, "The largest of these distances."]
@@ -239,7 +236,7 @@ class Solve(Record):
         float | None, "Violation of the dual's equality, relative to the largest weighted degree."
     ]
     unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
-    iterations: Annotated[int, "Of the solver that ran."]
+    iterations: Annotated[int, "Iterations of the solver that ran."]
     seconds: Annotated[float, "Wall-clock time of the solve."]
     method: Annotated[str, "The solver that ran."]
     method_reason: Annotated[str, "Why it was chosen."]
@@ -251,7 +248,7 @@ class Lud(Record):
     objective: Annotated[float, "Value of the LUD program at its start."]
     dual_bound: Annotated[float | None, "No placement has a lower objective."]
     equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
-    iterations: Annotated[int, "Of the solver."]
+    iterations: Annotated[int, "Iterations of its solver."]
 
 
 class Finish(Record):
@@ -307,13 +304,13 @@ class Facts(Record):
     verdict: Annotated[ModelVerdict, "One verdict for the whole model."]
     options: Options
     num_images: Annotated[int, "Images of the input, posed or not; nodes of a bare graph."]
-    num_placed: Annotated[int, "Of these, how many are in the output."]
+    num_placed: Annotated[int, "Images that are in the output."]
     figures: Annotated[KeyFigures, "The figures that matter."]
     num_pairs: Annotated[int, "Pairs that were looked at."]
     sigma_of: Annotated[
         str,
-        "What the standard deviations of cameras.csv know of: matching noise only, or, after an adjustment, "
-        "noise, rotations and calibration; and what they are relative to.",
+        "Errors that the standard deviations of cameras.csv include: matching noise only, or, after an "
+        "adjustment, noise, rotations and calibration; and what they are relative to.",
     ]
     residual_level_deg: Annotated[
         float | None, "Level of the agreeing pairs' residuals; null where no pair says any."
@@ -448,7 +445,7 @@ class GraphFacts(PlacedFacts):
     """locate.json of a bare graph, and what `sfm-shapefit place --json` prints."""
 
     inputs: Annotated[GraphInputs, "What was read."]
-    dimension: Annotated[int, "Of the locations."]
+    dimension: Annotated[int, "Number of coordinates of a location."]
 
     @property
     def next_step(self) -> NextStep:

@@ -1,4 +1,4 @@
-"""What `locate` and `solve` return: the answer with the evidence for it."""
+"""Results of `locate` and `place`: the answer with the evidence for it."""
 
 import math
 from dataclasses import dataclass, replace
@@ -133,27 +133,27 @@ class LocateResult(Displayed):
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     distances: tuple[KnownDistance, ...] = ()
-    """Those that were told of its images."""
+    """Distances that the user gave between its images."""
     triplet_scores: FloatArray | None = None
-    """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
+    """(m,) scores of the `directions`, NaN where a pair has none; None where `map` did not average."""
     matched_shares: FloatArray | None = None
     """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
     loops: tuple[Loop, ...] = ()
-    """Of the videos among the images, where `map` looked for some."""
+    """Loops of the videos among the images, where `map` looked for some."""
     prior_angles: PriorAngles | None = None
-    """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
-    that set the axes."""
+    """Angles of the `directions` to the baselines of position priors; None without priors that set the
+    axes."""
     num_seen: IntArray
-    """(n,) points that an image saw which was left out because they are too few, or hardly any of those that
-    its matches could make; -1 for all others."""
+    """(n,) number of points that an image saw, where it was left out because they are too few, or hardly any of
+    those that its matches could make; -1 for all others."""
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
     agreeing_observations: float = math.nan
-    """Of the keypoints of images in the output that are matched in two or more of the others, the share that
-    sees a 3D point; NaN where there is no database."""
+    """Share that sees a 3D point, of the keypoints of images in the output that are matched in two or more of
+    the others; NaN where there is no database."""
     contradicting_observations: float = math.nan
-    """Of the same, the share that sees none and most of whose matches miss the cameras' epipolar lines."""
+    """Share of the same keypoints that sees none, and most of whose matches miss the epipolar lines."""
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
 
@@ -229,7 +229,7 @@ class LocateResult(Displayed):
 
     @property
     def delivered(self) -> Delivered:
-        """What is certified, what is delivered, and how far apart they are."""
+        """The certified and the delivered solution, and how far apart they are."""
         return Delivered.compare(self.placement, self._centers, adjusted=self.adjusted is not None)
 
     @cached_property
@@ -292,7 +292,7 @@ class LocateResult(Displayed):
 
     @property
     def agreeing_pairs(self) -> float:
-        """Of the pairs of cameras in the output that say anything of a direction, the share that agrees.
+        """Share that agrees, of the pairs of cameras in the output whose matches say anything of a direction.
 
         Pairs whose matches contradict the rotations count as disagreeing; NaN where there are none.
         """
@@ -308,7 +308,7 @@ class LocateResult(Displayed):
 
     @property
     def few_points(self) -> dict[int, int]:
-        """By the images that were left out for what they see of points, how many these are."""
+        """Number of points that an image sees, by each image that was left out because of it."""
         return {camera: int(self.num_seen[camera]) for camera in np.flatnonzero(self.num_seen >= 0).tolist()}
 
     @property

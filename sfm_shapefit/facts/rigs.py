@@ -1,4 +1,4 @@
-"""What a refinement of rigs made of them: how far each sensor turned and moved, and how sure that is."""
+"""Rigs after a refinement: how far each sensor turned and moved, and how sure that is."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -15,9 +15,9 @@ class RefinedSensor(Record):
     """A sensor whose pose in its rig was refined."""
 
     camera: Annotated[int, "The id of its camera in the model."]
-    turned_deg: Annotated[float, "By how much its rotation changed."]
+    turned_deg: Annotated[float, "Angle by which its rotation changed."]
     moved: Annotated[float, "How far it moved in its rig, in units of the output."]
-    distance: Annotated[float, "From the reference sensor, in units of the output."]
+    distance: Annotated[float, "Distance from the reference sensor, in units of the output."]
     turn_sigma_deg: Annotated[float, "Standard deviation of its rotation per axis, by the noise alone."]
     place_sigma: Annotated[float, "Standard deviation of its place per axis, by the noise alone."]
 

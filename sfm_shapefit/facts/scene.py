@@ -1,4 +1,4 @@
-"""What is told of a scene: loops of videos, straight drives, doubtful pairs, and distances that were told."""
+"""What is told of a scene: loops of videos, straight drives, doubtful pairs, and known distances."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +24,7 @@ class Loop(Record):
     num_matches: Annotated[int, "Their inlier matches."]
     num_refused: Annotated[int, "Pairs left out, as they do not agree with the chain of pairs near in time."]
     angle_deg: Annotated[float, "Median angle between their relative rotations and the chain's."]
-    tolerance_deg: Annotated[float, "Up to where they agree with it."]
+    tolerance_deg: Annotated[float, "Largest angle that counts as agreeing."]
 
     @property
     def cells(self) -> list[str]:
@@ -37,12 +37,12 @@ class Loop(Record):
 
 
 class DistanceFacts(Record):
-    """A distance that was told."""
+    """A distance that the user gave."""
 
     first: Annotated[str, "Name of an image."]
     second: Annotated[str, "Name of another."]
-    known: Annotated[float, "How far apart they are, as told."]
-    found: Annotated[float | None, "In the output; null if one of them is not in it."]
+    known: Annotated[float, "Distance that the user gave."]
+    found: Annotated[float | None, "Distance in the output; null if one of them is not in it."]
 
 
 def told_distances(
@@ -86,8 +86,8 @@ def describe_line(sigma: float | None) -> str:
     if sigma is None:
         return ""
     return (
-        "the cameras stand on one line, along which points alone tell lengths: positions along it are known "
-        f"to {100.0 * sigma:.2g}% of its length (standard deviation)"
+        "the cameras stand on one line, along which only points determine lengths: positions along it are "
+        f"known to {100.0 * sigma:.2g}% of its length (standard deviation)"
     )
 
 

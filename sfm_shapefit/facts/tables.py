@@ -77,7 +77,7 @@ class PairRow:
     """Weighted share of the triangles of relative rotations that close with it; only where `map` averaged and
     the pair is in a triangle. A low one is a sign of repeated structure."""
     matched_share: float = math.nan
-    """Of the keypoints in the overlap of its images that are matched with third images, the share matched
+    """Share, among the keypoints in the overlap of its images that are matched with third images, matched
     here; the smaller one of its two images. Only from `map`."""
     pair_score: float = math.nan
     """`triplet_score` (0.5 where there is none) times `matched_share`: the lowest of a scene are the
@@ -88,7 +88,7 @@ class PairRow:
 
 _ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}
 _PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
-"""Of the columns of a vector, one per axis, or per two axes."""
+"""Beginning of the columns of a vector, one per axis, or per two axes."""
 
 
 def write_rows(

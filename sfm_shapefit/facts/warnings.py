@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
-from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
@@ -16,17 +16,13 @@ from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.solver.options import Status
 
-# A larger share of pairs that contradict the solution, or the given rotations, is warned of.
-_ALARMING_SHARE = 0.5
-_ALARMING_LEVEL_DEG = 5.0
-# If no more pairs contradict refined locations, it does not matter that one of the convex starts collapsed.
-_FEW_REJECTED = 0.1
+_ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
+_FEW_REJECTED = 0.1  # share of pairs against refined locations; below, a collapsed start does not matter
 _TWOFOLD_SHARE = 0.05
-"""Of pairs on two directions among those on one or two. It was at most 0.005 on eight real scenes and 0.04 in
-drawn courtyards, which are placed well, and 0.31 before drawn facades of one house again and again, where
-half of the cameras were shifted by a house without a contradiction."""
-# Fewer pairs on two directions prove nothing.
-_FEWEST_TWOFOLD = 3
+"""Share of pairs on two directions among those on one or two; above, warn. It was at most 0.005 on eight
+real scenes and 0.04 in drawn courtyards, which are placed well, and 0.31 before drawn facades of one house
+again and again, where half of the cameras were shifted by a house without a contradiction."""
+_FEWEST_TWOFOLD = 3  # pairs on two directions; fewer prove nothing
 
 
 def quality_warnings(placement: Judged) -> Iterator[str]:
@@ -36,7 +32,7 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
     level = placement.assessment.level_deg
-    if level > _ALARMING_LEVEL_DEG:
+    if level > MOST_LEVEL_DEG:
         yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
     refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):

@@ -9,18 +9,15 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.report.drawing import PairClass, Pairs
 
-# Smaller residuals count in the first bin.
-_RANGE_DEG = (1e-3, 180.0)
-_BINS = 42
-# A bar of the track lengths holds those from here to below the next.
+_RANGE_DEG = (1e-3, 180.0)  # degrees from the first bin to the last; smaller residuals count in the first
+_BINS = 42  # bins of the residuals; eight per decade
 _TRACK_LENGTHS = np.array([2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 15, 20, 30, 50, 100])
-# Bars of the reprojection errors, the last for all that are larger than this quantile.
-_ERROR_BARS = 24
-_ERROR_QUANTILE = 0.98
+"""Shortest track length of each bar, in images; long tracks are few, so that their bars are wide."""
+_ERROR_BARS = 24  # bars of the reprojection errors; as many as are told apart at a glance
+_ERROR_QUANTILE = 0.98  # quantile of the reprojection errors; all larger ones share the last bar
 MOST_CELLS = 200
 """Cells per side of the matrix; with more cameras, several share a cell."""
-# Rank of each PairClass; a cell shows the worst of its pairs.
-_UNBINNED_RANK = np.array([1, 4, 2, 3])
+_UNBINNED_RANK = np.array([1, 4, 2, 3])  # rank of each PairClass; a cell shows the worst of its pairs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,7 +56,7 @@ class Bars:
 
 
 def track_length_bars(lengths: IntArray) -> Bars | None:
-    """Return how many points are seen by so many images; None if there are none.
+    """Return the histogram of track lengths; None if there are no points.
 
     Args:
         lengths: (s,) number of images that see each point.
@@ -80,7 +77,7 @@ def track_length_bars(lengths: IntArray) -> Bars | None:
 
 
 def reprojection_error_bars(errors_px: FloatArray) -> Bars | None:
-    """Return how many points have errors of so many pixels; None if none is known.
+    """Return the histogram of the points' errors in pixels; None if none is known.
 
     Args:
         errors_px: (s,) mean reprojection error of each point; NaN where it is not known.

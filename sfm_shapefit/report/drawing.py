@@ -1,4 +1,4 @@
-"""What is drawn of a result: cameras, pairs and points as plain arrays. Page and mesh share it.
+"""The drawing of a result: cameras, pairs and points as plain arrays. Page and mesh share it.
 
 Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
 made of a result in memory or of its files. Positions are in the output's units and axes; what has no
@@ -27,19 +27,14 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
-# A point is left out if it is farther from the median than this many times the distance within which 90 % of
-# points and cameras lie.
+# Distance of a point from the median, in distances within which 90 % of points and cameras lie; points beyond
+# would shrink the rest, and are left out.
 _FAR_POINT = 4.0
-# The depth of a frustum is a share of the median distance between neighbors, within limits that are shares
-# of the extent.
-_FRUSTUM_SHARE = 0.4
-_FRUSTUM_OF_EXTENT = (0.008, 0.05)
-# Half a picture's side over its focal length is limited to these, since a fisheye has no pyramid.
-_HALF_SIZES = (0.15, 1.2)
-# Fewer common centers fix no similarity.
-_FEWEST_FITTED = 3
-# "The pictures' y axes point down" has this weight beside "their x axes are level".
-_UPRIGHT = 0.1
+_FRUSTUM_SHARE = 0.4  # depth of a frustum over the median distance between neighbors; frusta stay apart
+_FRUSTUM_OF_EXTENT = (0.008, 0.05)  # limits of the depth, as shares of the extent; frusta stay visible
+_HALF_SIZES = (0.15, 1.2)  # limits of half a picture's side over its focal length; a fisheye has no pyramid
+_FEWEST_FITTED = 3  # common centers; fewer fix no similarity
+_UPRIGHT = 0.1  # weight of "y axes point down" beside "x axes are level"; the second is the surer sign
 
 
 class PairClass(enum.IntEnum):
@@ -53,7 +48,7 @@ class PairClass(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Poses:
-    """How images look, by row; NaN where it is not known."""
+    """Poses and pictures of images, by row; NaN where they are not known."""
 
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
@@ -79,7 +74,7 @@ class Cameras:
     centers: FloatArray
     """(n, 3)"""
     covariances: FloatArray
-    """(n, 3, 3) of the centers, in squared units of the output; NaN where they are not known."""
+    """(n, 3, 3) covariances of the centers, in squared units of the output; NaN where they are not known."""
     poses: Poses
     """Rotations in the output's axes, pictures; `poses.centers` are the input's, in its own."""
 
@@ -182,13 +177,13 @@ class Drawing:
     frustum_depth: float
     """In the output's units."""
     dimension: int = 3
-    """Of the graph; others than 3 are bare graphs."""
+    """Number of coordinates of a location; others than 3 are bare graphs."""
     input_is_aligned: bool = False
     """Whether the input's centers are in the output's units, so that both can be drawn together."""
     history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
     further: tuple[CameraColumn, ...] = ()
-    """What is known of the cameras beside."""
+    """Further figures of the cameras."""
 
     def shifts(self) -> FloatArray:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""

@@ -14,7 +14,7 @@ from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
 
 # Folders of these names say nothing of the scene.
 _NAMELESS = {"sparse", "dense", "model", "models", "colmap", "text", "triangulated", "database", "."}
-_NAMED = 3
+_NAMED = 3  # cameras that the banner names; the table has all
 
 
 def scene_name(facts: Facts) -> str:
@@ -104,7 +104,7 @@ def _tile(value: str, label: str, hint: str, mood: str = "") -> dict[str, str]:
 def _placed_tile(drawing: Drawing) -> dict[str, str]:
     placed, total = int(drawing.cameras.placed.sum()), len(drawing.cameras.names)
     mood = "good" if placed == total else "look"
-    hint = "Those that are left out are listed with the reason."
+    hint = "Images that are left out are listed with the reason."
     return _tile(f"{placed:,} of {total:,}", f"{drawing.noun}s placed", hint, mood)
 
 
@@ -128,7 +128,7 @@ def _figure_tiles(facts: Facts) -> Iterator[dict[str, str]]:
 def _doubtful_tile(drawing: Drawing, facts: Facts) -> dict[str, str]:
     cameras = len(facts.verdict.cameras)
     label = f"{drawing.noun}{'' if cameras == 1 else 's'} to check"
-    hint = "Of low trust, uncertain, or left out; they are named under Look at first."
+    hint = "Cameras of low trust, uncertain ones, and those left out; Look at first names them."
     return _tile(f"{cameras:,}", label, hint, "look" if cameras else "good")
 
 

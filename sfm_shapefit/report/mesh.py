@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 Colors = npt.NDArray[np.uint8]
 
-_TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])
+_TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])  # trusts that have a color; others lie between
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
+"""Red, green and blue from 0 to 255 at each of these; the page has the same."""
 _PYRAMID = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]])
-"""Faces around an apex, 0, and four corners."""
+"""Faces of a camera as rows of its vertices: 0 is the apex, 1 to 4 are the corners of the picture."""
 
 
 def mesh_bytes(drawing: Drawing, file_type: str) -> bytes:

@@ -45,27 +45,17 @@ from sfm_shapefit.report.sentences import (
     summary_sentences,
 )
 
-MAX_PAIRS = 20_000
-"""Pairs that the page lists and draws."""
-# Only cameras of less trust are in the chart of trust.
-_HIGH_TRUST = 0.95
-# Fewer points that are seen by two images only are not worth a word.
-_NOTED_SHARE = 0.05
-# So many hinges are named per piece.
-_MAX_HINGES = 20
-# The objectives of the first iterations may be far out of scale.
-_STARTING_ITERATIONS = 2
-# So many loops are listed.
-_MAX_LOOPS = 50
-# So many control points are.
-_MAX_CONTROL_POINTS = 200
+MAX_PAIRS = 20_000  # pairs that the page lists and draws; with more it opens slowly
+_HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which need no look
+_NOTED_SHARE = 0.05  # share of points that only two images see; less is not worth a word
+_MAX_HINGES = 20  # hinges named per piece; locate.json has all
+_STARTING_ITERATIONS = 2  # iterations left out of the chart; their objectives may be far out of scale
+_MAX_LOOPS = 50  # loops listed; locate.json has all
+_MAX_CONTROL_POINTS = 200  # control points listed; locate.json has all
 _AXES = "xyz"
 _TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
-# What stands in the matrix of pairs where there is no pair.
-_NO_PAIR = 255
-
-
-# In the order in which they are one script.
+_NO_PAIR = 255  # byte of the matrix without a pair; no share comes near
+# In the order in which they make one script.
 _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js")
 
 

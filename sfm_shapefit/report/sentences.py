@@ -16,18 +16,13 @@ from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
-MAX_TEXT = 160
-"""Characters of a name or sentence that are shown."""
-# Repeated structure and wrong rotations are off by more than this.
-_FAR_DEG = 1.0
-# Below this trust, reasons are given.
-_LOW_TRUST = 0.75
+MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
+_FAR_DEG = 1.0  # degrees, residual of a pair; repeated structure and wrong rotations are off by more
+_LOW_TRUST = 0.75  # trust; a camera below is named, with the reason
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
-# Of fewer pairs it says nothing that most are of one camera.
-_FEW_PAIRS = 4
-# So many items of a kind are among the first things to look at.
-_SHOWN = 3
-_MOST_WEAK = 6
+_FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
+_SHOWN = 3  # items of a kind among the first things to look at; the tables have all
+_MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,7 +160,7 @@ def _weak(drawing: Drawing) -> Iterator[Hint]:
 def _contradictions(drawing: Drawing) -> Iterator[Hint]:
     """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
 
-    Those that are off by little, if by more than the others, come together in a sentence.
+    Pairs that are off by little, if by more than the others, come together in a sentence.
     """
     pairs = drawing.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)

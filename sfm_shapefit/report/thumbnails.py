@@ -10,14 +10,12 @@ from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.report.drawing import Drawing
 
-MAX_BYTES = 4_000_000
-"""Of all pictures of a page together, as base64."""
-_WIDEST_PX = 320
-_NARROWEST_PX = 64
-_QUALITY = 72
-# A JPEG picture of this quality has about so many bytes per pixel; a few are made to know better.
-_BYTES_PER_PIXEL = 0.25
-_BASE64 = 4.0 / 3.0
+MAX_BYTES = 4_000_000  # bytes of all pictures of a page as base64; with more it opens slowly
+_WIDEST_PX = 320  # pixels, longer side of a picture; the page shows none larger
+_NARROWEST_PX = 64  # pixels, longer side of a picture; nothing is seen in smaller ones
+_QUALITY = 72  # percent, JPEG's own scale; its blocks are hardly seen in small pictures
+_BYTES_PER_PIXEL = 0.25  # bytes of a JPEG of this quality per pixel; an estimate that only chooses the size
+_BASE64 = 4.0 / 3.0  # characters per byte of base64; it holds six bits each
 
 
 def thumbnails_of(drawing: Drawing, folder: Path | str) -> dict[int, str] | None:

@@ -47,14 +47,14 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
         ),
         (
             row(decided_by="undetermined", found=1000.0, sigma=None),
-            "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it",
+            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it",
         ),
         (
             replace(
                 row(decided_by="undetermined", found=1000.0, sigma=None),
                 parameters=[1000.0, 600.0, 450.0, -0.05],
             ),
-            "camera 1: focal length 1,000.0 px (a guess) kept, the matches do not tell it, "
+            "camera 1: focal length 1,000.0 px (a guess) kept, as the matches do not determine it, "
             "distortion -0.0500",
         ),
         (row(decided_by="held", found=1000.0), "camera 1: focal length 1,000.0 px (a guess) kept"),
@@ -72,7 +72,8 @@ def test_many_cameras_are_told_in_one_sentence():
     (line,) = describe_intrinsics(rows)
     assert line == (
         "3 of 5 cameras in doubt have another focal length now, by +10.0% to +30.0% (median +20.0%); 1 kept "
-        "what was given, as the matches do not tell it; 1 were not to be changed; each stands in locate.json"
+        "the given one, as the matches do not determine it; 1 were not to be changed; each stands in "
+        "locate.json"
     )
 
 

@@ -73,7 +73,7 @@ def test_convert_writes_a_model_in_its_own_axes_and_an_output_with_its_trust(tmp
     trust = [np.nan] * model.num_images
     if is_output:
         trusts = read_trust(source / "cameras.csv")
-        trust = [trusts[name] for name in model.images.names]
+        trust = [trusts[name] for name in model.names]
     expected = trust_colors(np.array(trust))
     np.testing.assert_array_equal(colors[: 5 * model.num_images : 5, :3], expected)
 
