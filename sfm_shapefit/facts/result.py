@@ -144,8 +144,8 @@ class LocateResult(Displayed):
     """Angles of the `directions` to the baselines of position priors; None without priors that set the
     axes."""
     num_seen: IntArray
-    """(n,) number of points that an image saw, where it was left out because they are too few, or hardly any of
-    those that its matches could make; -1 for all others."""
+    """(n,) number of points that an image saw, where it was left out because they are too few, or hardly any
+    of those that its matches could make; -1 for all others."""
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
