@@ -47,7 +47,7 @@ MOST_LINES = {
     "pipeline": 5320,
     "placement": 1970,
     "refinement": 1280,
-    "report": 1700,
+    "report": 1660,
     "rotations": 2270,
     "scene": 2010,
     "solver": 4360,

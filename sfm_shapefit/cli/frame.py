@@ -119,12 +119,10 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
     is_model = any((target / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
     if (is_model and not ours) or (target.is_file() and not source.is_file()):
-        model, file = (
-            "holds a model, but OUT is a folder to be made",
-            "is a file, but OUT is a folder to be made",
+        what = "holds a model" if is_model else "is a file"
+        raise InputError(
+            f"{target} {what}, but OUT is a folder to be made; the order is {order}, so give {target} first"
         )
-        what = model if is_model else file
-        raise InputError(f"{target} {what}; the order is {order}, so give {target} first")
 
 
 @contextmanager

@@ -21,18 +21,8 @@ from sfm_shapefit.cli.root import app
 from sfm_shapefit.facts.options import MapOptions
 
 _FLAGS = (
-    *(
-        "control_points",
-        "known_distance",
-        "gravity",
-        "without",
-        "intrinsics",
-        "rigs",
-        "adjust",
-        "scale",
-        "join",
-    ),
-    *("min_trust", "min_points_per_image", "min_model_size", "points", "threads", "max_memory_mb"),
+    *("control_points", "known_distance", "gravity", "without", "intrinsics", "rigs", "adjust", "scale"),
+    *("join", "min_trust", "min_points_per_image", "min_model_size", "points", "threads", "max_memory_mb"),
 )
 """Options that are flags; the others are keys of --config."""
 

@@ -95,14 +95,10 @@ def describe_doubtful_pairs(count: int) -> str:
     """Say what to do with pairs that look like repeated structure; empty where there are none."""
     if not count:
         return ""
-    if count == 1:
-        return (
-            "1 pair in use looks like repeated structure, though no position contradicts it; --without "
-            "doubtful_pairs.csv leaves it out"
-        )
+    look, them = ("looks", "it") if count == 1 else ("look", "them")
     return (
-        f"{count} pairs in use look like repeated structure, though no position contradicts them; --without "
-        "doubtful_pairs.csv leaves them out"
+        f"{counted(count, 'pair')} in use {look} like repeated structure, though no position contradicts "
+        f"{them}; --without doubtful_pairs.csv leaves {them} out"
     )
 
 

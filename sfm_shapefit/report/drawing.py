@@ -131,10 +131,8 @@ class Pairs:
         residuals = np.repeat(self.residuals_deg, 2)
         known = np.isfinite(residuals)
         order = np.lexsort((residuals[known], ends[known]))
-        ordered, first = (
-            residuals[known][order],
-            np.searchsorted(ends[known][order], np.arange(num_cameras + 1)),
-        )
+        ordered = residuals[known][order]
+        first = np.searchsorted(ends[known][order], np.arange(num_cameras + 1))
         counts = np.diff(first)
         medians = np.full(num_cameras, np.nan)
         some = counts > 0

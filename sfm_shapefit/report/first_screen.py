@@ -73,11 +73,8 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
         against = int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS))
         others = "none contradicts them"
         if against:
-            verb = "contradicts" if against == 1 else "contradict"
-            set_aside = (
-                "" if isinstance(facts, CheckedFacts) else f" and {'is' if against == 1 else 'are'} set aside"
-            )
-            others = f"{against:,} {verb} them{set_aside}"
+            verb, are = ("contradicts", "is") if against == 1 else ("contradict", "are")
+            others = f"{against:,} {verb} them" + ("" if is_checked else f" and {are} set aside")
         return (
             f"{placed_sentence(drawing)[:-1]}; {agree:,} pairs agree with them, {others}, and no "
             f"{drawing.noun} stands out."
@@ -135,13 +132,9 @@ def _doubtful_tile(drawing: Drawing, facts: Facts) -> dict[str, str]:
 def _points_tile(drawing: Drawing, facts: Facts) -> Iterator[dict[str, str]]:
     if not drawing.points.num_all or not isinstance(facts, FactsOfModel):
         return
-    label, hint, error = (
-        "3D points",
-        "Triangulated from the placed cameras.",
-        facts.mean_reprojection_error_px,
-    )
-    if error is not None:
-        label += f", {error:.2f} px mean reprojection error"
+    label, hint = "3D points", "Triangulated from the placed cameras."
+    if facts.mean_reprojection_error_px is not None:
+        label += f", {facts.mean_reprojection_error_px:.2f} px mean reprojection error"
     if isinstance(facts, ModelFacts) and facts.agreement.observations is not None:
         hint += f" {facts.agreement.observations:.0%} of the matched keypoints see one."
     yield _tile(f"{drawing.points.num_all:,}", label, hint)
@@ -152,9 +145,8 @@ def _shift_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
     known = shifts[np.isfinite(shifts)]
     if len(known) and drawing.extent > 0.0:
         median = float(np.median(known))
-        label = (
-            f"typical shift from the input's positions ({100.0 * median / drawing.extent:.2g}% of the scene)"
-        )
+        share = f"{100.0 * median / drawing.extent:.2g}% of the scene"
+        label = f"typical shift from the input's positions ({share})"
         yield _tile(f"{median:.2g} units", label, "The input's positions place no camera; they may be wrong.")
 
 
