@@ -21,7 +21,7 @@ from a drone, a park by a rig of fisheyes (twice), a hall with robots. In all of
 
 Where a tenth of the cameras was moved by 0.2 % of the scene's extent, or turned by 0.2 degrees, their errors
 were 2.4 times the usual or more, but for one at facade9 and one at liberty (2.0 and 1.9) and for the park,
-whose wide lenses hardly tell. Of cameras moved by 1 %, 35 % or more of the pairs contradict.
+whose wide lenses show it little. If a camera is moved by 1 %, 35 % or more of its pairs contradict it.
 """
 
 from collections.abc import Iterator
@@ -130,7 +130,7 @@ def check(
 def check_source(
     model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
 ) -> CheckResult:
-    """Judge a model whose matches are open: measure, judge, grade, tell.
+    """Judge a model whose matches are open: measure, judge and grade it.
 
     Args:
         model: not changed.
