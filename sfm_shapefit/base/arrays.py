@@ -19,6 +19,13 @@ def sum_by(labels: IntArray, rows: FloatArray, count: int) -> FloatArray:
     return np.stack([np.bincount(labels, column, minlength=count) for column in rows.T], axis=1)
 
 
+def rows_of_parts(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the offsets and the rows of some parts, part p having the rows offsets[p]:offsets[p + 1]."""
+    counts = np.diff(offsets)[chosen]
+    ends = np.append(0, np.cumsum(counts))
+    return ends, np.repeat(offsets[chosen] - ends[:-1], counts) + np.arange(ends[-1])
+
+
 def frozen(array: AnyArray) -> AnyArray:
     """Return `array` as a read-only view, so that a value object stays a value."""
     view = array.view()

@@ -142,7 +142,7 @@ def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray, *, hold: bool) -
         """Return the weight shares of some rows if the asking camera of each has such a factor."""
         pairs = of_images[rows[chosen]]
         tried = np.where(pairs == asking[chosen][:, None], factor, factors[pairs])
-        return _weight_shares(asked._replace(rays=_subset(asked.rays, rows[chosen])), tried, hold=hold)
+        return _weight_shares(asked._replace(rays=asked.rays.rays_of(rows[chosen])), tried, hold=hold)
 
     everyone = np.arange(len(rows))
     held = fit(everyone, 1.0)
@@ -263,17 +263,3 @@ def _spread(rays: FloatArray, factors: FloatArray, is_angular: BoolArray) -> Flo
     lengths = np.sin(np.minimum(narrowed, np.pi))
     heights = np.cos(np.minimum(narrowed, np.pi))
     return np.concatenate([lengths[:, None] * sideways, heights[:, None]], axis=1)
-
-
-def _subset(rays: RayMatches, rows: IntArray) -> RayMatches:
-    """Return some of the pairs."""
-    counts = np.diff(rays.offsets)[rows]
-    offsets = np.append(0, np.cumsum(counts))
-    chosen = np.repeat(rays.offsets[:-1][rows] - offsets[:-1], counts) + np.arange(offsets[-1])
-    return RayMatches(
-        pairs=rays.pairs[rows],
-        offsets=offsets,
-        rays_i=rays.rays_i[chosen],
-        rays_j=rays.rays_j[chosen],
-        pixel_angles=rays.pixel_angles[rows],
-    )

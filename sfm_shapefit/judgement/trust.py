@@ -79,8 +79,6 @@ class CameraTrust:
     """(k,) in [0, 1]."""
     agreement: FloatArray
     """(k,) the first factor."""
-    consensus: BoolArray
-    """(k,) the consensus of cameras, whose pairs count."""
     hold: FloatArray
     """(k,) the second factor."""
     reasons: tuple[str, ...]
@@ -119,7 +117,6 @@ def judge_cameras(
     agreement = _shares(checked.of_groups(labels), consensus, int(labels[:num_cameras].max()) + 1)[
         labels[:num_cameras]
     ]
-    consensus = consensus[labels]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
     # Where most cameras have no agreement at all, any agreement is more than usual.
@@ -135,7 +132,6 @@ def judge_cameras(
     return CameraTrust(
         trust=trust,
         agreement=agreement,
-        consensus=consensus[:num_cameras],
         hold=hold,
         reasons=tuple(reasons),
         loose_reasons=tuple(loose),

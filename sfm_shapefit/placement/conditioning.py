@@ -61,9 +61,6 @@ class Conditioning:
 
     num_pairs: IntArray
     """(k,) agreeing pairs of each camera."""
-    narrowness: FloatArray
-    """(k,) least over largest eigenvalue of the sum of I - u u^T over its agreeing pairs, in [0, 1]: how far
-    their directions are from parallel; 0 without pairs."""
     causes: tuple[Looseness | None, ...]
     """k causes; None where a camera is not loose."""
     groups: tuple[LooseCameras, ...]
@@ -113,7 +110,6 @@ def condition(
         groups.append(LooseCameras(cameras=members, cause=cause, sigma=float(largest[members].max())))
     return Conditioning(
         num_pairs=num_pairs[:num_cameras].astype(np.int64),
-        narrowness=narrowness[:num_cameras],
         causes=tuple(causes),
         groups=tuple(sorted(groups, key=lambda group: (-group.sigma, int(group.cameras[0])))),
     )

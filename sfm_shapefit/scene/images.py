@@ -197,8 +197,7 @@ class Images:
         turned = [sensors.rotations.copy(), sensors.translations.copy()]
         moved[0][rows], moved[1][rows] = part.frames.rotations, part.frames.centers
         turned[0][own], turned[1][own] = part.sensors.rotations, part.sensors.translations
-        every = np.ones(len(own), dtype=np.bool_)
-        return self.posed(*moved).with_sensors(*turned).with_lenses_of(part, every)
+        return self.posed(*moved).with_sensors(*turned).with_lenses_of(part, np.ones(len(own), np.bool_))
 
     def turned(self, part: "Images") -> "Images":
         """Return the images with rotations, lenses and sensors of a part of them; frames stay in place."""

@@ -18,7 +18,14 @@ from weakref import WeakSet
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, UInt32Array, hand_back_memory
+from sfm_shapefit.base.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    UInt32Array,
+    hand_back_memory,
+    rows_of_parts,
+)
 from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.scene.images import Images
@@ -52,9 +59,7 @@ class RayMatches:
 
     def rays_of(self, chosen: IntArray) -> "RayMatches":
         """Return the rays of some of the pairs, in that order."""
-        counts = np.diff(self.offsets)[chosen]
-        offsets = np.append(0, np.cumsum(counts))
-        rows = np.repeat(self.offsets[chosen] - offsets[:-1], counts) + np.arange(offsets[-1])
+        offsets, rows = rows_of_parts(self.offsets, chosen)
         return RayMatches(
             pairs=self.pairs[chosen],
             offsets=offsets,

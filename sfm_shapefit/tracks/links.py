@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
@@ -39,12 +39,8 @@ class JoinedRows(NamedTuple):
 
     def subset(self, chosen: IntArray) -> "JoinedRows":
         """Return the given tracks, in that order."""
-        lengths = np.diff(self.offsets)[chosen]
-        offsets = np.append(0, np.cumsum(lengths))
-        return JoinedRows(
-            offsets,
-            self.rows[np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])],
-        )
+        offsets, rows = rows_of_parts(self.offsets, chosen)
+        return JoinedRows(offsets, self.rows[rows])
 
     def of_points(self, points_seen: IntArray) -> "JoinedRows":
         """Return the tracks of points, one each: what rows (m,) see, -1 for those to be left out."""

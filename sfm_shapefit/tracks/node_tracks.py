@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -56,9 +56,7 @@ class Tracks:
 
     def subset(self, chosen: IntArray) -> "Tracks":
         """Return the given tracks, in that order."""
-        lengths = self.lengths()[chosen]
-        offsets = np.concatenate([[0], np.cumsum(lengths)])
-        rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
+        offsets, rows = rows_of_parts(self.offsets, chosen)
         return Tracks(offsets=offsets, cameras=self.cameras[rows], rays=self.rays[rows])
 
 
