@@ -38,7 +38,7 @@ MOST_LINES = {
     "adjustment": 4410,
     "base": 1930,
     "cli": 1650,
-    "facts": 3030,
+    "facts": 3050,
     "files": 4470,
     "graph": 1260,
     "judgement": 2450,

@@ -95,10 +95,14 @@ def describe_doubtful_pairs(count: int) -> str:
     """Say what to do with pairs that look like repeated structure; empty where there are none."""
     if not count:
         return ""
-    look, them = ("looks", "it") if count == 1 else ("look", "them")
+    if count == 1:
+        return (
+            "1 pair in use looks like repeated structure, though no position contradicts it; --without "
+            "doubtful_pairs.csv leaves it out"
+        )
     return (
-        f"{counted(count, 'pair')} in use {look} like repeated structure, though no position contradicts "
-        f"{them}; --without doubtful_pairs.csv leaves {them} out"
+        f"{count} pairs in use look like repeated structure, though no position contradicts them; --without "
+        "doubtful_pairs.csv leaves them out"
     )
 
 

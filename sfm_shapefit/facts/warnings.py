@@ -56,12 +56,14 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        one = len(uncertain) == 1
-        who, most = (f"{worst} is", "") if one else (f"{len(uncertain)} cameras are", f", above all {worst}")
-        yield (
-            f"{who} uncertain by more than {UNCERTAIN_SHARE:.0%} of the extent{most}; see sigma and trust in "
-            "cameras.csv"
-        )
+        share, see = f"{UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
+        if len(uncertain) == 1:
+            yield f"{worst} is uncertain by more than {share} of the extent; {see}"
+        else:
+            yield (
+                f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
+                f"{worst}; {see}"
+            )
 
 
 def match_warnings(directions: PairDirections) -> Iterator[str]:
@@ -87,21 +89,28 @@ def trust_warnings(placement: Judged, kept: BoolArray) -> Iterator[str]:
     lost = np.flatnonzero(~kept)
     if len(lost):
         worst = _least_trusted(placement, lost)
-        why, them = ("is left out because it is not trusted:", "it")
-        if len(lost) > 1:
-            why, them = ("are left out because they are not trusted, above all", "them")
-        yield f"{counted(len(lost), 'camera')} {why} {worst}; --min-trust 0 keeps {them}"
+        if len(lost) == 1:
+            yield f"1 camera is left out because it is not trusted: {worst}; --min-trust 0 keeps it"
+        else:
+            yield (
+                f"{len(lost)} cameras are left out because they are not trusted, above all {worst}; "
+                "--min-trust 0 keeps them"
+            )
 
 
 def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
     """Yield which cameras are left out, or kept as was asked, though their matches make no points, if any."""
     if names:
-        are, rest = ("is", "its pose is") if len(names) == 1 else ("are", "their poses are")
+        subject, rest = (
+            ("1 camera is", "its pose is")
+            if len(names) == 1
+            else (f"{len(names)} cameras are", "their poses are")
+        )
         what = "kept, as --min-trust 0 asks, though" if is_kept else "left out because"
         remedy = "" if is_kept else "; --min-trust 0 keeps what is left out"
         yield (
-            f"{counted(len(names), 'camera')} {are} {what} hardly any match makes a point with a third "
-            f"image: {first_of(names)}; {rest} wrong, or the scene repeats itself{remedy}"
+            f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
+            f"{rest} wrong, or the scene repeats itself{remedy}"
         )
 
 
