@@ -172,7 +172,7 @@ def test_two_groups_joined_at_one_camera_are_two_pieces(hinged):
 
 
 def test_figures_in_pixels_are_at_the_median_focal_length_of_the_images(hinged):
-    """Pairs are of images, and a camera counts as often as it took one; `report MODEL` says so, too."""
+    """Pairs are of images, and a camera counts as often as it took one; `check MODEL` says so, too."""
     focal_lengths_px = np.array([900.0, 100.0, 100.0, 100.0, 100.0, 100.0, 800.0, 700.0])
     images = hinged.images
     lenses = [Lens("SIMPLE_PINHOLE", (f, 0.0, 0.0), id=k) for k, f in enumerate(focal_lengths_px.tolist())]
