@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.adjustment import structure as triangulation
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline import execution, relative_rotations
 from sfm_shapefit.pipeline.execution import open_executor
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement
@@ -28,7 +27,6 @@ from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.abuse import determinism
@@ -503,67 +501,6 @@ UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RE
 def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
     with pytest.raises(InputError, match=message):
         sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
-
-
-def problem(num_false=0, seed=5, n=14):
-    """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
-    rng = np.random.default_rng(seed)
-    truth = Rotation.random(n, random_state=rng).as_matrix()
-    pairs = np.column_stack(np.triu_indices(n, 1))
-    noise = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=(len(pairs), 3))).as_matrix()
-    rotations = noise @ truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
-    counts = np.full(len(pairs), 100)
-    false = rng.permutation(np.flatnonzero((pairs < n // 2).sum(axis=1) == 1))[:num_false]
-    turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]).as_matrix()
-    i, j = pairs[false].T
-    rotations[false], counts[false] = truth[j] @ turn @ truth[i].transpose(0, 2, 1), 16
-    information = np.tile(np.eye(3), (len(pairs), 1, 1))
-    shares = np.ones(len(pairs))
-    return truth, RelativeRotations(
-        pairs=pairs,
-        rotations=rotations,
-        information=information,
-        num_matches=counts,
-        weight_shares=shares,
-    )
-
-
-def worst_error_deg(answer, truth):
-    difference = answer.rotations.transpose(0, 2, 1) @ truth
-    return rotation_angles_deg(difference @ mean_rotation_l1(difference).T).max()
-
-
-def test_the_most_consistent_of_several_averagings_is_kept():
-    truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    weights = np.sqrt(relative.num_matches)
-    right = relative.num_matches == 100
-    answer = average_relative_rotations(14, relative)
-    assert answer.certified
-    assert answer.registered.all()
-    assert answer.num_tried > 1
-    assert answer.num_pairs == right.sum()
-    assert worst_error_deg(answer, truth) < 0.5
-    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
-
-
-def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
-    truth, relative = problem()
-    assert not average_relative_rotations(14, relative).unsettled.any()
-    bad = (relative.pairs == 3).any(axis=1)
-    unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
-    answers = []
-    for wrong, shares in ((bad, np.ones(len(bad))), (unsound, np.where(unsound, 0.3, 1.0))):
-        rotations = relative.rotations.copy()
-        rng = np.random.default_rng(1)
-        rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
-        part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
-        answers.append(average_relative_rotations(14, part))
-    assert answers[0].agreements[3] < 0.25
-    assert np.delete(answers[0].agreements, 3).min() > 0.8
-    assert list(np.flatnonzero(answers[0].unsettled)) == [3]
-    assert answers[1].num_pairs == 61
-    assert answers[1].share > 0.99
-    assert worst_error_deg(answers[1], truth) < 0.5
 
 
 def keep_few_matches(wrong):
