@@ -27,6 +27,7 @@ from sfm_shapefit.scene.lens import LensDoubt
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
+from tests.models import centers_of
 from tests.problems import all_pairs
 from tests.scenes import real_scene
 from tests.structures import bundle_adjusted, colored, filtered, matches_between, triangulated
@@ -128,10 +129,6 @@ def dump(reconstruction):
         track = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
         lines.append((i, bytes(np.array(point.xyz)), bytes(np.array(point.color)), point.error, track))
     return [*lines, sorted(reconstruction.reg_image_ids()), sorted(reconstruction.rigs)]
-
-
-def centers_of(reconstruction):
-    return np.array([reconstruction.image(i).projection_center() for i in sorted(reconstruction.images)])
 
 
 def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tmp_path):
