@@ -50,6 +50,23 @@ def turned(
     )
 
 
+def only(model: pycolmap.Reconstruction, image_ids: Iterable[int]) -> pycolmap.Reconstruction:
+    """Return the model of some of the images of one without rigs, with the points that two of them see."""
+    part, chosen = pycolmap.Reconstruction(), sorted(image_ids)
+    for camera_id in sorted({model.image(i).camera_id for i in chosen}):
+        part.add_camera_with_trivial_rig(model.camera(camera_id))
+    for image_id in chosen:
+        image = model.image(image_id)
+        own = {"name": image.name, "camera_id": image.camera_id, "image_id": image_id}
+        xy = np.array([point.xy for point in image.points2D])
+        part.add_image_with_trivial_frame(pycolmap.Image(keypoints=xy, **own), image.cam_from_world())
+    for point in model.points3D.values():
+        seen = [element for element in point.track.elements if element.image_id in chosen]
+        if len(seen) > 1:
+            part.add_point3D(point.xyz, pycolmap.Track(seen), point.color)
+    return part
+
+
 def write_priors(path: Path, positions: Mapping[str, npt.ArrayLike], *further: float) -> Path:
     """Write a table of position priors, by the names of images; the same further columns follow each."""
     rows = ((name, *np.asarray(xyz).tolist(), *further) for name, xyz in positions.items())

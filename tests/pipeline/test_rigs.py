@@ -159,6 +159,14 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     assert located.reconstruction.num_reg_images() == 36
 
 
+def test_bundle_adjustment_keeps_the_rigs_their_scale_and_the_origin_of_the_input(workspace, rigs):
+    located = sfm_shapefit.locate(workspace / "truth", workspace / "database.db", adjust="full")
+    assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
+    centers = centers_of(located.reconstruction)
+    assert abs(fit_similarity(centers, rigs.scene.centers, rotate=False).scale - 1.0) < 1e-3
+    np.testing.assert_allclose(np.median(rigs.scene.centers - centers, axis=0), 0.0, atol=1e-9)
+
+
 def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
     model = workspace / "sparse" / "0"
     with pytest.raises(InputError, match="no solver admm"):

@@ -429,12 +429,14 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
     facts = json.loads(run(*arguments, tmp_path / "out").stdout)
     assert "; the priors moved cameras by " in facts["scale"]
+    run(*arguments, tmp_path / "full", "--adjust", "full")
     off = []
-    for folder in ("plain", "out"):
+    for folder in ("plain", "out", "full"):
         model = pycolmap.Reconstruction(tmp_path / folder)
         centers = {image.name: image.projection_center() for image in model.images.values()}
         off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
-    assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+    for pulled in off[1:]:
+        assert np.sum(np.square(pulled)) < np.sum(np.square(off[0]))  # nearer to the priors than before
 
 
 def test_pairs_that_contradict_the_baselines_of_priors_are_named():
