@@ -5,7 +5,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
@@ -102,21 +102,6 @@ def test_one_pair_of_thousands_of_matches_does_not_outvote_the_others():
     support[own[0]] = 100_000
     evidence = make_evidence(len(edges), support)
     assert assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=evidence), t).trust[3] < 0.5
-
-
-def test_evidence_follows_its_cameras_and_pairs():
-    evidence = Evidence(
-        support=np.array([10, 20, 30]),
-        contradicting=np.array([(0, 4), (2, 4), (1, 3)]),
-        contradicting_support=np.array([7, 8, 9]),
-        errors=np.arange(3.0)[:, None, None] * np.ones((3, 5, 2)),
-    )
-    part = evidence.part(np.array([2, 0]), np.array([0, 2, 4]), 5)
-    assert part.support.tolist() == [30, 10]
-    assert part.contradicting.tolist() == [[0, 2], [1, 2]]
-    assert part.contradicting_support.tolist() == [7, 8]
-    assert part.errors is not None
-    assert part.errors[:, 0, 0].tolist() == [2.0, 0.0]
 
 
 def test_bodies_join_while_more_speaks_for_it_than_against():
