@@ -12,7 +12,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.atomic_folder import atomic_folder
@@ -29,7 +28,6 @@ from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.models import centers_of
 from tests.problems import all_pairs
-from tests.scenes import real_scene
 from tests.structures import bundle_adjusted, colored, filtered, matches_between, triangulated
 
 NUM_IMAGES = 8
@@ -566,20 +564,6 @@ def test_what_pycolmap_says_reaches_the_terminal_only_if_wanted(capfd, quiet):
         raise KeyError
     os.write(2, b"after")  # it is quiet inside the block only
     assert capfd.readouterr().err == "after"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
-def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
-    folder = real_scene(name)
-    found = locate(folder / "sparse" / "0", options=LocateOptions(adjust="full")).reconstruction
-    truth = pycolmap.Reconstruction(folder / "gt")
-    names = [found.image(i).name for i in sorted(found.images)]
-    centers = centers_of(found)
-    true_centers = np.array([truth.find_image_with_name(name).projection_center() for name in names])
-    error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
-    # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
-    assert error_m.mean() <= 1.15 * to_reach_m
 
 
 def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):

@@ -15,7 +15,7 @@ from sfm_shapefit.pairs.essential import estimate_relative_rotations
 from sfm_shapefit.pipeline import doubts as doubts_stage
 from tests.models import posed
 from tests.problems import turn
-from tests.scenes import BUNDLED, COURTYARD, real_scene
+from tests.scenes import BUNDLED, COURTYARD
 
 PHOTOGRAPHED = BUNDLED / "photographed"
 
@@ -135,11 +135,3 @@ def test_measured_rotations_are_not_doubted():
     found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="held")
     assert found.placement.assessment.doubts is None
     assert "rotation" not in "".join(row.reason for row in found.cameras)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["sparse/0", "global"])
-def test_all_images_of_a_rig_of_fisheye_cameras_are_kept(model):
-    scene = real_scene("kerry-park")
-    found = sfm_shapefit.locate(scene / model, scene / "database.db")
-    assert found.reconstruction.num_reg_images() == 48

@@ -18,9 +18,8 @@ from sfm_shapefit.facts.scene import describe_line, describe_loops
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
-from sfm_shapefit.pipeline import execution, relative_rotations
+from sfm_shapefit.pipeline import relative_rotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.execution import open_executor
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
@@ -32,7 +31,6 @@ from tests.abuse import determinism
 from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.models import by_name, write_priors
-from tests.pipeline.test_execution import die_once
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
@@ -288,20 +286,6 @@ def test_an_executor_shares_out_pairs_and_tracks_and_changes_no_bit(monkeypatch,
     assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions", "triangulate_block"}
     assert pool.tasks["estimate_relative_rotations"] > 3 < pool.tasks["triangulate_block"]
     assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
-    assert_same_bits(shared, serial, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_path):
-    pytest.importorskip("distributed")
-    flag = tmp_path / "killed"
-    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
-    monkeypatch.setattr(execution, "measure_part", partial(die_once, str(flag)))
-    with open_executor("dask", 2) as pool:
-        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
-    monkeypatch.undo()
-    assert flag.exists()
-    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
     assert_same_bits(shared, serial, tmp_path)
 
 

@@ -13,7 +13,6 @@ from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs import essential as door
 from sfm_shapefit.pipeline import relative_rotations as module
-from sfm_shapefit.pipeline.execution import open_executor
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, read_from
 
 DATABASE = COURTYARD / "database.db"
@@ -70,16 +69,6 @@ def test_an_executor_changes_no_bit(found, monkeypatch):
     assert_same_bits(many, found.subset(found.num_matches >= 60))
     assert {stage for stage, _, _ in seen} == {"relative rotations"}
     assert len(seen) > 5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["processes", "dask"])
-def test_other_processes_change_no_bit(found, kind, monkeypatch):
-    if kind == "dask":
-        pytest.importorskip("distributed")
-    monkeypatch.setattr(module, "_MATCHES_PER_TASK", 10_000)
-    with open_executor(kind, 2) as pool:
-        assert_same_bits(sfm_shapefit.relative_rotations(DATABASE, executor=pool), found)
 
 
 def test_progress_ends_with_all_pairs_though_some_are_left_out(found):
