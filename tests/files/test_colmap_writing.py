@@ -236,28 +236,18 @@ class Copying(ThreadPoolExecutor):
         return super().submit(work, pickle.loads(pickle.dumps(task)))
 
 
-def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
+@SOURCES
+def test_tracks_shared_out_to_workers_give_the_same_bits(source, monkeypatch):
     monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
     original, points = ring_model(noise_px=3.0)
-    seed, seen = seeded(original, ring_centers() + 0.01)[0], []
+    (seed, tracks), seen = seeded_with(source, original, ring_centers() + 0.01), []
     with Copying(2) as executor:
-        shared = triangulated(seed, original, None, lambda *done: seen.append(done), executor)
-    assert dump(shared) == dump(triangulated(seed, original))
-    assert seen[0] == (7, len(points))
-    assert seen[-1] == (len(points), len(points))
-
-
-def test_tracks_of_matches_shared_out_to_workers_give_the_same_bits(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
-    original, points = ring_model(noise_px=3.0)
-    (seed, matches), seen = seeded(original, ring_centers() + 0.01), []
-    with Copying(2) as executor:
-        shared = triangulated(seed, matches, None, lambda *done: seen.append(done), executor)
+        shared = triangulated(seed, tracks, None, lambda *done: seen.append(done), executor)
     assert shared.num_points3D() > 0.9 * len(points)
     (num_tracks,) = {total for _, total in seen}
     assert [done for done, _ in seen] == [*range(7, num_tracks, 7), num_tracks]
     monkeypatch.undo()
-    assert dump(shared) == dump(triangulated(seed, matches))
+    assert dump(shared) == dump(triangulated(seed, tracks))
 
 
 @SOURCES
