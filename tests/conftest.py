@@ -10,9 +10,11 @@ from sfm_shapefit.synthetic import (
     SceneOptions,
     WorkspaceOptions,
     make_rendered_scene,
+    make_rig_drive,
     make_scene,
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from sfm_shapefit.synthetic.rigs import RigScene
 from sfm_shapefit.synthetic.workspace import write_workspace
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
@@ -40,3 +42,13 @@ def tiny_ring(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("tiny") / "ring"
     write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
     return out
+
+
+@pytest.fixture(scope="session")
+def rig_drive(tmp_path_factory) -> tuple[RigScene, Path]:
+    """Twelve frames of two rigs of three cameras, a fifth of the pairs wrong, and their workspace."""
+    size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
+    rigs = make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
+    return rigs, folder

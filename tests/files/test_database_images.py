@@ -4,8 +4,6 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_images import read_images
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
-from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import RING, copied, edit_database, read_from
 
 UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RENAME TO {0};"
@@ -37,28 +35,19 @@ DAMAGED_RIGS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    """A workspace of two rigs of three cameras."""
-    folder = tmp_path_factory.mktemp("rigs") / "drive"
-    rigs = make_rig_drive(SceneOptions(seed=0, num_images=36, num_points=600, max_pairs_per_image=12))
-    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"))
-    return folder
-
-
 @pytest.mark.parametrize(
     ("has_rigs", "statement", "message"),
     [*((False, *row) for row in DAMAGED), *((True, *row) for row in DAMAGED_RIGS)],
 )
-def test_what_is_damaged_is_named(drive, tmp_path, has_rigs, statement, message):
-    path = copied(drive if has_rigs else RING, tmp_path) / "database.db"
+def test_what_is_damaged_is_named(rig_drive, tmp_path, has_rigs, statement, message):
+    path = copied(rig_drive[1] if has_rigs else RING, tmp_path) / "database.db"
     edit_database(path, "PRAGMA foreign_keys = OFF", *statement.split(";"))
     with pytest.raises(InputError, match=message):
         read_from(path, read_images)
 
 
-def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(drive, tmp_path):
-    path = copied(drive, tmp_path) / "database.db"
+def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(rig_drive, tmp_path):
+    path = copied(rig_drive[1], tmp_path) / "database.db"
     edit_database(path, "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2")
     images = read_from(path, read_images)
     assert images.rigs.incomplete == (1,)

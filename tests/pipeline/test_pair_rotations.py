@@ -71,16 +71,6 @@ def test_an_executor_changes_no_bit(found, monkeypatch):
     assert len(seen) > 5
 
 
-def test_progress_ends_with_all_pairs_though_some_are_left_out(found):
-    seen = []
-    sfm_shapefit.relative_rotations(
-        DATABASE, min_matches=60, progress=lambda _stage, done, total: seen.append((done, total))
-    )
-    (total,) = {total for _, total in seen[1:-1]}
-    assert seen[-2] == (total, total)
-    assert total >= len(found.pairs) > (found.num_matches >= 60).sum()
-
-
 @pytest.mark.parametrize("threads", [1, 2])
 def test_an_interrupt_ends_the_work_after_the_slices_at_hand(monkeypatch, threads):
     monkeypatch.setattr(door, "_PAIRS_PER_SLICE", 8)

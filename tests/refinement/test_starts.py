@@ -168,13 +168,6 @@ def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
 
 
-def test_the_finish_is_the_same_to_the_bit_each_time_and_for_any_number_of_threads(expander):
-    one, again, two = finished(expander), finished(expander), finished(expander, threads=2)
-    assert np.array_equal(one.locations, again.locations)
-    assert np.array_equal(one.locations, two.locations)
-    assert one.costs == two.costs
-
-
 def test_disagreement_is_blind_to_scale_sees_stretched_lengths_and_is_finite_at_one_place():
     t = np.arange(40.0)[:, None] * [1.0, 0.2, 0.1]
     graph = ViewGraph(40, [(i, i + 1) for i in range(39)], normalized(np.tile([-1.0, -0.2, -0.1], (39, 1))))

@@ -425,16 +425,6 @@ def test_bundled_scenes_stay_under_five_megabytes_and_the_ring_has_enough_pairs_
     assert np.bincount(scene.pairs.ravel()).min() >= 3
 
 
-@pytest.mark.slow
-def test_100_cameras_and_4000_points_make_a_workspace(tmp_path):
-    options = synthetic.SceneOptions(
-        num_images=100, num_points=4000, corrupted_pair_fraction=0.25, wrong_match_fraction=0.1
-    )
-    scene = synthetic.make_scene(options)
-    write_workspace(scene, tmp_path / "out")
-    assert np.bincount(scene.pairs.ravel(), minlength=100).min() >= options.max_pairs_per_image
-
-
 FAMILIES = {
     "random": partial(synthetic.random_graph_problem, 120, p=0.5),
     "box": partial(synthetic.box_graph_problem, 500, degree=20.0),
