@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals,
 from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
-from tests.adjustment.made import LENSES, disturb, ring_problem
+from tests.adjustment.made import LENSES, disturb, observed, ring_problem
 
 STEP = 1e-5  # central differences are off by its square times third derivatives, 1e-9 of the first ones here
 ALL_FREE = AdjustmentOptions(loss_scale_px=2.0, free_focal_lengths=True, free_distortion=True)
@@ -160,13 +160,7 @@ def test_a_point_behind_its_camera_adds_nothing_and_counts_as_a_focal_length():
     assert (lost == ((behind.cameras_seeing == 0) & (behind.points_seen == 0))).all()
     squares = np.where(lost, 500.0**2, np.sum(residuals**2, axis=1))
     assert sum_losses(layout, values, 2.0, ONE) == pytest.approx(0.5 * 4.0 * np.log1p(squares / 4.0).sum())
-    kept = replace(
-        behind,
-        cameras_seeing=behind.cameras_seeing[~lost],
-        points_seen=behind.points_seen[~lost],
-        pixels=behind.pixels[~lost],
-    )
-    without = linearize(lay_out(kept, ALL_FREE), values, 2.0, ONE)
+    without = linearize(lay_out(observed(behind, ~lost), ALL_FREE), values, 2.0, ONE)
     found = linearize(layout, values, 2.0, ONE)
     np.testing.assert_array_equal(found.points, without.points)
     np.testing.assert_allclose(found.nodes, without.nodes, rtol=1e-14)
