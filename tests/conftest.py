@@ -5,8 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from sfm_shapefit.synthetic import RenderedScene, SceneOptions, WorkspaceOptions, make_rendered_scene
+from sfm_shapefit.synthetic import (
+    RenderedScene,
+    Scene,
+    SceneOptions,
+    WorkspaceOptions,
+    make_rendered_scene,
+    make_rig_drive,
+    make_scene,
+)
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from sfm_shapefit.synthetic.workspace import write_workspace
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
 
@@ -25,3 +34,21 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
     folder = tmp_path_factory.mktemp("drawn") / "workspace"
     write_rendered_workspace(scene, folder, WorkspaceOptions(relative_poses=True))
     return scene, folder
+
+
+@pytest.fixture(scope="session")
+def tiny_ring(tmp_path_factory) -> Path:
+    """A small ring as a COLMAP workspace, a tenth of its matches wrong."""
+    out = tmp_path_factory.mktemp("tiny") / "ring"
+    write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
+    return out
+
+
+@pytest.fixture(scope="session")
+def rig_drive(tmp_path_factory) -> tuple[Scene, Path]:
+    """Twelve frames of two rigs of three cameras, a fifth of the pairs wrong, and their workspace."""
+    size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
+    rigs = make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    write_workspace(rigs, folder, WorkspaceOptions(model="rotations"))
+    return rigs, folder

@@ -17,6 +17,7 @@ from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.program import differences
+from tests.models import posed, poses_of, turned
 from tests.problems import all_pairs
 from tests.scenes import RING, copied, edit_database
 
@@ -132,19 +133,8 @@ def test_cameras_on_one_line_are_none_of_them_trusted(noise):
     assert any("uncertain" in warning for warning in quality_warnings(placement))
 
 
-def turned_model(scene, image_id, rotation):
-    """The model of a scene with another rotation of one image, about the same center."""
-    model = pycolmap.Reconstruction(scene / "sparse" / "0")
-    image = model.image(image_id)
-    center = image.projection_center()
-    model.frame(image.frame_id).rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
-    return model
-
-
 def test_a_camera_whose_pairs_all_contradict_its_rotation_is_not_placed():
-    given = pycolmap.Reconstruction(RING / "sparse" / "0").image(3).cam_from_world().rotation
-    turn = pycolmap.Rotation3d(np.array([0.0, 1.0, 0.0, 0.0]))  # upside down
-    model = turned_model(RING, 3, turn * given)
+    model = turned(RING / "sparse" / "0", ["0003.jpg"], np.diag([-1.0, 1.0, -1.0]))  # looks backwards
     found = sfm_shapefit.locate(model, RING / "database.db")
     (row,) = [row for row in found.cameras if not row.placed]
     assert row.name == "0003.jpg"
@@ -156,8 +146,11 @@ def test_a_camera_whose_pairs_all_contradict_its_rotation_is_not_placed():
 def test_twin_images_stand_at_one_center_and_their_pair_has_no_parallax(tmp_path):
     scene = copied(RING, tmp_path)
     make_twin(scene / "database.db", of=7, twin=8)
-    rotation = pycolmap.Reconstruction(scene / "sparse" / "0").image(7).cam_from_world().rotation
-    model = turned_model(scene, 8, rotation)
+    rotation = poses_of(pycolmap.Reconstruction(scene / "sparse" / "0"))["0007.jpg"][:, :3]
+    model = posed(
+        scene / "sparse" / "0",
+        lambda name, own, center: (rotation if name == "0008.jpg" else own, center),
+    )
     found = sfm_shapefit.locate(model, scene / "database.db", scale="unit")
     (pair,) = [row for row in found.pairs if (row.name1, row.name2) == ("0007.jpg", "0008.jpg")]
     assert pair.reason.startswith("no parallax")

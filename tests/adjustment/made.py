@@ -89,6 +89,16 @@ def disturb(problem, rng, center=0.05, rotation_rad=0.01, point=0.03):
     )
 
 
+def observed(problem, rows):
+    """Return the problem with some of its observations, by a mask or in an order."""
+    return replace(
+        problem,
+        cameras_seeing=problem.cameras_seeing[rows],
+        points_seen=problem.points_seen[rows],
+        pixels=problem.pixels[rows],
+    )
+
+
 def problem_of(reconstruction):
     """Return the adjustment problem of a model without rigs, and the ids of its images and points."""
     images = sorted(reconstruction.reg_image_ids())

@@ -29,7 +29,7 @@ from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.scene.known_positions import KnownPositions
-from tests.adjustment.made import LENSES, disturb, look_at, ring_problem
+from tests.adjustment.made import LENSES, disturb, look_at, observed, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)
 
@@ -262,12 +262,7 @@ def test_threads_do_not_change_one_bit(solver):
 def test_the_order_of_observations_matters_to_rounding_only():
     _, start = make_start()
     order = np.random.default_rng(0).permutation(start.num_observations)
-    shuffled = replace(
-        start,
-        cameras_seeing=start.cameras_seeing[order],
-        points_seen=start.points_seen[order],
-        pixels=start.pixels[order],
-    )
+    shuffled = observed(start, order)
     np.testing.assert_allclose(adjust(shuffled, TIGHT).problem.centers, adjust(start, TIGHT).problem.centers,
                                atol=1e-9)  # fmt: skip
     np.testing.assert_array_equal(reprojection_errors_px(shuffled), reprojection_errors_px(start)[order])
@@ -312,18 +307,7 @@ def test_points_of_one_view_do_no_harm():
     first = np.zeros(start.num_observations, np.bool_)
     first[np.unique(start.points_seen, return_index=True)[1]] = True
     kept = ~single | first
-    thin = replace(
-        start,
-        cameras_seeing=start.cameras_seeing[kept],
-        points_seen=start.points_seen[kept],
-        pixels=start.pixels[kept],
-    )
-    rest = replace(
-        start,
-        cameras_seeing=start.cameras_seeing[~single],
-        points_seen=start.points_seen[~single],
-        pixels=start.pixels[~single],
-    )
+    thin, rest = observed(start, kept), observed(start, ~single)
     found, expected = adjust(thin, TIGHT).problem, adjust(rest, TIGHT).problem
     np.testing.assert_allclose(found.centers, expected.centers, atol=1e-6)
 

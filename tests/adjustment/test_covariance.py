@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
-from tests.adjustment.made import ring_problem
+from tests.adjustment.made import observed, ring_problem
 from tests.adjustment.test_derivatives import whole_matrix
 
 PLAIN = AdjustmentOptions(loss_scale_px=None, noise_px=0.5)
@@ -102,14 +102,7 @@ def test_drawn_noise_scatters_as_the_covariances_say():
 
 def test_what_nothing_sees_is_not_a_number_and_moves_nothing_else():
     problem = ring_problem(np.random.default_rng(0), 8, 60)
-    blind = problem.cameras_seeing != 7
-    without = replace(
-        problem,
-        cameras_seeing=problem.cameras_seeing[blind],
-        points_seen=problem.points_seen[blind],
-        pixels=problem.pixels[blind],
-    )
-    found = estimate_covariances(without, PLAIN)
+    found = estimate_covariances(observed(problem, problem.cameras_seeing != 7), PLAIN)
     assert np.isnan(found.centers[7]).all()
     assert np.isnan(found.rotations[7]).all()
     assert np.isfinite(found.centers[:7]).all()

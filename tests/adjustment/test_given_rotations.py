@@ -1,49 +1,31 @@
 """How exact given rotations are, as far as the matches tell."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust, estimate_covariances
+from sfm_shapefit.adjustment import AdjustmentOptions, adjust, estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
+from tests.adjustment.made import ring_problem
 
-FOCAL_PX = 1000.0
 OPTIONS = AdjustmentOptions(loss_scale_px=2.0)
 
 
-def ring_problem(sigma_deg, noise_px, num_frames=16, num_points=400, seed=0):
-    """Cameras on a ring that look at a cloud; rotations are off by sigma per axis. Returns the truth, too."""
+def turned_ring(sigma_deg, noise_px, num_points=400, seed=0):
+    """Cameras on a ring whose rotations are off by sigma per axis, and their true rotations."""
     rng = np.random.default_rng(seed)
-    angles = np.linspace(0.0, 2.0 * np.pi, num_frames, endpoint=False)
-    centers = np.stack([6.0 * np.cos(angles), 6.0 * np.sin(angles), np.zeros(num_frames)], axis=1)
-    forward = -centers / 6.0
-    down = np.tile([0.0, 0.0, -1.0], (num_frames, 1))
-    rotations = np.stack([np.cross(down, forward), down, forward], axis=1)
-    points = rng.uniform(-1.0, 1.0, (num_points, 3))
-    cameras, seen = (a.ravel() for a in np.meshgrid(np.arange(num_frames), np.arange(num_points)))
-    shown = rng.random(len(cameras)) < 0.4
-    cameras, seen = cameras[shown], seen[shown]
-    x = np.einsum("kab,kb->ka", rotations[cameras], points[seen] - centers[cameras])
-    pixels = FOCAL_PX * x[:, :2] / x[:, 2:] + noise_px * rng.standard_normal((len(x), 2))
-    errors = Rotation.from_rotvec(np.radians(sigma_deg) * rng.standard_normal((num_frames, 3))).as_matrix()
-    problem = AdjustmentProblem(
-        rotations=errors @ rotations,
-        centers=centers,
-        points=points,
-        cameras_seeing=cameras,
-        points_seen=seen,
-        pixels=pixels,
-        lenses=[Lens("SIMPLE_PINHOLE", (FOCAL_PX, 0.0, 0.0))],
-        lens_of_camera=np.zeros(num_frames, dtype=np.int64),
-    )
-    return problem, rotations
+    truth = ring_problem(rng, 16, num_points, noise_px=noise_px, share=0.4)
+    errors = Rotation.from_rotvec(np.radians(sigma_deg) * rng.standard_normal((16, 3))).as_matrix()
+    return replace(truth, rotations=errors @ truth.rotations), truth.rotations
 
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("noise_px", [0.2, 1.0])
 def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
-    problem, _ = ring_problem(0.0, noise_px, seed=seed)
+    problem, _ = turned_ring(0.0, noise_px, seed=seed)
     found = estimate_rotation_errors(problem, OPTIONS)
     assert found.decide(Freedom()).holds_rotations
     assert found.num_frames == 16
@@ -58,7 +40,7 @@ def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sigma_deg", [0.05, 0.3])
 def test_the_standard_deviation_of_wrong_rotations_is_found(sigma_deg, seed):
-    found = estimate_rotation_errors(ring_problem(sigma_deg, 0.3, seed=seed)[0], OPTIONS)
+    found = estimate_rotation_errors(turned_ring(sigma_deg, 0.3, seed=seed)[0], OPTIONS)
     freedom = found.decide(Freedom())
     assert not freedom.holds_rotations
     # The root mean square of 16 x 3 normal numbers is within 4 / sqrt(96) = 41 % of sigma.
@@ -67,7 +49,7 @@ def test_the_standard_deviation_of_wrong_rotations_is_found(sigma_deg, seed):
 
 @pytest.mark.parametrize("sigma_deg", [0.0, 0.05])
 def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_deg):
-    problem, _ = ring_problem(sigma_deg, 0.2)
+    problem, _ = turned_ring(sigma_deg, 0.2)
     turned = problem.rotations.copy()
     turned[5] = Rotation.from_rotvec(np.radians([0.5, -0.4, 0.3])).as_matrix() @ turned[5]
     errors = estimate_rotation_errors(
@@ -85,7 +67,7 @@ def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_de
 
 
 def test_a_common_turn_of_all_is_no_error():
-    problem, _ = ring_problem(0.0, 0.2)
+    problem, _ = turned_ring(0.0, 0.2)
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
     turned = problem.with_values(
         problem.rotations @ turn.T, problem.centers @ turn.T, problem.points @ turn.T, problem.lenses
@@ -94,7 +76,7 @@ def test_a_common_turn_of_all_is_no_error():
 
 
 def test_few_frames_that_see_enough_say_nothing():
-    problem, _ = ring_problem(0.5, 0.2)
+    problem, _ = turned_ring(0.5, 0.2)
     few = problem.of_points(np.arange(problem.num_points) < 12)
     found = estimate_rotation_errors(few, OPTIONS)
     assert found.num_frames < 3
@@ -104,13 +86,13 @@ def test_few_frames_that_see_enough_say_nothing():
 @pytest.mark.parametrize("seed", range(3))
 def test_weighted_rotations_end_nearer_to_the_truth_than_held_and_free_ones(seed):
     """Few noisy points say less than rotations that are off by 0.05 degrees, and both together more."""
-    problem, truth = ring_problem(0.05, 2.0, num_points=40, seed=seed)
+    problem, truth = turned_ring(0.05, 0.3, num_points=40, seed=seed)
     given = problem.rotations
     off = {}
     for name, freedom in {
         "held": Freedom(pull_rad=0.0),
         "free": Freedom(),
-        "weighted": Freedom(pull_rad=np.radians(0.05), noise_px=2.0),
+        "weighted": Freedom(pull_rad=np.radians(0.05), noise_px=0.3),
     }.items():
         options = AdjustmentOptions(
             loss_scale_px=None, hold_rotations=freedom.holds_rotations, noise_px=freedom.noise_px

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.base.geometry import METRIC_SIGMA, fit_similarity_l1
-from tests.adjustment.made import ring_problem
+from tests.adjustment.made import observed, ring_problem
 
 OPTIONS = AdjustmentOptions(loss_scale_px=1.0, noise_px=0.5, cost_tolerance=1e-8)
 
@@ -166,14 +166,7 @@ def test_the_variance_of_measured_numbers_is_found_beside_their_noise():
 
 def test_fixed_frames_have_no_error_and_unseen_ones_none_that_is_known():
     truth = ring_problem(np.random.default_rng(0), 8, 200)
-    seen = truth.cameras_seeing != 5
-    truth = replace(
-        truth,
-        fixed=np.arange(8) < 2,
-        cameras_seeing=truth.cameras_seeing[seen],
-        points_seen=truth.points_seen[seen],
-        pixels=truth.pixels[seen],
-    )
+    truth = replace(observed(truth, truth.cameras_seeing != 5), fixed=np.arange(8) < 2)
     covariances = estimate_center_errors(adjust(truth, OPTIONS).problem, OPTIONS).covariances
     assert (covariances[:2] == 0.0).all()
     assert np.isnan(covariances[5]).all()

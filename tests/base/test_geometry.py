@@ -41,6 +41,15 @@ def assert_same_map(found: Similarity, expected: Similarity, rtol: float) -> Non
     np.testing.assert_allclose(found.translation, expected.translation, atol=rtol * size)
 
 
+def nearby(fit: Similarity, rng: np.random.Generator, size: float) -> Similarity:
+    """A similarity that differs by a share of the scale, as much of a shift, and 50 times as many degrees."""
+    return Similarity(
+        scale=fit.scale * (1 + size * rng.normal()),
+        rotation=turn(rng.normal(size=3), 50 * size * rng.normal()) @ fit.rotation,
+        translation=fit.translation + size * rng.normal(size=3),
+    )
+
+
 def test_normalized_vectors_have_unit_length_and_keep_their_direction_and_zero_gives_nan():
     v = np.array([[3.0, 0.0, 4.0], [-1e-150, 0.0, 0.0], [0.0, 1e150, 0.0]])
     np.testing.assert_allclose(normalized(v), [[0.6, 0, 0.8], [-1, 0, 0], [0, 1, 0]], atol=2 * EPS)
@@ -109,12 +118,7 @@ def test_no_nearby_similarity_has_a_smaller_weighted_sum_of_squares(seed):
         return float(weights @ np.sum((s.apply(source) - target) ** 2, axis=1))
 
     for _ in range(20):
-        nearby = Similarity(
-            scale=fit.scale * (1 + 1e-3 * rng.normal()),
-            rotation=turn(rng.normal(size=3), 0.1 * rng.normal()) @ fit.rotation,
-            translation=fit.translation + 1e-3 * rng.normal(size=3),
-        )
-        assert cost(nearby) >= cost(fit)
+        assert cost(nearby(fit, rng, 1e-3)) >= cost(fit)
 
 
 def test_a_weight_of_zero_leaves_a_point_out_and_a_source_turned_inside_out_gets_scale_zero():
@@ -184,12 +188,7 @@ def test_no_nearby_similarity_has_a_smaller_sum_of_distances(cap):
 
     for size in (1e-2, 1e-4):
         for _ in range(100):
-            nearby = Similarity(
-                scale=fit.scale * (1 + size * rng.normal()),
-                rotation=turn(rng.normal(size=3), 50 * size * rng.normal()) @ fit.rotation,
-                translation=fit.translation + size * rng.normal(size=3),
-            )
-            assert cost(nearby) >= cost(fit) * (1 - 1e-9)
+            assert cost(nearby(fit, rng, size)) >= cost(fit) * (1 - 1e-9)
 
 
 def test_without_a_cap_one_point_far_away_shrinks_everything_and_one_that_nothing_reaches_changes_nothing():

@@ -12,7 +12,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
@@ -24,8 +23,8 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
+from tests.models import centers_of
 from tests.problems import all_pairs
-from tests.scenes import real_scene
 from tests.structures import bundle_adjusted, colored, filtered, matches_between, triangulated
 
 NUM_IMAGES = 8
@@ -125,10 +124,6 @@ def dump(reconstruction):
         track = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
         lines.append((i, bytes(np.array(point.xyz)), bytes(np.array(point.color)), point.error, track))
     return [*lines, sorted(reconstruction.reg_image_ids()), sorted(reconstruction.rigs)]
-
-
-def centers_of(reconstruction):
-    return np.array([reconstruction.image(i).projection_center() for i in sorted(reconstruction.images)])
 
 
 def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tmp_path):
@@ -238,28 +233,18 @@ class Copying(ThreadPoolExecutor):
         return super().submit(work, pickle.loads(pickle.dumps(task)))
 
 
-def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
+@SOURCES
+def test_tracks_shared_out_to_workers_give_the_same_bits(source, monkeypatch):
     monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
     original, points = ring_model(noise_px=3.0)
-    seed, seen = seeded(original, ring_centers() + 0.01)[0], []
+    (seed, tracks), seen = seeded_with(source, original, ring_centers() + 0.01), []
     with Copying(2) as executor:
-        shared = triangulated(seed, original, None, lambda *done: seen.append(done), executor)
-    assert dump(shared) == dump(triangulated(seed, original))
-    assert seen[0] == (7, len(points))
-    assert seen[-1] == (len(points), len(points))
-
-
-def test_tracks_of_matches_shared_out_to_workers_give_the_same_bits(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.adjustment.structure._TRACKS_A_BLOCK", 7)
-    original, points = ring_model(noise_px=3.0)
-    (seed, matches), seen = seeded(original, ring_centers() + 0.01), []
-    with Copying(2) as executor:
-        shared = triangulated(seed, matches, None, lambda *done: seen.append(done), executor)
+        shared = triangulated(seed, tracks, None, lambda *done: seen.append(done), executor)
     assert shared.num_points3D() > 0.9 * len(points)
     (num_tracks,) = {total for _, total in seen}
     assert [done for done, _ in seen] == [*range(7, num_tracks, 7), num_tracks]
     monkeypatch.undo()
-    assert dump(shared) == dump(triangulated(seed, matches))
+    assert dump(shared) == dump(triangulated(seed, tracks))
 
 
 @SOURCES
@@ -565,20 +550,6 @@ def test_what_pycolmap_says_reaches_the_terminal_only_if_wanted(capfd, quiet):
         raise KeyError
     os.write(2, b"after")  # it is quiet inside the block only
     assert capfd.readouterr().err == "after"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
-def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
-    folder = real_scene(name)
-    found = locate(folder / "sparse" / "0", options=LocateOptions(adjust="full")).reconstruction
-    truth = pycolmap.Reconstruction(folder / "gt")
-    names = [found.image(i).name for i in sorted(found.images)]
-    centers = centers_of(found)
-    true_centers = np.array([truth.find_image_with_name(name).projection_center() for name in names])
-    error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
-    # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
-    assert error_m.mean() <= 1.15 * to_reach_m
 
 
 def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):

@@ -34,23 +34,6 @@ def test_pairs_are_the_edges_among_cameras_and_a_bare_graph_has_cameras_only():
     assert bare.part(np.array([0]))[0].covariance is None
 
 
-def test_a_part_renumbers_everything_alike_and_without_the_fixed_group_has_none():
-    part, nodes = MEASURED.part(np.array([1, 2, 5]))
-    assert nodes.tolist() == [1, 2, 4, 6]
-    assert part.graph.names == ("n1", "n2", "n4", "n6")
-    assert part.graph.edges.tolist() == [[0, 1], [1, 2], [2, 3]]
-    assert part.graph.weights.tolist() == [2.0, 3.0, 6.0]
-    assert part.covariance[:, 0, 0].tolist() == [1.0, 2.0, 5.0]
-    assert part.evidence.support.tolist() == [10, 20, 50]
-    assert part.evidence.contradicting.tolist() == [[0, 2]]
-    assert part.evidence.contradicting_support.tolist() == [8]
-    assert (part.num_cameras, part.num_points) == (3, 1)
-    assert part.groups.group_of.tolist() == [0, 0, 1, 2]
-    np.testing.assert_array_equal(part.groups.offsets, MEASURED.groups.offsets[nodes])
-    assert part.fixed_group == 1
-    assert MEASURED.part(np.array([0, 1]))[0].fixed_group is None
-
-
 def test_without_points_all_cameras_keep_their_numbers():
     bare = MEASURED.without_points()
     assert (bare.num_cameras, bare.num_points) == (5, 0)

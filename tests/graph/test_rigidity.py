@@ -385,19 +385,6 @@ def test_a_hundred_thousand_pairs_and_a_late_pendant_are_sorted_out_exactly():
     assert label[-1] == 2
 
 
-def test_a_random_graph_of_few_triangles_is_decided_by_the_game_in_steps():
-    """Degree 4 in 3D at 3000 cameras: the pieces equal those of one undivided pebble game."""
-    rng = np.random.default_rng(5)
-    pairs = rng.integers(3000, size=(6000, 2))
-    edges = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
-    label = parallel_rigid_pieces(3000, edges, 3)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rigidity.pieces, "_FIRST_GAME_NODES", 3000)
-        np.testing.assert_array_equal(parallel_rigid_pieces(3000, edges, 3), label)
-    assert np.bincount(label)[0] > 1000
-    assert label.max() > 100
-
-
 def test_growth_ends_with_the_seed_at_which_its_work_is_used_up(monkeypatch):
     part = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3]])  # a triangle, and a camera joined to it twice
     edges, body = np.concatenate([part, part + 4]), np.array([0, 0, 0, 1, 2, 3, 3, 3, 4, 5])

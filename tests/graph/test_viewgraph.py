@@ -168,16 +168,6 @@ def test_components_agree_with_label_propagation(seed, n, m):
     assert graph.components().tolist() == brute_force_components(graph)
 
 
-def test_a_restriction_keeps_edges_names_and_orientation_under_new_numbers():
-    graph = ViewGraph(6, [(5, 1), (4, 2), (1, 3)], [X, Y, Z], [1.0, 2.0, 3.0], list("abcdef"))
-    part, cameras = graph.restricted_to(np.array([0, 2]))
-    np.testing.assert_array_equal(cameras, [1, 3, 5])
-    np.testing.assert_array_equal(part.edges, [[2, 0], [0, 1]])
-    np.testing.assert_array_equal(part.directions, [X, Z])
-    np.testing.assert_array_equal(part.weights, [1.0, 3.0])
-    assert part.names == ("b", "d", "f")
-
-
 def test_a_graph_without_edges_has_only_lone_cameras():
     graph = ViewGraph(3, np.zeros((0, 2), dtype=int), np.zeros((0, 3)))
     assert (graph.num_edges, graph.dimension) == (0, 3)

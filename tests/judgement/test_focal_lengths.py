@@ -13,24 +13,17 @@ FOCAL_PX = 900.0
 IMAGES = 12
 
 
-def matches(factors, seed, *, angular=False, count=60):
-    """Matches of images of three cameras around a scene, read with focal lengths off by factors (3,)."""
-    rng = np.random.default_rng(seed)
-    camera_of = np.arange(IMAGES) % 3
-    centers = 8.0 * normalized(rng.standard_normal((IMAGES, 3)) * [1.0, 1.0, 0.3])
-    forward = -normalized(centers + 0.3 * rng.standard_normal((IMAGES, 3)))
-    side = normalized(np.cross(forward, random_rotations(rng, IMAGES)[:, 0]))
-    rotations = np.stack([side, np.cross(forward, side), forward], axis=1)
-    pairs = np.array(all_pairs(IMAGES))
+def seen(rng, centers, rotations, pairs, lenses, factors, count):
+    """Matches of cameras that see points near the origin, read with focal lengths off by a factor each."""
     read = ([], [])
     for i, j in pairs.tolist():
         points = rng.uniform(-2.0, 2.0, (count, 3))
         for rays, k in zip(read, (i, j), strict=True):
-            inside = (points - centers[k]) @ rotations[k].T
+            inside, angular = (points - centers[k]) @ rotations[k].T, lenses.is_angular[k]
             angles = np.arctan2(np.hypot(inside[:, 0], inside[:, 1]), inside[:, 2])
             radius = FOCAL_PX * (angles if angular else np.tan(angles))
             pixels = radius[:, None] * normalized(inside[:, :2]) + 0.3 * rng.standard_normal((count, 2))
-            off = np.hypot(*pixels.T) / (FOCAL_PX * factors[camera_of[k]])
+            off = np.hypot(*pixels.T) / (FOCAL_PX * factors[lenses.camera_of[k]])
             off = off if angular else np.arctan(off)
             rays.append(np.column_stack([np.sin(off)[:, None] * normalized(pixels), np.cos(off)]))
     given = RayMatches(
@@ -40,8 +33,22 @@ def matches(factors, seed, *, angular=False, count=60):
         rays_j=np.concatenate(read[1]),
         pixel_angles=np.full(len(pairs), 1.0 / FOCAL_PX),
     )
-    focal_lengths = FOCAL_PX * np.array(factors)[camera_of]
-    return given, rotations, Lenses(camera_of, focal_lengths, np.full(IMAGES, angular))
+    return given, rotations, lenses
+
+
+def lenses_of(camera_of, factors, angular=False):
+    return Lenses(camera_of, FOCAL_PX * np.array(factors)[camera_of], np.full(IMAGES, angular))
+
+
+def matches(factors, seed, *, angular=False, count=60):
+    """Matches of images of three cameras around a scene, read with focal lengths off by factors (3,)."""
+    rng = np.random.default_rng(seed)
+    centers = 8.0 * normalized(rng.standard_normal((IMAGES, 3)) * [1.0, 1.0, 0.3])
+    forward = -normalized(centers + 0.3 * rng.standard_normal((IMAGES, 3)))
+    side = normalized(np.cross(forward, random_rotations(rng, IMAGES)[:, 0]))
+    rotations = np.stack([side, np.cross(forward, side), forward], axis=1)
+    lenses = lenses_of(np.arange(IMAGES) % 3, factors, angular)
+    return seen(rng, centers, rotations, np.array(all_pairs(IMAGES)), lenses, factors, count)
 
 
 @pytest.mark.parametrize("angular", [False, True])
@@ -55,30 +62,13 @@ def test_a_camera_with_a_wrong_focal_length_is_named_with_the_right_one(factor, 
 
 def ring_about_an_object(factors, seed, count=30):
     """Matches of images whose optical axes meet: without rotations, two views hardly tell focal lengths."""
-    rng = np.random.default_rng(seed)
-    camera_of = (np.arange(IMAGES) % 3 == 0).astype(np.int64)
     angles = np.linspace(0.0, 2.0 * np.pi, IMAGES, endpoint=False)
     centers = np.stack([8.0 * np.cos(angles), 8.0 * np.sin(angles), np.zeros(IMAGES)], axis=1)
     forward, down = -centers / 8.0, np.tile([0.0, 0.0, -1.0], (IMAGES, 1))
     rotations = np.stack([np.cross(down, forward), down, forward], axis=1)
     pairs = np.array([(i, j) for i, j in all_pairs(IMAGES) if min(j - i, IMAGES - j + i) < 4])
-    read = ([], [])
-    for i, j in pairs.tolist():
-        points = rng.uniform(-2.0, 2.0, (count, 3))
-        for rays, k in zip(read, (i, j), strict=True):
-            inside = (points - centers[k]) @ rotations[k].T
-            pixels = FOCAL_PX * inside[:, :2] / inside[:, 2:] + 0.3 * rng.standard_normal((count, 2))
-            focal = FOCAL_PX * factors[camera_of[k]]
-            rays.append(normalized(np.column_stack([pixels / focal, np.ones(count)])))
-    given = RayMatches(
-        pairs=pairs,
-        offsets=count * np.arange(len(pairs) + 1),
-        rays_i=np.concatenate(read[0]),
-        rays_j=np.concatenate(read[1]),
-        pixel_angles=np.full(len(pairs), 1.0 / FOCAL_PX),
-    )
-    focal_lengths = FOCAL_PX * np.array(factors)[camera_of]
-    return given, rotations, Lenses(camera_of, focal_lengths, np.zeros(IMAGES, dtype=np.bool_))
+    lenses = lenses_of((np.arange(IMAGES) % 3 == 0).astype(np.int64), factors)
+    return seen(np.random.default_rng(seed), centers, rotations, pairs, lenses, factors, count)
 
 
 @pytest.mark.parametrize(("wrong", "factor"), [(0, 0.9), (1, 0.42), (1, 1.1)])

@@ -10,11 +10,9 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
-from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.scene.matches import RayMatches
 from sfm_shapefit.solver.solve import solve
 from tests.problems import all_pairs, random_rotations
-from tests.scenes import COURTYARD
 
 FOCAL_PX = 1000.0
 EXACT_DEG = 1e-9  # rays are exact to 1e-16 rad, and 5 degrees of parallax amplify that by a hundred or so
@@ -310,13 +308,6 @@ def test_weights_make_the_locations_of_uneven_pairs_better():
             errors.append(np.linalg.norm(aligned - truth, axis=1).mean())
         ratios.append(errors[0] / errors[1])
     assert np.median(ratios) < 0.7
-
-
-def test_locate_gives_the_solver_the_weights():
-    found = locate(COURTYARD / "sparse" / "0")
-    weights = found.directions.weights()[found.directions.usable()]
-    assert np.ptp(weights) > 0.1
-    np.testing.assert_array_equal(found.placement.graph.weights[: len(weights)], weights)
 
 
 def test_more_hypotheses_survive_more_wrong_matches():

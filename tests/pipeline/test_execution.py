@@ -24,38 +24,28 @@ from sfm_shapefit.pipeline.execution import (
     measure_with_workers,
     open_executor,
 )
-from sfm_shapefit.synthetic import SceneOptions, make_scene
-from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run_python
 from tests.scenes import view_of
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory):
-    """A small ring as a COLMAP workspace."""
-    out = tmp_path_factory.mktemp("execution") / "ring"
-    write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
-    return out
-
-
-@pytest.fixture(scope="module")
-def model(workspace):
-    return read_model(workspace / "sparse" / "0")
+def model(tiny_ring):
+    return read_model(tiny_ring / "sparse" / "0")
 
 
 WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()), matches_per_task=700)
 
 
-def serial(workspace, model):
-    with view_of(workspace / "database.db", model.images) as view:
+def serial(tiny_ring, model):
+    with view_of(tiny_ring / "database.db", model.images) as view:
         (part,) = view.parts(10**9)
     (found,) = measure_part(WORK, part)
     return found
 
 
-def shared(workspace, model, executor):
+def shared(tiny_ring, model, executor):
     seen = []
-    with view_of(workspace / "database.db", model.images) as view:
+    with view_of(tiny_ring / "database.db", model.images) as view:
         parts = measure_with_workers(view, WORK, executor, lambda *done: seen.append(done))
     return concatenate(parts), seen
 
@@ -69,18 +59,18 @@ def assert_same_bits(a, b):
             np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
 
 
-def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):
+def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(tiny_ring, model):
     with ThreadPoolExecutor(2) as pool:
-        found, seen = shared(workspace, model, pool)
-    assert_same_bits(found, serial(workspace, model))
+        found, seen = shared(tiny_ring, model, pool)
+    assert_same_bits(found, serial(tiny_ring, model))
     assert seen[-1] == (len(found.pairs), len(found.pairs))
 
 
 @pytest.mark.slow
-def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(workspace, model):
+def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(tiny_ring, model):
     with open_executor("processes", 2) as pool:
-        found, _ = shared(workspace, model, pool)
-    assert_same_bits(found, serial(workspace, model))
+        found, _ = shared(tiny_ring, model, pool)
+    assert_same_bits(found, serial(tiny_ring, model))
 
 
 def _die(_work, _part):
@@ -88,22 +78,22 @@ def _die(_work, _part):
 
 
 @pytest.mark.slow
-def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch):
+def test_a_worker_that_dies_in_a_pool_is_reported(tiny_ring, model, monkeypatch):
     monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", _die)
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         pytest.raises(WorkerError, match=r"a worker failed .* run again"),
     ):
-        shared(workspace, model, pool)
+        shared(tiny_ring, model, pool)
 
 
-def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
+def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model, monkeypatch):
     def refuse(_work, _part):
         raise InputError("the database is damaged")
 
     monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", refuse)
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
-        shared(workspace, model, pool)
+        shared(tiny_ring, model, pool)
 
 
 def die_once(flag, work, part):
@@ -117,14 +107,14 @@ def die_once(flag, work, part):
 
 
 @pytest.mark.slow
-def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
+def test_dask_gives_the_work_of_a_killed_worker_to_another(tiny_ring, model, monkeypatch, tmp_path):
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
     monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", partial(die_once, str(flag)))
     with open_executor("dask", 2) as pool:
-        found, _ = shared(workspace, model, pool)
+        found, _ = shared(tiny_ring, model, pool)
     assert flag.exists()
-    assert_same_bits(found, serial(workspace, model))
+    assert_same_bits(found, serial(tiny_ring, model))
 
 
 @pytest.mark.slow

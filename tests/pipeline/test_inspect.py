@@ -1,8 +1,8 @@
 """`inspect` says of a camera what `locate` will say of it."""
 
-import pycolmap
-
 import sfm_shapefit
+from tests.models import turned
+from tests.problems import turn
 from tests.scenes import COURTYARD
 
 
@@ -14,12 +14,7 @@ def test_a_right_camera_before_a_repeated_facade_is_not_weak():
 
 
 def test_a_turned_camera_is_named():
-    model = pycolmap.Reconstruction(COURTYARD / "sparse" / "0")
-    image = next(image for image in model.images.values() if image.name == "0010.jpg")
-    frame = model.frame(image.frame_id)
-    pose = frame.rig_from_world
-    turn = pycolmap.Rotation3d([0.0, 0.35, 0.0]) * pose.rotation
-    frame.rig_from_world = pycolmap.Rigid3d(turn, pose.translation)
+    model = turned(COURTYARD / "sparse" / "0", ["0010.jpg"], turn([0.0, 1.0, 0.0], 20.0))
     seen = sfm_shapefit.inspect(model, COURTYARD / "database.db")
     told = {camera.name for camera in seen.diagnosis.weak} | set(seen.diagnosis.left_out)
     assert told == {"0010.jpg"}

@@ -13,32 +13,31 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.adjustment import structure as triangulation
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene import describe_line, describe_loops
-from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.pair_list import read_pair_list
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline import execution, relative_rotations
-from sfm_shapefit.pipeline.execution import open_executor
+from sfm_shapefit.pipeline import relative_rotations
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.first_placement import adjust_first_placement
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from sfm_shapefit.report.results import draw_joined
-from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.abuse import determinism
 from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
-from tests.pipeline.test_execution import die_once
-from tests.program import run, run_python
-from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, read_from
+from tests.models import by_name, write_priors
+from tests.program import run
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
 PAIR = 2147483647
+PAIRS = "DELETE FROM two_view_geometries WHERE"
+ACROSS = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
+"""Pairs between the first four images of the ring and the others."""
 FAST = {"points": "never"}
 
 
@@ -84,19 +83,10 @@ def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
 
 def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
     truth = read_model(RING / "sparse" / "0").images
-    ids = ", ".join(map(str, truth.ids[:4].tolist()))
-    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
-    positions = dict(zip(truth.names, 2.0 * truth.centers @ turn.T + 100.0, strict=True))
-    table = tmp_path / "priors.txt"
-    table.write_text(
-        "\n".join(f"{n} {x} {y} {z}" for n, (x, y, z) in positions.items() if n in truth.names[4:])
-    )
-    found = sfm_shapefit.map_database(
-        changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}"),
-        priors=table,
-        **FAST,
-    )
+    positions = by_name(truth, 2.0 * truth.centers @ turn.T + 100.0)
+    table = write_priors(tmp_path / "priors.txt", {name: positions[name] for name in truth.names[4:]})
+    found = sfm_shapefit.map_database(changed(RING, tmp_path, f"{PAIRS} {ACROSS}"), priors=table, **FAST)
     scales = {}
     for model in found.models:
         scales[model.names[0] in truth.names[:4]] = model.located.gauge.scale
@@ -111,14 +101,10 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
 
 def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path, monkeypatch):
     truth = read_model(RING / "sparse" / "0").images
-    ids = ", ".join(map(str, truth.ids[:4].tolist()))
-    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
     # The receiver of the first four said the same place all the time.
     positions = np.where(np.arange(8)[:, None] < 4, truth.centers[0], truth.centers)
-    table = tmp_path / "priors.txt"
-    rows = zip(truth.names, positions, strict=True)
-    table.write_text("\n".join(f"{name} {x} {y} {z}" for name, (x, y, z) in rows))
-    path = changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}")
+    table = write_priors(tmp_path / "priors.txt", by_name(truth, positions))
+    path = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
     first = Mock(wraps=adjust_first_placement)
     monkeypatch.setattr("sfm_shapefit.pipeline.component.adjust_first_placement", first)
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
@@ -194,35 +180,23 @@ def test_threads_repetition_and_hashes_change_no_byte(tmp_path):
 
 
 STAGES = ("relative rotations", "rotation averaging", "first placement", "locate")
-INTERRUPTED = """
-import os, signal, sys
-from contextlib import contextmanager
-from sfm_shapefit.cli import main
-from sfm_shapefit.pipeline.clock import Clock
-
-stage, sys.argv = sys.argv[1], ["sfm-shapefit", *sys.argv[2:]]
-timed = Clock.__call__
-
-def begin(clock, name):
-    if name == stage:
-        os.kill(os.getpid(), signal.SIGINT)
-    return timed(clock, name)
-
-Clock.__call__ = begin
-main()
-"""
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_an_interrupt_in_any_stage_leaves_nothing(tmp_path, stage):
-    done = run_python("-c", INTERRUPTED, stage, "map", RING / "database.db", tmp_path / "out", "-q")
-    assert (done.returncode, done.stderr) == (130, "sfm-shapefit: interrupted; nothing was written\n")
+def test_an_interrupt_in_any_stage_leaves_nothing_and_whoever_watches_may_cancel_there(
+    tmp_path, monkeypatch, stage
+):
+    def interrupt(_clock, name):
+        if name == stage:
+            raise KeyboardInterrupt
+        return begin(_clock, name)
+
+    begin, seen = Clock.__call__, []
+    with monkeypatch.context() as patch:
+        patch.setattr(Clock, "__call__", interrupt)
+        done = run("map", RING / "database.db", tmp_path / "out", "-q", code=130)
+    assert done.stderr == "sfm-shapefit: interrupted; nothing was written\n"
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("stage", STAGES)
-def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
-    seen = []
 
     def cancel(name, _done, _total):
         seen.append(name)
@@ -260,9 +234,7 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor)
     gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
     without = tmp_path / "without.csv"
     without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
-    database = changed(
-        RING, tmp_path / "edited", f"DELETE FROM two_view_geometries WHERE {' OR '.join(gone)}"
-    )
+    database = changed(RING, tmp_path / "edited", f"{PAIRS} {' OR '.join(gone)}")
     if executor is None:
         given = (
             sfm_shapefit.map_database(RING / "database.db", without=str(without), **FAST).models[0].located
@@ -314,20 +286,6 @@ def test_an_executor_shares_out_pairs_and_tracks_and_changes_no_bit(monkeypatch,
     assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions", "triangulate_block"}
     assert pool.tasks["estimate_relative_rotations"] > 3 < pool.tasks["triangulate_block"]
     assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
-    assert_same_bits(shared, serial, tmp_path)
-
-
-@pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_midway_changes_no_bit(monkeypatch, tmp_path):
-    pytest.importorskip("distributed")
-    flag = tmp_path / "killed"
-    monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
-    monkeypatch.setattr(execution, "measure_part", partial(die_once, str(flag)))
-    with open_executor("dask", 2) as pool:
-        shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
-    monkeypatch.undo()
-    assert flag.exists()
-    serial = sfm_shapefit.map_database(COURTYARD / "database.db")
     assert_same_bits(shared, serial, tmp_path)
 
 
@@ -392,9 +350,8 @@ def test_pairs_are_left_out_of_databases_only(tmp_path):
 
 
 def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):
-    groups = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
     lonely = f"pair_id / {PAIR} = 8 OR pair_id % {PAIR} = 8"
-    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {groups} OR {lonely}")
+    path = changed(RING, tmp_path, f"{PAIRS} {ACROSS} OR {lonely}")
     found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
     assert [model.names for model in found.models] == [
         tuple(f"{k:04d}.jpg" for k in group) for group in ((1, 2, 3, 4), (5, 6, 7))
@@ -409,7 +366,7 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
 def test_images_in_no_model_are_told_their_own_reason(tmp_path):
     group = f"(pair_id / {PAIR} > 4) + (pair_id / {PAIR} > 6) + (pair_id / {PAIR} > 7)"
     cut = f"{group} != {group.replace('/', '%')}"
-    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {cut}")
+    path = changed(RING, tmp_path, f"{PAIRS} {cut}")
     found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
     assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
     assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
@@ -417,25 +374,6 @@ def test_images_in_no_model_are_told_their_own_reason(tmp_path):
         "matched with 1 other image only; a model needs 3"
     }
     assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
-
-
-def test_inlier_matches_are_enough(tmp_path):
-    path = changed(
-        RING,
-        tmp_path,
-        "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL",
-    )
-    images = read_from(path, read_images)
-    unposed, truth = images.images, read_model(RING / "sparse" / "0").images
-    found = sfm_shapefit.relative_rotations(path)
-    i, j = found.pairs.T
-    true = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
-    assert len(found.pairs) > 10
-    assert found.are_sound().all()
-    assert found.names == unposed.names
-    # Half a pixel of noise at f = 1000 px, over hundreds of matches.
-    assert np.median(rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ true)) < 0.2
-    assert len(sfm_shapefit.relative_rotations(path, source="stored").pairs) == 0
 
 
 def wrong_focal_length(factor):
@@ -470,99 +408,6 @@ def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
     assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
     assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)
     assert located.summary()["intrinsics"][0]["decided_by"] == "held"
-
-
-UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RENAME TO {0};"
-
-
-@pytest.mark.parametrize(
-    ("statement", "message"),
-    [
-        ("UPDATE cameras SET params = x'00'", "camera with id 1 is damaged"),
-        ("UPDATE cameras SET model = 99", "has the model 99, which pycolmap does not know"),
-        ("UPDATE cameras SET height = -1", "camera with id 1 is damaged"),
-        ("UPDATE cameras SET camera_id = 4294967295", "camera with id 4294967295 is damaged"),
-        (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
-        (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
-        (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
-        ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
-        (
-            "ALTER TABLE cameras RENAME TO c; CREATE VIEW cameras AS WITH RECURSIVE n(x) AS "
-            "(VALUES (1) UNION ALL SELECT x + 1 FROM n) SELECT x AS camera_id, 1 AS model, 1 AS width, "
-            "1 AS height, x'' AS params, 1 AS prior_focal_length FROM n",
-            "its cameras is a view",
-        ),
-        (
-            "UPDATE images SET camera_id = 7 WHERE image_id = 2",
-            "image with id 2 has no valid name and camera",
-        ),
-        ("DELETE FROM images", "has 0 images, but two or more"),
-    ],
-)
-def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
-    with pytest.raises(InputError, match=message):
-        sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
-
-
-def problem(num_false=0, seed=5, n=14):
-    """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
-    rng = np.random.default_rng(seed)
-    truth = Rotation.random(n, random_state=rng).as_matrix()
-    pairs = np.column_stack(np.triu_indices(n, 1))
-    noise = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=(len(pairs), 3))).as_matrix()
-    rotations = noise @ truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
-    counts = np.full(len(pairs), 100)
-    false = rng.permutation(np.flatnonzero((pairs < n // 2).sum(axis=1) == 1))[:num_false]
-    turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]).as_matrix()
-    i, j = pairs[false].T
-    rotations[false], counts[false] = truth[j] @ turn @ truth[i].transpose(0, 2, 1), 16
-    information = np.tile(np.eye(3), (len(pairs), 1, 1))
-    shares = np.ones(len(pairs))
-    return truth, RelativeRotations(
-        pairs=pairs,
-        rotations=rotations,
-        information=information,
-        num_matches=counts,
-        weight_shares=shares,
-    )
-
-
-def worst_error_deg(answer, truth):
-    difference = answer.rotations.transpose(0, 2, 1) @ truth
-    return rotation_angles_deg(difference @ mean_rotation_l1(difference).T).max()
-
-
-def test_the_most_consistent_of_several_averagings_is_kept():
-    truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    weights = np.sqrt(relative.num_matches)
-    right = relative.num_matches == 100
-    answer = average_relative_rotations(14, relative)
-    assert answer.certified
-    assert answer.registered.all()
-    assert answer.num_tried > 1
-    assert answer.num_pairs == right.sum()
-    assert worst_error_deg(answer, truth) < 0.5
-    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
-
-
-def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
-    truth, relative = problem()
-    assert not average_relative_rotations(14, relative).unsettled.any()
-    bad = (relative.pairs == 3).any(axis=1)
-    unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
-    answers = []
-    for wrong, shares in ((bad, np.ones(len(bad))), (unsound, np.where(unsound, 0.3, 1.0))):
-        rotations = relative.rotations.copy()
-        rng = np.random.default_rng(1)
-        rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
-        part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
-        answers.append(average_relative_rotations(14, part))
-    assert answers[0].agreements[3] < 0.25
-    assert np.delete(answers[0].agreements, 3).min() > 0.8
-    assert list(np.flatnonzero(answers[0].unsettled)) == [3]
-    assert answers[1].num_pairs == 61
-    assert answers[1].share > 0.99
-    assert worst_error_deg(answers[1], truth) < 0.5
 
 
 def keep_few_matches(wrong):
@@ -657,13 +502,9 @@ def check_joined_folder(folder, found):
 
 
 def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
-    truth = read_model(RING / "sparse" / "0").images
-    across = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
-    database = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {across}")
-    table = tmp_path / "priors.txt"
-    rows = zip(truth.names, truth.centers.tolist(), strict=True)
-    table.write_text("\n".join(" ".join(map(str, (name, *center))) for name, center in rows))
-    out = tmp_path / "out"
+    truth, out = read_model(RING / "sparse" / "0").images, tmp_path / "out"
+    database = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
+    table = write_priors(tmp_path / "priors.txt", by_name(truth, truth.centers))
     arguments = ("map", database, out, "--points", "never", "--no-report")
     run(*arguments, "--priors", table)
     (told,) = json.loads((out / "map.json").read_text())["joins"]

@@ -24,8 +24,7 @@ from sfm_shapefit.pipeline.memory import (
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.solver.options import NO_FACTOR
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive, random_graph_problem
-from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.synthetic import random_graph_problem
 from tests.scenes import RING
 
 WORK = Workload(
@@ -151,12 +150,9 @@ def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_f
 
 
 @pytest.fixture(scope="module")
-def workspaces(tmp_path_factory):
+def workspaces(rig_drive):
     """Models with a database: plain, and of rigs."""
-    folder = tmp_path_factory.mktemp("rigs") / "drive"
-    drive = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
-    write_workspace(drive, folder, WorkspaceOptions(model="rotations"))
-    return {"plain": RING / "sparse" / "0", "rigs": folder / "sparse" / "0"}
+    return {"plain": RING / "sparse" / "0", "rigs": rig_drive[1] / "sparse" / "0"}
 
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])

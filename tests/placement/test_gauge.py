@@ -8,18 +8,27 @@ import struct
 import numpy as np
 import pycolmap
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import InputError, PlacementOptions, locate
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.base.geometry import Similarity, compose, invert, median_spread, normalized
 from sfm_shapefit.facts.warnings import prior_warnings
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
-from sfm_shapefit.placement.gauge import distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.placement.gauge import (
+    distance_gauge,
+    input_gauge,
+    metric_gauge,
+    moved_gauge,
+    prior_gauge,
+    unit_gauge,
+)
 from sfm_shapefit.placement.prior_pairs import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
@@ -44,6 +53,40 @@ def priors_of(positions, sigma=np.nan, rows=None):
         ),
         statement="a test",
     )
+
+
+TOLD = 7.0 * cameras(0) + [1.0, -2.0, 3.0]
+GAUGES = {
+    "unit": unit_gauge,
+    "input": lambda t: input_gauge(t, TOLD),
+    "metric": lambda t: metric_gauge(
+        t, median_spread(t) / median_spread(TOLD), TOLD, np.arange(12) < 1, has_rigs=False
+    ),
+    "one distance": lambda t: distance_gauge(t, np.array([[3, 7]]), np.array([12.5]), ["a and b"]),
+    "distances": lambda t: distance_gauge(t, np.array([[3, 7], [1, 2]]), np.array([2.0, 3.0]), ["a", "b"]),
+    "priors": lambda t: prior_gauge(t, priors_of(TOLD @ TURN.T)),
+    "moved": lambda t: moved_gauge(unit_gauge(t), t[4], TOLD[4], "e"),
+}
+
+
+@pytest.mark.parametrize("kind", GAUGES)
+@settings(max_examples=10, deadline=None)
+@given(log_scale=st.floats(-5.0, 5.0), shift=st.floats(-30.0, 30.0), seed=st.integers(0, 99))
+def test_a_gauge_undoes_scale_and_origin_of_the_solver_and_is_none_where_it_holds(
+    kind, log_scale, shift, seed
+):
+    t = cameras(0) + 0.01 * cameras(seed + 1)
+    inner = Similarity(scale=np.exp(log_scale), rotation=np.eye(3), translation=np.full(3, shift))
+    gauge, of_moved = GAUGES[kind](t), GAUGES[kind](inner.apply(t))
+    placed = gauge.apply(t)
+    size = np.ptp(placed) * (1.0 + abs(shift) / inner.scale)  # digits that a far origin takes
+    np.testing.assert_allclose(of_moved.apply(inner.apply(t)), placed, atol=1e-6 * size)
+    composed = compose(of_moved.similarity, inner)
+    assert composed.scale == pytest.approx(gauge.similarity.scale, rel=1e-6)
+    np.testing.assert_allclose(compose(invert(inner), inner).apply(t), t, atol=1e-9 * (1.0 + abs(shift)))
+    again = GAUGES[kind](placed)
+    np.testing.assert_allclose(again.apply(placed), placed, atol=1e-4 * np.ptp(placed))
+    assert again.scale == gauge.scale == of_moved.scale
 
 
 def test_the_input_gauge_is_recovered_without_turning_the_axes_in_spite_of_a_few_wild_cameras():
@@ -429,12 +472,14 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
     facts = json.loads(run(*arguments, tmp_path / "out").stdout)
     assert "; the priors moved cameras by " in facts["scale"]
+    run(*arguments, tmp_path / "full", "--adjust", "full")
     off = []
-    for folder in ("plain", "out"):
+    for folder in ("plain", "out", "full"):
         model = pycolmap.Reconstruction(tmp_path / folder)
         centers = {image.name: image.projection_center() for image in model.images.values()}
         off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
-    assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+    for pulled in off[1:]:
+        assert np.sum(np.square(pulled)) < np.sum(np.square(off[0]))  # nearer to the priors than before
 
 
 def test_pairs_that_contradict_the_baselines_of_priors_are_named():

@@ -17,7 +17,6 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.solve import solve
 from tests.problems import fit_angles, shape, shape_error
 
 
@@ -243,21 +242,6 @@ def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
     assert isinstance(plan_refinement(graph), IterativeNormal)
 
 
-def test_the_refinement_improves_the_certified_optimum_on_noisy_data():
-    problem = synthetic.measured_problem(
-        np.random.default_rng(1).standard_normal((40, 3)),
-        np.array([(i, j) for i in range(40) for j in range(i + 1, min(i + 12, 40))]),
-        sigma=0.02,
-        q=0.1,
-        seed=4,
-    )
-    graph = problem.view_graph
-    start = solve(graph).locations
-    assert shape_error(refined(graph, start).locations, problem.locations) < 0.8 * shape_error(
-        start, problem.locations
-    )
-
-
 def test_the_answer_is_a_stationary_point_of_the_robust_cost():
     problem = synthetic.random_graph_problem(20, 0.9, sigma=0.02, q=0.15, seed=5)
     graph = problem.view_graph
@@ -298,10 +282,8 @@ def test_a_direction_counts_in_its_own_metric():
     start = shaken(problem, 0.02)
     known = refined(graph, start, Metric(covariance, classes))
     unknown = refined(graph, start, Metric(None, classes))
-    none_known = refined(graph, start, Metric(np.full_like(covariance, np.nan), classes))
     truth = problem.locations
     assert shape_error(known.locations, truth) < 0.8 * shape_error(unknown.locations, truth)
-    np.testing.assert_allclose(none_known.locations, unknown.locations, atol=1e-6)
 
 
 def test_origin_and_scale_of_the_start_do_not_matter_and_another_out_of_reach_ends_it_early():

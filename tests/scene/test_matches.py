@@ -17,8 +17,6 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.scene import matches as scene_matches
 from sfm_shapefit.scene.matches import PLENTY, KeypointMatches, Matches, Reading
-from sfm_shapefit.synthetic import SceneOptions, make_scene
-from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import RING
 
 READINGS = {
@@ -31,23 +29,17 @@ READINGS = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A tiny ring as a COLMAP workspace."""
-    out = tmp_path_factory.mktemp("matches") / "ring"
-    write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
-    return out
-
-
-@pytest.fixture(scope="module")
-def model(folder):
-    return read_model(folder / "sparse" / "0")
+def model(tiny_ring):
+    return read_model(tiny_ring / "sparse" / "0")
 
 
 @pytest.fixture(params=["database", "tracks"])
-def matches(request, folder, model):
+def matches(request, tiny_ring, model):
     """The matches of the ring, which were not read yet."""
     of_database = request.param == "database"
-    found = open_database(folder / "database.db", model.images.names) if of_database else TrackMatches(model)
+    found = (
+        open_database(tiny_ring / "database.db", model.images.names) if of_database else TrackMatches(model)
+    )
     with closing(found):
         yield found
 
@@ -166,14 +158,14 @@ def turned(model):
     return dataclasses.replace(model, images=model.images.posed(rotations, frames.centers))
 
 
-def test_other_rotations_have_the_rays_of_matches_that_are_opened_for_them(folder, matches, model):
+def test_other_rotations_have_the_rays_of_matches_that_are_opened_for_them(tiny_ring, matches, model):
     other = turned(model)
     before = columns(matches.at(model.images).batches())
     found = columns(matches.at(other.images).batches())
     again = (
         TrackMatches(other)
         if isinstance(matches, TrackMatches)
-        else open_database(folder / "database.db", other.images.names)
+        else open_database(tiny_ring / "database.db", other.images.names)
     )
     with closing(again):
         assert_same_bits(found, columns(again.at(other.images).batches()))
@@ -181,8 +173,8 @@ def test_other_rotations_have_the_rays_of_matches_that_are_opened_for_them(folde
     assert not np.array_equal(found["rays_i"], before["rays_i"])
 
 
-def test_parts_are_read_elsewhere_to_the_same_bits(folder, model):
-    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+def test_parts_are_read_elsewhere_to_the_same_bits(tiny_ring, model):
+    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         whole = matches.at(model.images, frozenset([model.images.names[:2]]))
         expected = columns(whole.batches())
         for size in (1, 700, 10**9):
@@ -199,24 +191,24 @@ def test_parts_are_read_elsewhere_to_the_same_bits(folder, model):
     assert len(TrackMatches(model).at(model.images).parts(700)) == 0  # only this process has the model
 
 
-def test_a_part_does_not_read_the_table_of_all_pairs(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+def test_a_part_does_not_read_the_table_of_all_pairs(tiny_ring, model, monkeypatch):
+    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         (part,) = matches.at(model.images).parts(10**9)
     monkeypatch.delattr("sfm_shapefit.files.colmap.database.read_pairs")
     with part.open() as view:
         assert sum(len(batch.pairs) for batch in view.batches()) == part.num_pairs
 
 
-def test_what_was_read_once_is_read_again_by_no_view(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+def test_what_was_read_once_is_read_again_by_no_view(tiny_ring, model, monkeypatch):
+    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         expected = columns(matches.at(model.images).batches())
         monkeypatch.setattr(DatabaseMatches, "_read_matches", None)  # nothing may be read from here on
         again = columns(matches.at(turned(model).images).links())
     assert_same_bits(again, expected)
 
 
-def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(folder, model, monkeypatch):
-    with closing(open_database(folder / "database.db", model.images.names)) as matches:
+def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(tiny_ring, model, monkeypatch):
+    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         view, other = matches.at(model.images), matches.at(turned(model).images)
         (whole,) = view.links()
         reads, read = [], DatabaseMatches._read_matches
@@ -241,20 +233,20 @@ def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(f
         np.testing.assert_array_equal(found.offsets, whole.offsets)
 
 
-def test_a_closed_database_is_read_no_more(folder, model):
-    matches = open_database(folder / "database.db", model.images.names)
+def test_a_closed_database_is_read_no_more(tiny_ring, model):
+    matches = open_database(tiny_ring / "database.db", model.images.names)
     matches.close()
     matches.close()
     with pytest.raises(InputError, match="cannot be read"):
         list(matches.at(model.images).batches())
 
 
-def test_a_keypoint_without_a_ray_has_no_match(folder, model):
+def test_a_keypoint_without_a_ray_has_no_match(tiny_ring, model):
     def blinkered(lens, xy):
         """The left halves of images have no rays."""
         return np.where(xy[:, :1] < 600.0, np.nan, rays_of(lens, xy))
 
-    for matches in (TrackMatches(model), open_database(folder / "database.db", model.images.names)):
+    for matches in (TrackMatches(model), open_database(tiny_ring / "database.db", model.images.names)):
         with closing(matches):
             whole = columns(matches.at(model.images).batches())
             matches.rays, view = blinkered, matches.at(model.images)

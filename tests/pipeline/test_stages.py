@@ -1,0 +1,273 @@
+"""Each stage of the pipeline alone: from the ring as it stands, or a little off, not from other stages."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit import LocateOptions
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import (
+    angle_between_deg,
+    fit_similarity,
+    mean_rotation_l1,
+    normalized,
+    rotation_angles_deg,
+)
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.judgement.judged import judge
+from sfm_shapefit.judgement.turns import Doubt
+from sfm_shapefit.pairs.options import DirectionOptions
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline import joins
+from sfm_shapefit.pipeline.adjustment import adjust_placed
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.doubts import doubt_cameras
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule
+from sfm_shapefit.pipeline.joined import ToldOfJoins
+from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.rigs import place_cameras, rigid_parts
+from sfm_shapefit.pipeline.seed import seed_points, select_trusted
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+from tests.models import centers_of, only, posed
+from tests.pipeline.made import DATABASE, FOLDER, directions_of, opened, placement_at, stand_at
+from tests.problems import all_pairs, exact_graph, turn
+from tests.scenes import read_from, view_of
+
+MODEL = read_model(FOLDER)
+TRUTH = MODEL.images
+TURN = turn([0.3, -0.2, 0.1], 30.0)
+
+
+def relative_rotations(model, turned=()):
+    """The rotations between all cameras of a model; those of some are turned by 10 degrees."""
+    rotations = model.rotations.copy()
+    rotations[list(turned)] = turn([0.0, 0.6, 0.8], 10.0) @ rotations[list(turned)]
+    pairs = np.array(all_pairs(model.num_images))
+    k, (i, j) = len(pairs), pairs.T
+    return RelativeRotations(
+        pairs=pairs,
+        rotations=rotations[j] @ rotations[i].transpose(0, 2, 1),
+        information=np.tile(1e8 * np.eye(3), (k, 1, 1)),
+        num_matches=np.full(k, 100),
+        weight_shares=np.ones(k),
+    )
+
+
+def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_graph_of_them():
+    with opened() as source:
+        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks=True, errors=True))
+        bare = measure(source, DirectionOptions(), Clock())
+    i, j = found.directions.pairs[found.directions.usable()].T
+    true = normalized(TRUTH.centers[i] - TRUTH.centers[j])
+    usable = found.directions.directions[found.directions.usable()]
+    assert angle_between_deg(usable, true).max() < 1e-3  # keypoints are stored as float32
+    np.testing.assert_array_equal(bare.directions.directions, found.directions.directions)
+    assert (bare.tracks, bare.errors) == (None, None)
+    graph = add_evidence(build_graph(TRUTH, found), found)
+    assert graph.num_cameras == 8 < graph.graph.num_nodes
+    assert graph.graph.names[:8] == TRUTH.names
+    np.testing.assert_array_equal(graph.graph.edges[: len(i)], np.stack([i, j], axis=1))
+    assert graph.evidence.support[: len(i)].tolist() == [
+        found.directions.num_matches[row] for row in found.directions.usable()
+    ]
+    assert len(graph.evidence.errors) == graph.graph.num_edges
+    share = 1 + np.arange(len(bare.directions.pairs)) % 2  # every other pair loses half of its inliers
+    uneven = replace(bare.directions, num_inliers=bare.directions.num_inliers // share)
+    weights = build_graph(TRUTH, replace(bare, directions=uneven)).graph.weights
+    assert np.ptp(weights) > 0.1
+    np.testing.assert_array_equal(weights, uneven.weights()[uneven.usable()])
+
+
+def test_place_yields_the_rigid_pieces_the_largest_first():
+    edges = [*all_pairs(4), *all_pairs((3, 4, 5, 6, 7))]
+    measured = MeasuredGraph(exact_graph(TRUTH.centers, edges))
+    pieces = list(place_cameras(measured, PlacementOptions(), NodeOptions(), Clock()))
+    assert [piece.cameras.tolist() for piece in pieces] == [[3, 4, 5, 6, 7], [0, 1, 2, 3]]
+    for number, piece in enumerate(pieces):
+        assert piece.piece == number
+        true = TRUTH.centers[piece.cameras]
+        fit = fit_similarity(piece.locations, true, rotate=False)
+        np.testing.assert_allclose(fit.apply(piece.locations), true, atol=1e-7)
+    loose = MeasuredGraph(exact_graph(TRUTH.centers[:4], [(0, 1), (1, 2), (2, 3)]))
+    with pytest.raises(UnsolvableError, match="no three cameras"):
+        next(place_cameras(loose, PlacementOptions(), NodeOptions(), Clock()))
+
+
+@pytest.mark.parametrize("pull_rad", [0.0, np.inf])
+def test_adjust_moves_cameras_and_free_rotations_to_where_the_pixels_are_and_measures_there_again(pull_rad):
+    rng = np.random.default_rng(0)
+    off = posed(
+        FOLDER,
+        lambda _name, rotation, center: (
+            Rotation.from_rotvec(min(pull_rad, 5e-4) * rng.standard_normal(3)).as_matrix() @ rotation,
+            center,
+        ),
+    )
+    with opened(off) as source:
+        away = TRUTH.centers + 0.004 * rng.standard_normal((8, 3))
+        stand = stand_at(source, 0.1 * away, all_pairs=False, pull_rad=pull_rad)
+        after = adjust_placed(stand, LocateOptions(), Clock())
+    found = stand.gauge.similarity.apply(after.placement.locations)
+    fit = fit_similarity(found, TRUTH.centers, rotate=pull_rad > 0.0)
+    np.testing.assert_allclose(fit.apply(found), TRUTH.centers, atol=1e-4)
+    assert after.estimate is after.adjustment
+    assert after.estimate.freedom.holds_rotations == (pull_rad == 0.0)
+    if pull_rad == 0.0:
+        assert after.source is source
+        assert after.directions is stand.directions
+        np.testing.assert_array_equal(after.estimate.images.frames.rotations, source.images.frames.rotations)
+        return
+    rotations = after.source.images.rotations @ fit.rotation.T
+    assert rotation_angles_deg(rotations @ TRUTH.rotations.transpose(0, 2, 1)).max() < 1e-3
+    i, j = after.directions.pairs.T
+    true = normalized(TRUTH.centers[i] - TRUTH.centers[j]) @ fit.rotation
+    off_deg = [angle_between_deg(one.directions, true) for one in (stand.directions, after.directions)]
+    assert np.median(off_deg[0]) > 0.01
+    assert off_deg[1].max() < 1e-3
+
+
+def test_judge_names_the_pairs_that_contradict_and_who_is_turned_by_what_its_pairs_say():
+    graph = exact_graph(TRUTH.centers)
+    wrong = graph.directions.copy()
+    wrong[5] = normalized(np.cross(wrong[5], wrong[6]))
+    placement = judge(placement_at(TRUTH.centers), PlacementOptions())
+    assert placement.assessment.inliers.all()
+    assert select_trusted(placement, 0.9).all()
+    measured = MeasuredGraph(ViewGraph(8, graph.edges, wrong))
+    (bent,) = place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())
+    assert np.flatnonzero(~judge(bent, PlacementOptions()).assessment.inliers).tolist() == [5]
+    directions = directions_of(TRUTH)
+    for turned in ([], [3]):
+        judged = doubt_cameras(placement, directions, relative_rotations(TRUTH, turned), TRUTH)
+        kinds = judged.assessment.doubts.kinds
+        assert [k for k, kind in enumerate(kinds) if kind is Doubt.TURNED] == turned
+        assert np.flatnonzero(~select_trusted(judged, 0.5)).tolist() == turned
+    assert doubt_cameras(placement, directions, None, TRUTH).assessment.doubts is None
+
+
+def test_seed_has_the_points_that_kept_cameras_see_and_leaves_the_others_unregistered():
+    kept = np.arange(8) != 2
+    with opened() as source:
+        stand = stand_at(source, 0.1 * TRUTH.centers)
+        every = seed_points(stand, np.ones(8, np.bool_), LocateOptions(), Clock())
+        some = seed_points(stand, kept, LocateOptions(), Clock())
+    np.testing.assert_allclose(every.images.centers, TRUTH.centers, atol=1e-9)
+    assert every.adjusted is None
+    assert (every.num_seen == -1).all()
+    assert every.points.errors_px.max() < 1e-2  # keypoints are stored as float32
+    assert every.points.num_points > some.points.num_points > 200
+    np.testing.assert_array_equal(some.images.is_posed, kept)
+    assert set(some.points.images) == set(np.flatnonzero(kept))
+
+
+def known(positions, rows=slice(None)):
+    """Exact position priors of some cameras, of unknown standard deviations."""
+    rows = np.arange(len(positions))[rows]
+    return PositionPriors(
+        known=KnownPositions(rows, positions[rows], np.full((len(rows), 3, 3), np.nan)), statement="made"
+    )
+
+
+PAIR = (TRUTH.names[0], TRUTH.names[2])
+APART = float(np.linalg.norm(TRUTH.centers[0] - TRUTH.centers[2]))
+DISTANCE = {"distances": ((*PAIR, 1.5 * APART),)}
+PRIORS = {"priors": known(2.0 * TRUTH.centers)}
+OFF = 0.01 * np.random.default_rng(1).standard_normal(TRUTH.centers.shape)
+TURNED_PRIORS = {"priors": known(2.0 * (TRUTH.centers + OFF) @ TURN.T + 100.0)}
+
+
+@pytest.mark.parametrize(
+    ("fixed", "told", "scale", "checks"),
+    [
+        (5, DISTANCE | PRIORS, "fixed", ["known distances 50 %", "position priors 100 %"]),
+        (0, DISTANCE | PRIORS, "distance", ["position priors 33.3 %"]),
+        (0, DISTANCE | {"scale": "input"}, "distance", []),
+        (0, PRIORS | {"scale": "unit"}, "prior", []),
+        (1, PRIORS, "input", ["position priors 100 %"]),
+        (1, DISTANCE, "distance", []),
+        (0, {"scale": "unit"}, "unit", []),
+        (0, {}, "input", []),
+    ],
+)
+def test_gauge_the_first_by_precedence_sets_the_scale_and_the_others_check_it(fixed, told, scale, checks):
+    locations, rigid = 0.1 * TRUTH.centers, rigid_parts(TRUTH, np.arange(8) < fixed)
+    rule = GaugeRule(TRUTH, rigid, **{"scale": "auto", **told})
+    chosen = rule.choose(np.arange(8), locations, 0.1 if fixed > 1 else None)
+    assert chosen.scale == scale
+    found = chosen.apply(locations)
+    size = {"distance": 1.5, "prior": 2.0, "unit": None}.get(scale, 1.0)
+    if size is None:
+        assert np.median(np.linalg.norm(found, axis=1)) == pytest.approx(1.0)
+    else:
+        assert np.linalg.norm(found[0] - found[2]) == pytest.approx(size * APART, rel=1e-6)
+    if fixed:
+        np.testing.assert_allclose(found[0], TRUTH.centers[0], atol=1e-9)
+    said = list(rule.check(chosen, np.arange(8), found))
+    words = [f"{one.split(' were')[0]} {one.split('differ by ')[1]}" for one in said]
+    assert words == checks
+
+
+@pytest.mark.parametrize("adjust", ["seed", "full"])
+@pytest.mark.parametrize(
+    "told", [{}, {"scale": "unit"}, DISTANCE, TURNED_PRIORS], ids=["input", "unit", "distance", "priors"]
+)
+def test_seed_has_the_scale_the_origin_and_the_axes_that_are_told_also_where_all_was_adjusted(told, adjust):
+    """The input has its cameras off by a tenth of the ring's radius, in another unit."""
+    rng = np.random.default_rng(0)
+    given = posed(
+        FOLDER, lambda _name, turn, center: (turn, 3.0 * (center + 0.5 * rng.standard_normal(3)) + 5.0)
+    )
+    with opened(given) as source:
+        stand = stand_at(source, 0.1 * TRUTH.centers, **told)
+        found = seed_points(stand, np.ones(8, np.bool_), LocateOptions(adjust=adjust), Clock())
+    assert (found.adjusted is not None) == (adjust == "full")
+    centers = found.images.centers
+    again = stand.given.rule.choose(np.arange(8), centers, None)  # what is told holds already
+    assert again.scale == found.gauge.scale
+    axes = np.eye(3) if found.gauge.axes is None else found.gauge.axes
+    exact = 1e-4 if told is TURNED_PRIORS else 1e-9  # a robust fit is no fixed point after twenty rounds
+    assert again.similarity.scale == pytest.approx(1.0, abs=exact)
+    np.testing.assert_allclose(again.apply(centers), centers, atol=exact * np.ptp(centers))
+    np.testing.assert_allclose(axes, TURN if told is TURNED_PRIORS else np.eye(3), atol=0.02)
+    turned = TRUTH.rotations.transpose(0, 2, 1) @ found.images.rotations @ axes
+    np.testing.assert_allclose(mean_rotation_l1(turned), np.eye(3), atol=1e-9)
+    near = found.gauge.apply(stand.placement.locations)
+    assert np.abs(near - centers).max() < 0.01 * np.ptp(centers)
+
+
+@pytest.fixture(scope="module")
+def models():
+    """The ring as two models of four cameras each, the second one in another world."""
+    ids, halves = TRUTH.ids.tolist(), []
+    for chosen in (ids[:4], ids[4:]):
+        half = only(MODEL.reconstruction, chosen)
+        if halves:
+            half.transform(pycolmap.Sim3d(0.5, pycolmap.Rotation3d(TURN), np.ones(3)))
+        options = SimpleNamespace(structure=StructureOptions())
+        located = SimpleNamespace(reconstruction=half, images=TRUTH, options=options)
+        halves.append(SimpleNamespace(names=TRUTH.names, located=located))
+    return halves
+
+
+@pytest.mark.parametrize("by", ["matches", "priors"])
+def test_join_brings_models_into_the_world_of_the_first(models, by, monkeypatch):
+    monkeypatch.setattr(joins, "tell_group", lambda group, *_: group)
+    unposed = read_from(DATABASE, read_images).images
+    priors = None if by == "matches" else known(7.0 * TRUTH.centers)
+    with view_of(DATABASE, unposed) as view:
+        found = joins.join_models(models, unposed, view.matches, ToldOfJoins(priors), Clock())
+    (told,), (group,) = found.joins, found.joined
+    assert ("position priors" in told.statement) == (by == "priors")
+    assert list(group.world_from) == [0, 1]
+    np.testing.assert_allclose(centers_of(group.reconstruction), TRUTH.centers, atol=2e-3)
+    assert joins.join_models(models[:1], unposed, None, ToldOfJoins(), Clock()) == joins.JoinedModels((), ())
