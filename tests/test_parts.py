@@ -30,6 +30,12 @@ from sfm_shapefit.tracks.node_tracks import Tracks
 from tests.problems import all_pairs
 
 N = 9  # members of each noun
+_NO_LENSES = np.arange(1)  # the freedom of lenses that is alike for all
+
+
+def freedom_of(noun, frames):
+    """The freedom of some frames, whose lenses are all alike."""
+    return noun.of(frames, _NO_LENSES)
 
 
 class Noun(NamedTuple):
@@ -195,7 +201,9 @@ NOUNS = {
     ),
     "measured graph": Noun(measured, lambda noun, members: noun.part(members)[0], say_edges),
     "given poses": Noun(given_poses, GivenPoses.of, say_given),
-    "freedom": columns(Freedom, Freedom.of, {"pull_rad": (), "doubt_rad": ()}),
+    "freedom": columns(
+        Freedom, lambda noun, frames: noun.of(frames, _NO_LENSES), {"pull_rad": (), "doubt_rad": ()}
+    ),
     "frames": columns(Frames, Frames.part, {"ids": (), "rotations": (3, 3), "centers": (3,)}),
     "relative rotations": columns(
         RelativeRotations,
@@ -270,11 +278,11 @@ def test_what_contradicts_stays_while_both_of_its_cameras_do_and_a_fixed_group_w
 
 def test_freedom_of_some_frames_is_found_again_among_all():
     own = Freedom(pull_rad=np.array([0.1, 0.7, 0.2]), doubt_rad=np.array([0.0, 0.0, 0.3]))
-    found = own.among(np.array([4, 5, 9]), 10).of(np.array([5, 8, 9]))
+    found = own.among(np.array([4, 5, 9]), 10).of(np.array([5, 8, 9]), _NO_LENSES)
     assert found.pull_rad.tolist() == [0.7, 0.1, 0.2]
     assert found.doubt_rad.tolist() == [0.0, 0.0, 0.3]
     assert own.singled_out().tolist() == [False, True, True]
     for pull_rad in (0.0, np.inf, None, 0.1):
         one = Freedom(pull_rad=pull_rad)
-        assert one.among(np.array([4, 5]), 10).of(np.array([5, 9])).pull_rad == pull_rad
+        assert one.among(np.array([4, 5]), 10).of(np.array([5, 9]), _NO_LENSES).pull_rad == pull_rad
         assert one.holds_rotations == (pull_rad == 0.0)

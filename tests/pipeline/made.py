@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from sfm_shapefit import LocateOptions
+from sfm_shapefit.facts.intrinsics import intrinsics_in_doubt
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -44,7 +45,9 @@ def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Sta
     template = template_of(read_model(FOLDER))
     known = Known(priors=told.pop("priors", None))
     told = {"scale": "auto", "known": known, **told}
-    given = Given(template, images, source.inputs, rigid, pull_rad, **told)
+    held = np.zeros(len(images.lenses), dtype=np.bool_)
+    lenses = intrinsics_in_doubt(held, held, held)
+    given = Given(template, images, lenses, source.inputs, rigid, pull_rad, **told)
     directions, placement = directions_of(images, pairs), placement_at(locations, pairs)
     return Stand.of(given, source, directions, placement, LocateOptions())
 

@@ -181,8 +181,8 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     assert unused[2] == "the scale unit was not used, but that of the rigs"
 
 
-def test_rigs_whose_sensors_coincide_have_no_scale(drive, tmp_path):
-    write_workspace(drive, tmp_path / "w", WorkspaceOptions(database=False))
+def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
+    write_workspace(rigs, tmp_path / "w", WorkspaceOptions(database=False))
     model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():

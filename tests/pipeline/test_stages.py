@@ -254,7 +254,7 @@ def models():
         if halves:
             half.transform(pycolmap.Sim3d(0.5, pycolmap.Rotation3d(TURN), np.ones(3)))
         options = SimpleNamespace(structure=StructureOptions())
-        located = SimpleNamespace(reconstruction=half, images=TRUTH, options=options)
+        located = SimpleNamespace(reconstruction=half, images=TRUTH, placed=TRUTH, options=options)
         halves.append(SimpleNamespace(names=TRUTH.names, located=located))
     return halves
 
