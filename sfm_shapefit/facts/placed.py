@@ -273,6 +273,11 @@ class Finish(Record):
     ]
     num_put_back: Annotated[int, "Cameras that had left the scene and were put back."]
     lud: Annotated[Lud | None, "The second start; null if it was not solved."]
+    reweighted: Annotated[
+        Solve | None,
+        "The program at the weights that are the pairs' posteriors, certified at these; null where the "
+        "cameras come from another start.",
+    ]
 
     @classmethod
     def of_placement(cls, refined: RefinedPlacement) -> Self:
@@ -284,6 +289,7 @@ class Finish(Record):
             moved_max=refined.moved[1],
             num_put_back=len(refined.reset_nodes),
             lud=Lud.of(refined.lud),
+            reweighted=refined.reweighted and Solve(**refined.reweighted.solved.summary()),
         )
 
 
@@ -441,11 +447,24 @@ class GraphInputs(InputFacts):
         return self.graph
 
 
+class TakenForRight(Record):
+    """What is certain if the pairs that the answer takes for right are right."""
+
+    statement: Annotated[str, "All of it in a sentence."]
+    num_right: Annotated[int, "Pairs of the largest piece whose posterior in pairs.csv is above one half."]
+    num_fixed: Annotated[int, "Nodes of the largest piece that these pairs alone make parallel rigid."]
+    rigid: Annotated[bool, "Whether these are all nodes that are placed."]
+    solve: Annotated[
+        Solve | None, "The certified program restricted to these pairs; null where they are not rigid."
+    ]
+
+
 class GraphFacts(PlacedFacts):
     """locate.json of a bare graph, and what `sfm-shapefit place --json` prints."""
 
     inputs: Annotated[GraphInputs, "What was read."]
     dimension: Annotated[int, "Number of coordinates of a location."]
+    right_pairs: Annotated[TakenForRight, "What is certain if the pairs taken for right are right."]
 
     @property
     def next_step(self) -> NextStep:
@@ -474,6 +493,7 @@ class GraphFacts(PlacedFacts):
             Row("residuals", [within, f"{beyond} deg"]),
             row("locations", locations),
             row("certificate", self.delivered.statement),
+            row("right pairs", self.right_pairs.statement),
         ]
         return Telling(
             counted(self.num_images, "node"),

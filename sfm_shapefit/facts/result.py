@@ -34,6 +34,8 @@ from sfm_shapefit.facts.placed import (
     Delivered,
     GraphFacts,
     GraphInputs,
+    Solve,
+    TakenForRight,
     facts_of_placement,
 )
 from sfm_shapefit.facts.rigs import RefinedSensor
@@ -53,6 +55,7 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
 from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import PairNames
@@ -422,6 +425,7 @@ class GraphResult(Displayed):
         """What is told of the graph: each figure of locate.json, terminal and report."""
         placement = self.placement
         solved = [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *self.further)]
+        right = self.right_pairs
         return GraphFacts(
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
             verdict=self.verdict,
@@ -431,7 +435,19 @@ class GraphResult(Displayed):
             warnings=list(graph_warnings(placement)),
             inputs=GraphInputs(graph=str(self.path), directions=self.statement),
             dimension=placement.graph.dimension,
+            right_pairs=TakenForRight(
+                statement=right.statement(),
+                num_right=len(right.edges),
+                num_fixed=right.num_fixed,
+                rigid=right.is_rigid,
+                solve=None if right.solved is None else Solve(**right.solved.summary()),
+            ),
         )
+
+    @cached_property
+    def right_pairs(self) -> RightPairs:
+        """The pairs of the largest piece that are taken for right, and the program restricted to them."""
+        return examine_right_pairs(self.placement, self.options.solver)
 
     @property
     def told(self) -> Telling:

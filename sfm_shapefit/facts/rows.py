@@ -167,6 +167,7 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
                 leverage=float(assessment.leverages[e]),
                 verdict=verdict.value,
                 reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
+                posterior=float(piece.refined.posterior[e]),
             )
         )
     return rows

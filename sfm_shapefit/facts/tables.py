@@ -84,6 +84,8 @@ class PairRow:
     likeliest to be repeated structure."""
     prior_angle_deg: float = math.nan
     """Angle between the direction and the baseline of the position priors, where both cameras have one."""
+    posterior: float = math.nan
+    """Probability that the direction is right, by its residual and by the residuals of all pairs."""
 
 
 _ROW_TYPES: dict[TableName, type[CameraRow] | type[PairRow]] = {"cameras": CameraRow, "pairs": PairRow}

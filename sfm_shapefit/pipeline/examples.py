@@ -133,8 +133,9 @@ def find_pieces(_folder: Path) -> None:
 
 
 def place_graph(_folder: Path) -> None:
-    """Place a bare graph with all that follows the solve."""
+    """Place bare graphs with all that follows the solve, also where most pairs are wrong."""
     place(_random_graph(), threads=2)
+    place(synthetic.random_graph_problem(40, 0.6, q=0.8, seed=1).view_graph, threads=2)
 
 
 def place_long_graph(_folder: Path) -> None:

@@ -213,7 +213,7 @@ def _place_piece(
         piece=k,
         certified=solved,
         refined=refined,
-        agreement=find_agreement(part, refined.locations),
+        agreement=find_agreement(part, refined.locations, refined.right),
         history=history,
         unit=unit,
     )
@@ -227,7 +227,7 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
     """
     moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
     moved["refined"] = refined
-    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations)
+    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations, refined.right)
     return Placement(**moved)
 
 

@@ -48,8 +48,13 @@ class AngularAgreement:
     """The part of it, per axis, that the directions' own covariances do not explain."""
 
 
-def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> AngularAgreement:
-    """Return which directions agree with locations (n, d) of a measured graph."""
+def find_agreement(
+    measured: MeasuredGraph, locations: FloatArray, right: BoolArray | None = None
+) -> AngularAgreement:
+    """Return which directions agree with locations (n, d) of a measured graph.
+
+    Where most directions may be wrong, the level of all is first that of those that are taken for `right`.
+    """
     graph, groups = measured.graph, measured.groups
     freedom, covariances = graph.dimension - 1, own_covariances(measured)
     baselines = differences(locations, graph.edges)
@@ -57,11 +62,11 @@ def find_agreement(measured: MeasuredGraph, locations: FloatArray) -> AngularAgr
     behind = along(baselines, graph.directions) <= 0.0
     num_groups = graph.num_nodes if groups is None else groups.num_groups
     num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
-    excess, agrees = _excess(residuals, covariances, behind, num_unknowns)
+    used: BoolArray = np.ones(graph.num_edges, dtype=np.bool_) if right is None else right
+    excess, agrees = _excess(residuals, covariances, behind, num_unknowns, used)
     angles = np.linalg.norm(residuals, axis=1)
-    return AngularAgreement(
-        angles_rad=angles, agrees=agrees, level_rad=_level(angles, num_unknowns, freedom), excess_rad=excess
-    )
+    level = _level(angles[used], num_unknowns, freedom)
+    return AngularAgreement(angles_rad=angles, agrees=agrees, level_rad=level, excess_rad=excess)
 
 
 def own_covariances(measured: MeasuredGraph) -> FloatArray:
@@ -104,15 +109,17 @@ def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
 
 
 def _excess(
-    residuals: FloatArray, covariances: FloatArray, behind: BoolArray, num_unknowns: int
+    residuals: FloatArray, covariances: FloatArray, behind: BoolArray, num_unknowns: int, used: BoolArray
 ) -> tuple[float, BoolArray]:
-    """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
+    """Return the excess s in radians and which pairs agree; each decides the other, a few times.
+
+    The pairs that are `used` decide first.
+    """
     freedom = residuals.shape[1]
     angles = np.linalg.norm(residuals, axis=1)
     values, vectors = np.linalg.eigh(covariances)
     squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
     limit = chdtri(freedom, _OUTLIER_PROBABILITY)
-    used: BoolArray = np.ones(len(angles), dtype=np.bool_)
     inliers = used
     for _ in range(_LEVEL_ROUNDS):
         level = _level(angles[used], num_unknowns, freedom)

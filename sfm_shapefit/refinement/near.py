@@ -8,6 +8,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.refinement.angular import Metric, residual_levels
+from sfm_shapefit.refinement.consensus import fit_mixture
 from sfm_shapefit.refinement.starts import OPENING_RAD, RefinedPlacement
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import normalize_locations
@@ -45,6 +46,7 @@ def stay_near(
         reason=f"{first.reason}; then adjusted to the pixels, rotations too",
         levels_deg=tuple(np.degrees(levels).tolist()),
         reset_nodes=np.empty(0, dtype=np.int64),
+        posterior=fit_mixture(measured, locations).posterior,
     )
 
 

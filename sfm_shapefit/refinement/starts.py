@@ -2,9 +2,10 @@
 
 ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
 corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
-neither bias exists, and the one of lower robust cost is kept. Whether ShapeFit's optimum can be believed by
-itself is seen by how far both disagree: the standard deviation, over cameras, of the log ratio of their node
-lengths, which are medians of the lengths of a camera's pairs.
+neither bias exists, and the one of lower robust cost is kept. Where even that explains few of the pairs,
+ShapeFit is solved at the weights of a posterior, and kept if the directions speak for it (`reweighted`).
+Whether ShapeFit's optimum can be believed by itself is seen by how far both disagree: the standard deviation,
+over cameras, of the log ratio of their node lengths, which are medians of the lengths of a camera's pairs.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -27,8 +28,10 @@ from sfm_shapefit.refinement.angular import (
     residual_levels,
     robust_cost,
 )
+from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
+from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
@@ -55,7 +58,7 @@ class Start:
     """One convex start, and what became of it."""
 
     name: str
-    """ "ShapeFit" or "LUD"."""
+    """ "ShapeFit", "LUD" or "reweighted ShapeFit"."""
     locations: FloatArray
     """(n, d) as solved."""
     refined: AngularResult | None
@@ -76,7 +79,7 @@ class RefinedPlacement:
     locations: FloatArray
     """(n, d) centered, scaled like the solver's."""
     start: str
-    """The program they come from: "ShapeFit" or "LUD"."""
+    """The program they come from: "ShapeFit", "LUD" or "reweighted ShapeFit"."""
     is_refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -98,11 +101,20 @@ class RefinedPlacement:
     instead, and nothing says that they belong there."""
     lud: LudResult | None
     """The second start, with its own dual bound (0 where that was not computed)."""
+    posterior: FloatArray
+    """(m,) probability that each direction is right, by its residual and those of all (`consensus`)."""
+    reweighted: Reweighted | None
+    """The program at other weights that the locations come from, certified; None where another was kept."""
 
     @property
     def collapsed(self) -> bool:
         """Whether the starts disagree so much that one of them must have collapsed."""
         return self.disagreement is not None and self.disagreement > COLLAPSED
+
+    @property
+    def right(self) -> BoolArray | None:
+        """(m,) the directions that a reweighted start takes for right; None where most of all are."""
+        return None if self.reweighted is None else np.asarray(self.posterior > 0.5)
 
     def statement(self) -> str:
         """Say where the locations come from and what the refinement changed, in a sentence."""
@@ -165,6 +177,13 @@ def refine_starts(
     chosen, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
+    usual = fit_mixture(measured, chosen.best)
+    reweighted = _reweight(problem, chosen.best, usual, options)
+    if reweighted is not None:
+        chosen, reason = _start_of(reweighted), _explain(usual, reweighted)
+        if reweighted.refined is not None:
+            levels = np.minimum(levels, reweighted.refined.levels_rad)
+        costs[chosen.name] = robust_cost(graph, chosen.best, metric, levels)
     moved = _measure_moves(chosen)
     # To the bit: the certificate is that of these very locations.
     is_as_solved = chosen.locations is solved.locations and moved[1] == 0.0
@@ -180,6 +199,46 @@ def refine_starts(
         num_turned_pairs=_count_turned_pairs(problem, chosen, levels),
         reset_nodes=chosen.reset_nodes,
         lud=lud,
+        posterior=(usual if reweighted is None else reweighted.mixture).posterior,
+        reweighted=reweighted,
+    )
+
+
+def _reweight(
+    problem: _Problem, usual: FloatArray, mixture: ResidualMixture, options: PlacementOptions
+) -> Reweighted | None:
+    """Return the reweighted start where the usual answer explains few pairs and it explains them better."""
+    solver, measured = problem.normal_solver, problem.measured
+    if solver is None or measured.groups is not None or options.objective != "auto":
+        return None
+    if mixture.shares[0] >= POOR_SHARE or not has_second_start(problem.graph):
+        return None
+    if not can_be_reweighted(problem.graph):
+        return None
+
+    def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
+        return refine_angles(graph, locations, problem.metric, solver)
+
+    return solve_reweighted(measured, usual, options.solver, refine)
+
+
+def _start_of(reweighted: Reweighted) -> Start:
+    """Return the reweighted start among the others."""
+    return Start(
+        name="reweighted ShapeFit",
+        locations=reweighted.solved.locations,
+        refined=reweighted.refined,
+        reset_nodes=np.empty(0, dtype=np.int64),
+    )
+
+
+def _explain(usual: ResidualMixture, reweighted: Reweighted) -> str:
+    """Say why a reweighted start is kept, and what its certificate is of."""
+    before, after = usual.shares[0], reweighted.mixture.shares[0]
+    gap = max(reweighted.solved.gap, 0.0)
+    return (
+        f"the usual starts explain {before:.0%} of the pairs, this one {after:.0%}; "
+        f"certified to {gap:.1e} at weights that are the pairs' posteriors"
     )
 
 
