@@ -66,12 +66,14 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return the cells with each ten seeds, a larger graph, and one of 1e4 cameras."""
     n, cells = (40, list(REACH)[4:5]) if args.quick else (100, list(REACH))
     found: dict[str, Case] = {
-        f"{model} {q:g} {sigma:g}, {seeds}": partial(measure, (model, q, sigma), n, seeds, args.repeats)
+        f"{seeds} {model} {q:g} {sigma:g}": partial(measure, (model, q, sigma), n, seeds, args.repeats)
         for seeds in SEEDS
         for model, q, sigma in cells
     }
     if not args.quick:
-        found["n = 300, uniform 0.85 0"] = partial(measure, ("uniform", 0.85, 0.0), 300, "published", 2)
+        found["published uniform 0.85 0, n = 300"] = partial(
+            measure, ("uniform", 0.85, 0.0), 300, "published", 2
+        )
         found["large"] = measure_large
     return found
 
