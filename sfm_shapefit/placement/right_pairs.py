@@ -51,7 +51,7 @@ class RightPairs:
                 "too few of them hold the others"
             )
         if self.solved is None:
-            return f"{taken}; they alone are parallel rigid; the program restricted to them was not solved"
+            return f"{taken}; they alone are parallel rigid"
         gap = f"{max(self.solved.gap, 0.0):.1e}"
         if self.is_certain:
             certified = f"has one optimum, certified to {gap}: exact if their directions are"
@@ -62,7 +62,11 @@ class RightPairs:
 
 @one_blas_thread()
 def examine_right_pairs(placement: Placement, options: SolverOptions) -> RightPairs:
-    """Return the pairs that a placement of free nodes takes for right; solve the program on them alone."""
+    """Return the pairs that a placement of free nodes takes for right, and the program on them alone.
+
+    It is solved where the answer comes from other weights. Elsewhere the program of all pairs has its
+    certificate, and a second solve would take as long as the first.
+    """
     assert placement.groups is None
     edges, posterior = placement.edges, placement.refined.posterior
     right = edges[posterior > 0.5]
@@ -70,8 +74,11 @@ def examine_right_pairs(placement: Placement, options: SolverOptions) -> RightPa
     num_fixed = max((len(piece.nodes) for piece in rigid_pieces(graph)), default=0)
     solved = None
     if num_fixed == len(placement.nodes):
-        with suppress(UnsolvableError):  # directions that cancel, or a factor too large
-            solved = placement.certified if len(right) == len(edges) else solve(graph, options)
+        if len(right) == len(edges):
+            solved = placement.certified
+        elif placement.refined.reweighted is not None:
+            with suppress(UnsolvableError):  # directions that cancel, or a factor too large
+                solved = solve(graph, options)
     return RightPairs(
         edges=right,
         num_pairs=len(edges),
