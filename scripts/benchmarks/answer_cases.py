@@ -220,8 +220,8 @@ _WRONG = {
     "inspect-missing": "inspect scenes/nowhere",
     "evaluate-others": "evaluate RING scenes/rig/truth",
     "evaluate-without-reference": "evaluate RING",
-    "check-empty": "report empty",
-    "check-missing": "report scenes/nowhere",
+    "check-empty": "check empty",
+    "check-missing": "check scenes/nowhere",
     "convert-unknown": "convert RING OUT.xyz",
     "synth-options": "synth OUT --jpeg-quality 50",
 }
@@ -243,7 +243,7 @@ _OTHERS = {
     "help/version": "--version",
     **{
         f"help/{command}": f"{command} --help"
-        for command in ("locate", "map", "place", "inspect", "evaluate", "report", "convert", "synth")
+        for command in ("locate", "map", "place", "inspect", "evaluate", "convert", "synth")
     },
 }
 _CHECKED = {
@@ -361,4 +361,4 @@ def _inspect_cases(scenes: Sequence[str]) -> Iterator[Case]:
 def _check_case(scene: str, truth: str) -> Case:
     """Return the case of the referee of one model."""
     model = "sparse/0" if scene == "courtyard-broken" else _CHECKED[scene] or truth
-    return _case(f"check/{scene}", f"report scenes/{scene}/{model} --write-to OUT.html", scene)
+    return _case(f"check/{scene}", f"check scenes/{scene}/{model} --report OUT.html", scene)
