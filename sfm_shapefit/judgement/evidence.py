@@ -1,0 +1,87 @@
+"""Evidence that the fit did not use, at the levels of the image, the camera and the group.
+
+A pair agrees with where its cameras stand if its direction is off their baseline by at most a degree, or six
+times what is usual, but never more than two degrees, lest a model that is wrong throughout set the limit by
+which it is judged; and by three of its own standard deviations where these are more. It contradicts if it is
+farther off, or if most of its matches contradict the rotations, so that it has no direction at all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.judgement.left_out import WrongLens
+from sfm_shapefit.judgement.places import OtherPlace, find_other_places
+from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
+from sfm_shapefit.pairs.pair_directions import PairDirections
+
+_LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
+_OWN_SIGMAS = 3.0  # standard deviations of the pair's own direction; far points make it inexact
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PairFits:
+    """How the directions of k pairs fit where cameras stand."""
+
+    centers: FloatArray
+    """(n, 3) where cameras stand; NaN for those that are not asked."""
+    pairs: IntArray
+    """(k, 2) cameras."""
+    directions: FloatArray
+    """(k, 3) measured; NaN for pairs without one."""
+    residuals_deg: FloatArray
+    """(k,) NaN where there is no direction, or no baseline."""
+    level_deg: float
+    """Standard deviation per axis of these, by their median; NaN without any."""
+    agrees: BoolArray
+    """(k,) pairs that agree."""
+    contradicts: BoolArray
+    """(k,) pairs that contradict."""
+
+    def other_places(self) -> tuple[OtherPlace, ...]:
+        """Return the cameras for which many of the contradicting pairs agree on another place."""
+        rows = np.isfinite(self.residuals_deg)
+        return find_other_places(
+            self.centers, self.pairs[rows], self.directions[rows], self.agrees[rows], self.level_deg
+        )
+
+    def cuts(self) -> tuple[Cut, ...]:
+        """Return the groups that contradictions cut off."""
+        return find_cuts(self.pairs[self.agrees], self.pairs[self.contradicts], len(self.centers))
+
+
+def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
+    """Return how the directions of pairs fit where cameras stand, (n, 3); NaN for those that do not count."""
+    pairs = directions.pairs
+    baselines = normalized(centers[pairs[:, 0]] - centers[pairs[:, 1]])
+    known = np.isfinite(baselines).all(axis=1)
+    usable = known & np.isfinite(directions.directions).all(axis=1)
+    residuals = np.full(len(pairs), np.nan)
+    residuals[usable] = angle_between_deg(directions.directions[usable], baselines[usable])
+    level = SIGMA_PER_MEDIAN * float(np.median(residuals[usable])) if usable.any() else np.nan
+    limit = np.maximum(np.clip(_LEVELS * level, *_FAR_DEG), _OWN_SIGMAS * directions.sigma_deg())
+    against = np.zeros(len(pairs), dtype=np.bool_)
+    against[directions.contradicting()] = True
+    return PairFits(
+        centers=centers,
+        pairs=pairs,
+        directions=directions.directions,
+        residuals_deg=residuals,
+        level_deg=level,
+        agrees=usable & (residuals <= limit),
+        contradicts=(usable & (residuals > limit)) | (known & against),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModelEvidence:
+    """What speaks against a model although it fits."""
+
+    lenses: tuple[WrongLens, ...] = ()
+    """By rows of the lenses of the images."""
+    places: tuple[OtherPlace, ...] = ()
+    """By rows of the images."""
+    seams: tuple[Seam, ...] = ()
+    """By rows of the images."""

@@ -1,0 +1,81 @@
+"""Which pairs agree with where cameras stand: limits that no model can set for itself."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from tests.judgement.test_seams import EVERY, GROUP, N
+
+
+def measured(centers, *, off_deg=0.0, sigma_deg=0.01, status=None):
+    """Directions of all pairs, off by an angle each."""
+    k = len(EVERY)
+    directions = normalized(centers[EVERY[:, 0]] - centers[EVERY[:, 1]])
+    across = normalized(np.cross(directions, [0.3, 0.5, 0.8]))
+    angles = np.radians(np.broadcast_to(off_deg, k))[:, None]
+    directions = np.cos(angles) * directions + np.sin(angles) * across
+    none = np.zeros(k, dtype=int)
+    status = [DirectionStatus.USABLE] * k if status is None else status
+    known = np.array([value is DirectionStatus.USABLE for value in status])[:, None]
+    return PairDirections(
+        pairs=EVERY,
+        directions=np.where(known, directions, np.nan),
+        status=status,
+        num_matches=none,
+        num_inliers=none,
+        num_rivals=none,
+        cheirality_fraction=np.ones(k),
+        median_residual_px=np.ones(k),
+        parallax_deg=np.ones(k),
+        covariance=np.tile(np.radians(sigma_deg) ** 2 * np.eye(2), (k, 1, 1)),
+    )
+
+
+@pytest.fixture
+def centers():
+    return np.random.default_rng(1).uniform(-5.0, 5.0, (N, 3))
+
+
+@pytest.mark.parametrize(
+    ("usual_deg", "off_deg", "agrees"),
+    [(0.01, 0.9, True), (0.01, 1.1, False), (0.2, 1.5, True), (0.2, 1.9, False), (1.9, 2.1, False)],
+)
+def test_the_limit_is_six_levels_but_within_one_and_two_degrees(centers, usual_deg, off_deg, agrees):
+    angles = np.full(len(EVERY), usual_deg)
+    angles[7] = off_deg
+    fits = fit_pairs(centers, measured(centers, off_deg=angles))
+    assert fits.level_deg == pytest.approx(1.4826 * usual_deg)
+    assert fits.agrees[7] == agrees
+    assert fits.contradicts[7] != agrees
+    assert fits.agrees.sum() >= len(EVERY) - 1
+
+
+def test_a_pair_that_knows_its_direction_badly_agrees_within_three_of_its_deviations(centers):
+    fits = fit_pairs(centers, measured(centers, off_deg=4.0, sigma_deg=1.5))
+    assert fits.agrees.all()
+    assert fit_pairs(centers, measured(centers, off_deg=4.0, sigma_deg=1.0)).contradicts.all()
+
+
+def test_pairs_whose_matches_contradict_the_rotations_count_and_others_without_direction_do_not(centers):
+    status = [DirectionStatus.USABLE] * len(EVERY)
+    status[3], status[4] = DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.NO_PARALLAX
+    fits = fit_pairs(centers, measured(centers, status=status))
+    assert np.flatnonzero(fits.contradicts).tolist() == [3]
+    assert np.flatnonzero(~fits.agrees).tolist() == [3, 4]
+    centers[EVERY[3, 0]] = np.nan  # a camera that is not placed has no part
+    fits = fit_pairs(centers, measured(centers, status=status))
+    assert not (fits.agrees | fits.contradicts)[np.isin(EVERY, EVERY[3, 0]).any(axis=1)].any()
+
+
+def test_a_shifted_group_is_cut_and_a_moved_camera_has_its_other_place(centers):
+    moved = centers.copy()
+    moved[GROUP] += [0.0, 3.0, 0.0]
+    (cut,) = fit_pairs(moved, measured(centers)).cuts()
+    assert cut.cameras.tolist() == GROUP.tolist()
+    moved = centers.copy()
+    moved[5] += [0.0, 3.0, 0.0]
+    (place,) = [place for place in fit_pairs(moved, measured(centers)).other_places() if place.camera == 5]
+    assert place.place == pytest.approx(centers[5], abs=1e-6)
+    assert (place.num_here, place.num_there) == (0, N - 1)

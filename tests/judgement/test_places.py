@@ -1,0 +1,74 @@
+"""Another place for a camera, on which its rejected pairs agree."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.judgement.places import find_other_places
+
+
+def scene(*, lying=8, agreeing=10, spread_deg=0.1, coherent=True):
+    """One camera, 0, and others; the last `lying` of its pairs put it at (4, 1, 2), or anywhere."""
+    rng, n = np.random.default_rng(3), 1 + agreeing + lying
+    centers = rng.uniform(-5.0, 5.0, (n, 3))
+    elsewhere = np.array([4.0, 1.0, 2.0])
+    pairs = np.stack([np.zeros(n - 1, dtype=int), np.arange(1, n)], axis=1)
+    seen = np.tile(centers[0], (n - 1, 1))
+    seen[agreeing:] = elsewhere if coherent else rng.uniform(-5.0, 5.0, (lying, 3))
+    directions = normalized(seen - centers[1:])
+    directions = normalized(directions + np.radians(spread_deg) * rng.standard_normal(directions.shape))
+    agrees = np.arange(n - 1) < agreeing
+    return centers, pairs, directions, agrees
+
+
+def test_it_is_found_with_both_counts_whatever_the_order_of_a_pair():
+    centers, pairs, directions, agrees = scene()
+    for turned in (False, True):
+        if turned:
+            pairs, directions = pairs[:, ::-1], -directions
+        (found,) = find_other_places(centers, pairs, directions, agrees, 0.1)
+        assert (found.camera, found.num_here, found.num_there) == (0, 10, 8)
+        assert found.place == pytest.approx([4.0, 1.0, 2.0], abs=0.1)
+
+
+def test_wrong_pairs_that_agree_on_nothing_are_no_other_place():
+    assert find_other_places(*scene(coherent=False), 0.1) == ()
+
+
+def test_few_pairs_are_none_and_nor_is_one_that_more_than_twice_as_many_contradict():
+    assert find_other_places(*scene(lying=2, agreeing=2), 0.1) == ()
+    assert find_other_places(*scene(lying=4, agreeing=9), 0.1) == ()
+    assert len(find_other_places(*scene(lying=5, agreeing=9), 0.1)) == 1
+
+
+def test_a_place_nearby_is_the_same_however_exactly_pairs_tell_it():
+    centers, pairs, _, agrees = scene(lying=12)
+    centers[1:11] = centers[0] + 0.2 * normalized(centers[1:11] - centers[0])  # 8 degrees
+    seen = np.where(agrees[:, None], centers[0], centers[0] + [0.03, 0.0, 0.0])
+    assert find_other_places(centers, pairs, normalized(seen - centers[1:]), agrees, 0.01) == ()
+    seen = np.where(agrees[:, None], centers[0], centers[0] + [1.0, 0.0, 0.0])
+    assert len(find_other_places(centers, pairs, normalized(seen - centers[1:]), agrees, 0.01)) == 1
+
+
+def test_loose_directions_tell_none_and_nor_do_rays_that_meet_behind():
+    assert find_other_places(*scene(), 1.1) == ()
+    centers, pairs, directions, agrees = scene()
+    directions[~agrees] *= -1.0
+    assert find_other_places(centers, pairs, directions, agrees, 0.1) == ()
+
+
+def test_a_camera_on_a_line_that_may_stand_anywhere_on_it_has_no_other_place():
+    n = 8
+    centers = np.zeros((n, 3))
+    centers[:, 0] = np.arange(n)
+    centers[5:] = [[0.0, 2.0, 0.0], [0.0, 0.0, 2.0], [2.0, 2.0, 1.0]]
+    pairs = np.stack([np.zeros(n - 1, dtype=int), np.arange(1, n)], axis=1)
+    seen = np.where(np.arange(1, n)[:, None] < 5, centers[0], [-3.0, 0.0, 0.0])
+    agrees = np.arange(1, n) < 5
+    assert find_other_places(centers, pairs, normalized(seen - centers[1:]), agrees, 0.1) == ()
+
+
+def test_cameras_without_a_place_are_not_asked():
+    centers, pairs, directions, agrees = scene()
+    centers[0] = np.nan
+    assert find_other_places(centers, pairs, directions, agrees, 0.1) == ()
