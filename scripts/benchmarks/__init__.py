@@ -23,4 +23,5 @@ INDEX = {
     "start": "The first run of each command in a fresh environment, as a clone and from the wheel.",
     "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
     "uncertainty": "Errors of delivered cameras over their standard deviations.",
+    "verdict": "Spoiled models: called good, named rightly; sound ones: doubted.",
 }

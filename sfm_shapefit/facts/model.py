@@ -17,6 +17,7 @@ from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
+from sfm_shapefit.facts.evidence import ToldEvidence
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.placed import (
@@ -194,6 +195,7 @@ class FactsOfModel(Facts):
         float | None, "Mean reprojection error of these points; null if there are none."
     ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+    evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
     @property
     def points_statement(self) -> str:

@@ -1,7 +1,7 @@
 """Results of `locate` and `place`: the answer with the evidence for it."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
+from sfm_shapefit.facts.evidence import ToldEvidence, tell_evidence
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
 from sfm_shapefit.facts.joins import JoinFacts
 from sfm_shapefit.facts.model import (
@@ -45,8 +46,9 @@ from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, tab
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
-from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model
+from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -159,6 +161,8 @@ class LocateResult(Displayed):
     """Share of the same keypoints that sees none, and most of whose matches miss the epipolar lines."""
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
+    evidence: ModelEvidence = field(default_factory=ModelEvidence)
+    """What speaks against it although it fits, by images of it."""
 
     intrinsics: RefinedIntrinsics
     """What became of the lenses that were in doubt."""
@@ -206,6 +210,7 @@ class LocateResult(Displayed):
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(self.placed)),
+            evidence=self.told_evidence,
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
@@ -231,6 +236,11 @@ class LocateResult(Displayed):
         return table_of(self, name, 3)
 
     @property
+    def told_evidence(self) -> ToldEvidence:
+        """What speaks against it although it fits, by name."""
+        return tell_evidence(self.evidence, self.placed, self.gauge.similarity.scale, self.gauge.axes)
+
+    @property
     def delivered(self) -> Delivered:
         """The certified and the delivered solution, and how far apart they are."""
         return Delivered.compare(self.placement, self._centers, adjusted=self.adjusted is not None)
@@ -243,12 +253,14 @@ class LocateResult(Displayed):
             self.contradicting_observations,
             self.agreeing_pairs,
             float(np.mean(self.kept)),
+            float(np.mean(self.placed.is_posed)),
         )
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
         lenses = (f"the matches of camera {d.camera} prefer another focal length" for d in self.focal_doubts)
         repeats = tuple(match_warnings(self.directions))[:1]
         names = [self.images.names[camera] for camera in outside]
-        return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions))
+        against = weigh_evidence(self.evidence, self.placed)
+        return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions), against)
 
     @property
     def certified(self) -> SolverResult:

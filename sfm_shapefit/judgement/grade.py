@@ -6,15 +6,18 @@ Do not use, if any of these holds:
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than a quarter of the pairs that say anything of a direction agree
-    fewer than half of the cameras that were placed are in the output
+    fewer than half of the cameras that were placed are in the output, or of all images
+    more than a tenth of the cameras stand apart from the rest (`seams`)
+    evidence that the fit did not use speaks against more than a third of them (`evidence`)
 
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
-placed but are not in the output, and that are kept though their matches make no points. Look also, though no
-camera can be named, if
+placed but are not in the output, that are kept though their matches make no points, or that evidence which
+the fit did not use names: another place, a seam, a wrong lens. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
-    the matches of a camera prefer another focal length than the given one
+    images, left out one by one, or the matches of pairs contradict the focal length of a lens
+    fewer than 95 % of the images are placed
     fewer than three quarters of the observations see a 3D point
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
@@ -32,10 +35,12 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
+from sfm_shapefit.scene.images import Images
 
 UNCERTAIN_SHARE = 0.05
 """Share of the extent of all; a larger standard deviation of a camera counts as large."""
@@ -44,6 +49,9 @@ MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model i
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 LEAST_PAIRS = 0.25  # share of agreeing pairs; below, the model is not to be used
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
+_LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
+_MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
+_MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
 _LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
@@ -89,6 +97,41 @@ class Shares(NamedTuple):
     contradicting: float
     pairs: float
     kept: float
+    placed: float = np.nan
+
+
+class Against(NamedTuple):
+    """What evidence that the fit did not use says against a model."""
+
+    cameras: tuple[str, ...]
+    """Names of cameras to be looked at."""
+    suspicions: tuple[str, ...]
+    """A clause each, if it is to be looked at."""
+    reasons: tuple[str, ...]
+    """A clause each, if it is not to be used."""
+
+
+NOTHING_AGAINST = Against((), (), ())
+
+
+def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
+    """Return what evidence says against a model of some images; the others are not posed."""
+    apart = [camera for seam in evidence.seams for camera in seam.cameras.tolist()]
+    alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
+    lenses = [wrong.lens for wrong in evidence.lenses]
+    through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
+    named = dict.fromkeys([*apart, *(place.camera for place in evidence.places), *through.tolist()])
+    count = int(images.is_posed.sum())
+    suspicions: list[str] = []
+    reasons: list[str] = []
+    if apart:
+        clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
+        (reasons if len(apart) > _MOST_APART * count else suspicions).append(clause)
+    if len(named) > _MOST_NAMED * count:
+        reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
+    if lenses:
+        suspicions.append(f"images contradict {counted(len(lenses), 'focal length')}")
+    return Against(tuple(images.names[camera] for camera in named), tuple(suspicions), tuple(reasons))
 
 
 def judge_graph(placement: Judged) -> ModelVerdict:
@@ -98,7 +141,11 @@ def judge_graph(placement: Judged) -> ModelVerdict:
 
 
 def judge_model(
-    placement: Judged, shares: Shares, outside: Sequence[str] = (), suspicions: Sequence[str] = ()
+    placement: Judged,
+    shares: Shares,
+    outside: Sequence[str] = (),
+    suspicions: Sequence[str] = (),
+    against: Against = NOTHING_AGAINST,
 ) -> ModelVerdict:
     """Apply the rules of the module's header.
 
@@ -107,8 +154,9 @@ def judge_model(
         shares: how much agrees.
         outside: names of cameras that are not in the output, or that no point supports.
         suspicions: what else speaks against the model, a clause each.
+        against: what evidence that the fit did not use says.
     """
-    bad = tuple(_reasons_against(placement, shares))
+    bad = (*_reasons_against(placement, shares), *against.reasons)
     trust, cameras = placement.assessment.trust, placement.cameras
     doubtful = trust < _LOW_TRUST
     doubtful[uncertain_cameras(placement)] = True
@@ -116,12 +164,14 @@ def judge_model(
         doubtful[group.cameras] = True
     rows = np.flatnonzero(doubtful)
     names = [placement.graph.name_of(int(cameras[k])) for k in rows[np.argsort(trust[rows], kind="stable")]]
-    named = tuple(dict.fromkeys([*outside, *names]))
-    unnamed = list(suspicions)
+    named = tuple(dict.fromkeys([*outside, *against.cameras, *names]))
+    unnamed = [*suspicions, *against.suspicions]
     if placement.second_configuration is not None:
         unnamed.append("many rejected pairs agree on a second configuration")
     if shares.observations < _FEW_OBSERVATIONS:
         unnamed.append(f"only {shares.observations:.0%} of the observations see a 3D point")
+    if shares.placed < _FEW_PLACED:
+        unnamed.append(f"only {shares.placed:.0%} of the images are placed")
     reasons = bad or tuple(unnamed)
     grade = Grade.DO_NOT_USE if bad else Grade.LOOK if named or unnamed else Grade.GOOD
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
@@ -138,6 +188,8 @@ def _reasons_against(placement: Judged, shares: Shares) -> Iterator[str]:
         yield f"only {shares.pairs:.0%} of the pairs agree"
     if shares.kept < _LEAST_KEPT:
         yield f"only {shares.kept:.0%} of the placed cameras are trusted"
+    if shares.placed < _LEAST_PLACED:
+        yield f"only {shares.placed:.0%} of the images are placed"
 
 
 def uncertain_cameras(placement: Judged) -> IntArray:

@@ -41,8 +41,8 @@ class OtherPlace(NamedTuple):
     """Pairs that agree with where it is, and not with the other place."""
     num_there: int
     """Rejected pairs that agree on the other place."""
-    place: FloatArray
-    """(3,) the other place."""
+    offset: FloatArray
+    """(3,) the other place minus this one."""
 
 
 def find_other_places(
@@ -77,7 +77,7 @@ def find_other_places(
         is_other = there >= max(_FEWEST_PAIRS, _LEAST_SHARE * (agreeing - shared))
         is_other &= shared <= _MOST_SHARED * agreeing
         if is_other and np.linalg.norm(place - centers[camera]) > least:
-            found.append(OtherPlace(int(camera), agreeing - shared, there, place))
+            found.append(OtherPlace(int(camera), agreeing - shared, there, place - centers[camera]))
     return tuple(found)
 
 

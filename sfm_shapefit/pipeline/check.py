@@ -37,17 +37,27 @@ from sfm_shapefit import __version__
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.grade import LEAST_PAIRS, MOST_LEVEL_DEG, Grade, ModelVerdict
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.grade import (
+    LEAST_PAIRS,
+    MOST_LEVEL_DEG,
+    Against,
+    Grade,
+    ModelVerdict,
+    weigh_evidence,
+)
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -141,9 +151,11 @@ def check_source(
     quality, directions = _measure(model, matches, options, clock)
     pairs, level_deg = _judge_pairs(model.images, directions)
     cameras = _judge_cameras(model, quality, pairs)
-    verdict = _grade(model, cameras, pairs, level_deg)
+    evidence = _question(model, matches, directions, clock)
+    verdict = _grade(model, cameras, pairs, level_deg, weigh_evidence(evidence, model.images))
+    told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
-    facts |= {"timings_s": clock.seconds}
+    facts |= {"timings_s": clock.seconds, "evidence": told, "warnings": told.statements}
     return CheckResult(
         model=model, cameras=cameras, pairs=pairs, quality=quality, facts=CheckedFacts(**facts)
     )
@@ -162,6 +174,19 @@ def _measure(
             return quality, measure(matches, options, clock).directions
         except UnsolvableError:
             return quality, None
+
+
+def _question(
+    model: ColmapModel, matches: MatchSource, directions: PairDirections | None, clock: Clock
+) -> ModelEvidence:
+    """Return the evidence against a model that its fit did not use."""
+    images, evidence = model.images, ModelEvidence()
+    with clock("evidence"):
+        if directions is not None:
+            evidence = question_pairs(matches, directions, images.centers, clock.threads)
+        points = points_of(model.reconstruction, images)
+        pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
+        return gather_evidence(images, points, pictures, evidence, clock.threads)
 
 
 def _judge_pairs(images: Images, directions: PairDirections | None) -> tuple[list[PairRow], float]:
@@ -242,15 +267,17 @@ def _weaknesses(quality: ImageQuality, k: int, usual: _Usual, pairs: tuple[int, 
 
 
 def _grade(
-    model: ColmapModel, cameras: list[CameraRow], pairs: list[PairRow], level_deg: float
+    model: ColmapModel, cameras: list[CameraRow], pairs: list[PairRow], level_deg: float, against: Against
 ) -> ModelVerdict:
     """Return the verdict on a model as it stands."""
-    weak = tuple(row.name for row in cameras if row.placed and row.reason)
-    if bad := tuple(_reasons_against(model.images, pairs, level_deg)):
-        return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=weak, reasons=bad)
+    weak = (row.name for row in cameras if row.placed and row.reason)
+    named = tuple(dict.fromkeys([*against.cameras, *weak]))
+    if bad := (*_reasons_against(model.images, pairs, level_deg), *against.reasons):
+        return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
     pointless = model.reconstruction.num_points3D() == 0
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
-    return ModelVerdict(grade=Grade.LOOK if weak or reasons else Grade.GOOD, cameras=weak, reasons=reasons)
+    reasons = (*reasons, *against.suspicions)
+    return ModelVerdict(grade=Grade.LOOK if named or reasons else Grade.GOOD, cameras=named, reasons=reasons)
 
 
 def _reasons_against(images: Images, pairs: list[PairRow], level_deg: float) -> Iterator[str]:
@@ -291,7 +318,6 @@ def _tell(
         "scale": "input: those of the model",
         "pieces": [],
         "loose_groups": [],
-        "warnings": [],
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
     }
 

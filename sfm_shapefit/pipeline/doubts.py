@@ -87,6 +87,16 @@ def _poses_as_given(images: Images, directions: PairDirections, rows: IntArray) 
     return LikelyPoses(images.rotations[j] @ images.rotations[i].transpose(0, 2, 1), translations)
 
 
+def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
+    """Return the relative rotations that the matches of some pairs (k, 2) have by themselves."""
+    wanted, parts = set(map(tuple, pairs.tolist())), []
+    for batch in source.view.batches():
+        rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
+        rays = _thin(source.images, batch, rows, _MOST_MATCHES)
+        parts.append(estimate_relative_rotations(rays, threads, num_pairs=len(wanted)))
+    return concatenate_rotations(parts)
+
+
 def doubt_cameras(
     placement: Judged,
     directions: PairDirections,

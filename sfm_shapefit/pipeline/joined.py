@@ -99,6 +99,7 @@ def tell_group(
         inputs=inputs.facts,
         options=flat_values(located.options) | {"known_distance": tuple(known)},
         verdict=_judge(seen.verdict, group, models),
+        evidence=seen.evidence,
         models=[str(number) for number in group.world_from],
         joins=[join.facts(f"joined_{first}") for join in group.joins],
         num_images=len(cameras),
@@ -117,7 +118,7 @@ def tell_group(
         pieces=[],
         loose_groups=[],
         timings_s=own.seconds,
-        warnings=[gauge.warning] if gauge.warning else [],
+        warnings=[*seen.warnings, *filter(None, [gauge.warning])],
         versions=seen.versions,
     )
     return JoinedModel(

@@ -23,6 +23,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -36,7 +37,9 @@ from sfm_shapefit.facts.warnings import (
     support_warnings,
     trust_warnings,
 )
+from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.adjustment import (
     adjust_placed,
@@ -46,6 +49,7 @@ from sfm_shapefit.pipeline.adjustment import (
 )
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
+from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, GaugeRule
 from sfm_shapefit.pipeline.given import Given
@@ -61,7 +65,7 @@ from sfm_shapefit.pipeline.measure import (
 )
 from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
 from sfm_shapefit.pipeline.rigs import place_cameras
-from sfm_shapefit.pipeline.seed import seed_points, select_trusted
+from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
 from sfm_shapefit.placement.options import Scale
@@ -144,11 +148,21 @@ def finish_piece(
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
         intrinsics = intrinsics.after(seeded.adjusted, before.lenses_of(seeded.adjusted.images))
     sensors = _refined_sensors(stand, first, seeded.adjusted)
-    focal_doubts = tuple(one for one in focal_doubts if np.isnan(intrinsics.focal_sigmas[one.camera]))
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     images, source, directions = seeded.images, stand.source, stand.directions
     unsupported = [images.names[k] for k in np.flatnonzero(seeded.unsupported).tolist()]
     centers = images.centers
+    kept &= images.is_posed[judged.cameras]
+    with clock("trust"):
+        evidence = _question(stand, kept, seeded, clock)
+    told = tell_evidence(evidence, images, gauge.similarity.scale, gauge.axes)
+    # What adjustments or points say of a lens is known better than by the matches of pairs.
+    named = {wrong.lens for wrong in evidence.lenses}
+    focal_doubts = tuple(
+        one
+        for one in focal_doubts
+        if np.isnan(intrinsics.focal_sigmas[one.camera]) and one.camera not in named
+    )
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
@@ -166,7 +180,7 @@ def finish_piece(
         image_names=given.template.image_names,
         directions=directions,
         placement=judged,
-        kept=kept & images.is_posed[judged.cameras],
+        kept=kept,
         num_seen=seeded.num_seen,
         unsupported=seeded.unsupported,
         agreeing_observations=seeded.observations.agreeing,
@@ -177,6 +191,7 @@ def finish_piece(
         turned_deg=turned,
         timings_s=clock.seconds,
         warnings=(
+            *told.statements,
             *focal_warnings(source.images.lenses, focal_doubts, intrinsics.undetermined),
             *intrinsics_warnings(intrinsics.rows(images)),
             *_collect_warnings(stand, judged, kept, seeded.points.num_points),
@@ -189,6 +204,7 @@ def finish_piece(
         distances=given.distances,
         prior_angles=prior_angles,
         focal_doubts=tuple(one._replace(camera=images.lenses[one.camera].id) for one in focal_doubts),
+        evidence=evidence,
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
         control_points=brought.control_points,
@@ -238,6 +254,16 @@ def _choose(stand: Stand, judged: Judged, min_trust: float) -> tuple[BoolArray, 
         kept |= stand.given.rigid.fixed[judged.cameras]
         gauge = stand.given.rule.choose(judged.cameras[kept], judged.locations[kept], judged.unit)
     return kept, stand._replace(placement=judged, gauge=gauge)
+
+
+def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> ModelEvidence:
+    """Return the evidence against a piece that its fit did not use."""
+    placement, source = stand.placement, stand.source
+    centers = np.full((source.images.num_images, 3), np.nan)
+    centers[placement.cameras[kept]] = placement.locations[kept]
+    pairs = question_pairs(source, stand.directions, centers, clock.threads)
+    pictures = ModelPictures(seeded.images, source.view.keypoints)
+    return gather_evidence(seeded.images, seeded.points, pictures, pairs, clock.threads)
 
 
 def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estimate | None) -> FloatArray:

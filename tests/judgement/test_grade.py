@@ -7,7 +7,11 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import synthetic
-from sfm_shapefit.judgement.grade import Grade, judge_graph
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
+from sfm_shapefit.judgement.left_out import WrongLens
+from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from tests.program import run
@@ -121,3 +125,48 @@ def test_strict_ends_with_code_4_where_the_verdict_is_do_not_use_and_writes_the_
     run("place", graph, tmp_path / "strict", "--no-report", "--strict", code=4)
     assert (tmp_path / "strict" / "locate.json").exists()
     run("place", BUNDLED / "graph40.txt", tmp_path / "sound", "--no-report", "--strict", code=0)
+
+
+def seam_of(cameras):
+    return Seam(np.array(cameras), 0, 9, 0, float("nan"))
+
+
+def place_of(camera):
+    return OtherPlace(camera, 5, 6, np.ones(3))
+
+
+def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(found):
+    names = found.images.names
+    verdict = altered(found, evidence=ModelEvidence(places=(place_of(3),))).verdict
+    assert (verdict.grade, verdict.cameras) == (Grade.LOOK, (names[3],))
+
+    lens = WrongLens(0, 1.2, 0.01, 8, 20.0)
+    verdict = altered(found, evidence=ModelEvidence(lenses=(lens,))).verdict
+    assert (verdict.grade, verdict.cameras) == (Grade.LOOK, ())  # a lens of all images names none of them
+    assert verdict.reasons == ("images contradict 1 focal length",)
+
+    verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
+    assert (verdict.grade, verdict.cameras) == (Grade.DO_NOT_USE, (names[1], names[2]))
+    assert verdict.reasons == ("2 of 8 cameras stand apart from the rest",)
+
+
+def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is_looked_at(found):
+    few = ModelEvidence(places=(place_of(3), place_of(4)))
+    many = ModelEvidence(places=(place_of(2), place_of(3), place_of(4)))
+    assert altered(found, evidence=few).verdict.grade is Grade.LOOK
+    verdict = altered(found, evidence=many).verdict
+    assert verdict.grade is Grade.DO_NOT_USE
+    assert verdict.reasons == ("evidence speaks against 3 of 8 cameras",)
+    images = replace(found.placed, lens_of=np.zeros(8, dtype=int))
+    large = images.part(np.zeros(0, dtype=int))
+    assert weigh_evidence(ModelEvidence(), large) == NOTHING_AGAINST
+    against = weigh_evidence(few, images)
+    assert (against.suspicions, against.reasons) == ((), ())
+
+
+def test_images_that_are_not_placed_are_told_and_count(found):
+    gone = np.arange(8) < 1
+    verdict = altered(found, placed=found.placed.without(gone)).verdict
+    assert (verdict.grade, verdict.reasons) == (Grade.LOOK, ("only 88% of the images are placed",))
+    verdict = altered(found, placed=found.placed.without(np.arange(8) < 5)).verdict
+    assert (verdict.grade, verdict.reasons) == (Grade.DO_NOT_USE, ("only 38% of the images are placed",))

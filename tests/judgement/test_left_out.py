@@ -119,7 +119,7 @@ def test_own_rays_have_no_part_in_the_points_of_an_image():
     scene = Scene(noise_px=0.0, turned=5)
     found = scene.left_out()
     assert found.log_factors[5] == pytest.approx(0.0, abs=1e-6)
-    assert found.noise_px[5] < 0.01
+    assert found.noise_px[5] <= 0.01  # the least that is assumed
     assert found.noise_px[4] > 0.1  # which sees points that the turned image has a part in
 
 

@@ -77,5 +77,5 @@ def test_a_shifted_group_is_cut_and_a_moved_camera_has_its_other_place(centers):
     moved = centers.copy()
     moved[5] += [0.0, 3.0, 0.0]
     (place,) = [place for place in fit_pairs(moved, measured(centers)).other_places() if place.camera == 5]
-    assert place.place == pytest.approx(centers[5], abs=1e-6)
+    assert place.offset == pytest.approx([0.0, -3.0, 0.0], abs=1e-6)
     assert (place.num_here, place.num_there) == (0, N - 1)

@@ -1,0 +1,242 @@
+"""Verdicts: is a wrong model called good, is what is wrong named, and is a right one doubted?
+
+Models of known truth are spoiled: a third of the cameras, those farthest along one axis, with the points that
+mostly they see, shifted, scaled or turned as a whole; one camera moved or turned; all focal lengths wrong,
+then bundle adjusted. They are judged as models of any program (`check`). And one image gets a wrong lens
+of its own, of which `locate` is not told. Every model is judged unspoiled, too.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.record import Row, at_least, at_most, table
+from harness.scenes import temporary_scene
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+
+BUNDLED = ROOT / "data_synthetic"
+REAL = ("fountain-P11", "Herz-Jesus-P25", "castle-P30")
+DRAWN = {
+    "drawn ring": {"shape": "ring", "num_images": 24, "num_points": 1500},
+    "drawn courtyard": {"shape": "courtyard", "num_images": 24, "num_points": 1500},
+}
+GROUPS = ("shifted 5 %", "shifted 20 %", "scaled 1.1", "turned 3 deg", "turned 10 deg", "turned 90 deg")
+SINGLES = ("one moved 5 %", "one turned 3 deg")
+ALL_LENSES = ("lenses x 0.8", "lenses x 1.1", "lenses x 1.3")
+ONE_LENS = (0.67, 0.77, 0.91, 1.1, 1.3)
+"""Factors on the focal length of one image."""
+MOST_OTHERS = 0.1
+"""Share of others among what is named, beside a group."""
+
+
+class Scene(NamedTuple):
+    """A model of known truth, and where its matches are."""
+
+    model: Path
+    database: Path | None
+
+
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return a case per scene."""
+    bundled = {
+        "courtyard": Scene(BUNDLED / "courtyard" / "truth", BUNDLED / "courtyard" / "database.db"),
+        "photographed": Scene(BUNDLED / "photographed" / "truth", BUNDLED / "photographed" / "database.db"),
+        "ring8": Scene(BUNDLED / "ring8" / "sparse" / "0", BUNDLED / "ring8" / "database.db"),
+    }
+    if args.quick:
+        return {"ring8": partial(judge_scene, "ring8", bundled["ring8"])}
+    found: dict[str, Case] = {name: partial(judge_scene, name, scene) for name, scene in bundled.items()}
+    found |= {name: partial(judge_drawn, name) for name in DRAWN}
+    for name in REAL:
+        scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
+        found[name] = partial(judge_scene, name, scene) if scene.model.is_dir() else NOT_FOUND
+    return found
+
+
+def judge_drawn(name: str) -> list[Row]:
+    """Judge a drawn scene, an eighth of whose pairs is wrong."""
+    options = {**DRAWN[name], "seed": 5, "corrupted_pair_fraction": 0.12}
+    with temporary_scene(options) as (_, folder):
+        model = next(folder.rglob("truth"), folder / "sparse" / "0")
+        return judge_scene(name, Scene(model, folder / "database.db"))
+
+
+def judge_scene(name: str, scene: Scene) -> list[Row]:
+    """Return a row for each way in which a scene is spoiled."""
+    truth = pycolmap.Reconstruction(scene.model)
+    rows = [tell(name, "nothing", look(truth, scene), set())]
+    for how in (*GROUPS, *SINGLES, *ALL_LENSES):
+        spoiled, wrong = spoil(truth, how)
+        rows.append(tell(name, how, look(spoiled, scene), wrong))
+    rows.append(tell(name, "nothing, locate", locate(truth, scene), set()))
+    for factor in ONE_LENS:
+        spoiled, wrong = spoil_one_lens(truth, factor)
+        rows.append(tell(name, f"one lens x {factor:g}", locate(spoiled, scene), wrong))
+    return rows
+
+
+def look(model: pycolmap.Reconstruction, scene: Scene) -> ModelVerdict:
+    """Return the verdict on a model as it stands."""
+    return sfm_shapefit.check(model, scene.database).verdict
+
+
+def locate(model: pycolmap.Reconstruction, scene: Scene) -> ModelVerdict:
+    """Return the verdict of `locate` on its own model, made of the rotations of another."""
+    return sfm_shapefit.locate(model, scene.database).verdict
+
+
+def tell(scene: str, how: str, verdict: ModelVerdict, wrong: set[str]) -> Row:
+    """Return the row of a verdict; all cameras are wrong where none is named as such."""
+    named = set(verdict.cameras)
+    is_spoiled = not how.startswith("nothing")
+    is_group = len(wrong) > 1
+    right = wrong <= named if not is_group else len(named & wrong) >= 0.9 * len(wrong)
+    right = right and len(named - wrong) <= MOST_OTHERS * max(len(wrong), 1 if is_group else 10)
+    good = verdict.grade is Grade.GOOD
+    cells = {
+        "scene": scene,
+        "spoiled": how,
+        "verdict": verdict.grade.value,
+        "named": f"{len(named & wrong)} of {len(wrong)}, {len(named - wrong)} others"
+        if wrong
+        else len(named),
+        "good": int(good),
+        "rightly": int(right) if wrong else "",
+    }
+    checks = at_most(good=(int(good), 0 if is_spoiled else None))
+    checks += at_least(good=(int(good), None if is_spoiled else 1))
+    return Row(cells, checks)
+
+
+def spoil(truth: pycolmap.Reconstruction, how: str) -> tuple[pycolmap.Reconstruction, set[str]]:
+    """Return a spoiled copy, and the names of the cameras that are wrong; none where all are."""
+    model = pycolmap.Reconstruction(truth)
+    if how in ALL_LENSES:
+        return adjusted(with_focal_lengths(model, float(how.rsplit(maxsplit=1)[-1]))), set()
+    chosen, amount = choose(model, 1 if how in SINGLES else len(model.reg_image_ids()) // 3), how.split()
+    centers = np.array([image.projection_center() for image in chosen])
+    every = np.array([model.image(i).projection_center() for i in model.reg_image_ids()])
+    axis = np.random.default_rng(len(every)).standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    scale, turn, shift = 1.0, np.eye(3), np.zeros(3)
+    if "turned" in amount:
+        turn = Rotation.from_rotvec(np.radians(float(amount[-2])) * axis).as_matrix()
+    elif "scaled" in amount:
+        scale = float(amount[-1])
+    else:
+        shift = 0.01 * float(amount[-2]) * np.linalg.norm(np.ptp(every, axis=0)) * axis
+    about = centers.mean(axis=0)
+    moved = pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), about + shift - scale * turn @ about)
+    move(model, chosen, moved, with_points=how in GROUPS)
+    return model, {image.name for image in chosen}
+
+
+def choose(model: pycolmap.Reconstruction, count: int) -> list[pycolmap.Image]:
+    """Return so many images, those farthest along the first axis of the centers; one from the middle."""
+    images = [model.image(i) for i in sorted(model.reg_image_ids())]
+    centers = np.array([image.projection_center() for image in images])
+    along = (centers - centers.mean(axis=0)) @ np.linalg.svd(centers - centers.mean(axis=0))[2][0]
+    order = np.argsort(along)
+    return [images[k] for k in (order[len(order) // 2 :][:1] if count == 1 else order[:count])]
+
+
+def move(
+    model: pycolmap.Reconstruction,
+    chosen: Sequence[pycolmap.Image],
+    moved: pycolmap.Sim3d,
+    *,
+    with_points: bool,
+) -> None:
+    """Move cameras by a similarity, and the points that mostly they see, if asked for."""
+    own = {image.image_id for image in chosen}
+    for image in chosen:
+        pose = image.frame.rig_from_world
+        turn = pose.rotation * moved.rotation.inverse()
+        image.frame.rig_from_world = pycolmap.Rigid3d(turn, -(turn * (moved * image.projection_center())))
+    for point in model.points3D.values() if with_points else ():
+        seen = [element.image_id in own for element in point.track.elements]
+        if np.mean(seen) > 0.5:
+            point.xyz = moved * point.xyz
+
+
+def with_focal_lengths(
+    model: pycolmap.Reconstruction, factor: float, cameras: Sequence[int] | None = None
+) -> pycolmap.Reconstruction:
+    """Multiply the focal lengths of cameras, all if None; return the same model."""
+    for camera_id in model.cameras if cameras is None else cameras:
+        camera = model.camera(camera_id)
+        params = camera.params.copy()
+        params[camera.focal_length_idxs()] *= factor
+        camera.params = params
+    return model
+
+
+def adjusted(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Adjust a model with its lenses held, without the observations that miss; return the same model."""
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+    for _ in range(3):
+        pycolmap.bundle_adjustment(model, options)
+        pycolmap.ObservationManager(model).filter_all_points3D(4.0, 1.0)
+    return model
+
+
+def spoil_one_lens(truth: pycolmap.Reconstruction, factor: float) -> tuple[pycolmap.Reconstruction, set[str]]:
+    """Return a copy where each image has a lens of its own, that of one wrong by a factor, and its name."""
+    model = pycolmap.Reconstruction()
+    wrong = choose(truth, 1)[0].name
+    for image_id in sorted(truth.reg_image_ids()):
+        image = truth.image(image_id)
+        given = truth.camera(image.camera_id)
+        camera = pycolmap.Camera(
+            model=given.model, width=given.width, height=given.height, params=given.params, camera_id=image_id
+        )
+        model.add_camera_with_trivial_rig(camera)
+        copy = pycolmap.Image(name=image.name, camera_id=image_id, image_id=image_id)
+        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(p.xy) for p in image.points2D])
+        model.add_image_with_trivial_frame(copy, image.cam_from_world())
+    chosen = [i for i in model.images if model.image(i).name == wrong]
+    return with_focal_lengths(model, factor, chosen), {wrong}
+
+
+def summarize(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the counts over all scenes by family."""
+    families: Mapping[str, Callable[[str], bool]] = {
+        "unspoiled": lambda how: how.startswith("nothing"),
+        "groups": GROUPS.__contains__,
+        "one camera": SINGLES.__contains__,
+        "all lenses, adjusted": ALL_LENSES.__contains__,
+        "one lens, locate": lambda how: how.startswith("one lens"),
+    }
+    lines = []
+    for family, belongs in families.items():
+        own = [row for row in rows if belongs(row["spoiled"])]
+        verdicts = [row["verdict"] for row in own]
+        rightly = [row["rightly"] for row in own if row["rightly"] != ""]
+        counts = [verdicts.count(grade.value) for grade in Grade]
+        lines.append([family, len(own), *counts, f"{sum(rightly)} of {len(rightly)}" if rightly else ""])
+    yield "## Over all scenes"
+    yield table(["family", "models", *(grade.value for grade in Grade), "named rightly"], lines)
+
+
+BENCHMARK = Benchmark(
+    name="verdict",
+    title="Verdicts",
+    cases=cases,
+    closing=summarize,
+    threads=2,
+    columns={
+        "spoiled": "what was done to the model; `nothing, locate` and `one lens` are placed by `locate`",
+        "named": "cameras that the verdict names, of those that are wrong; else all that it names",
+        "good": "1 if the model is called good",
+        "rightly": "1 if nine tenths of what is wrong is named, and hardly anything else",
+    },
+)

@@ -1,0 +1,133 @@
+"""What evidence that the fit did not use says against a model: lenses, places and seams, by name."""
+
+from typing import Annotated
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.record import Record
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.left_out import WrongLens
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
+
+
+class ContradictedLens(Record):
+    """A lens whose images, left out one by one, ask for another focal length."""
+
+    camera: Annotated[int, "Its id in the model."]
+    num_images: Annotated[int, "Images that were asked."]
+    focal_px: Annotated[float, "Mean focal length of the model."]
+    asked_focal_px: Annotated[float, "Focal length that its images ask for, the median one."]
+    asked_sigma_px: Annotated[
+        float, "Standard deviation of it: by the noise for one image or two, by the scatter over more."
+    ]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        asked = f"{self.asked_focal_px:,.0f} +- {self.asked_sigma_px:,.0f} px"
+        who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
+        return (
+            f"the focal length of camera {self.camera} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
+            "px, by the points that the others make; its images stand wrong by that: --intrinsics focal lets "
+            "it change, or calibrate that camera"
+        )
+
+
+class AmbiguousPlace(Record):
+    """A camera that two sets of pairs put at two places."""
+
+    image: Annotated[str, "Its name."]
+    num_here: Annotated[int, "Pairs that put it where it is."]
+    num_there: Annotated[int, "Pairs that agree on the other place."]
+    offset: Annotated[tuple[float, ...], "The other place minus this one, in axes and units of the output."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        return (
+            f"{counted(self.num_here, 'pair')} put {self.image} where it is, {self.num_there} put it "
+            f"{np.linalg.norm(self.offset):.3g} away: the scene repeats itself, or one of the sets is wrong"
+        )
+
+
+class GroupApart(Record):
+    """A group of cameras that agree with one another, and stand apart from the rest."""
+
+    images: Annotated[tuple[str, ...], "Names of its members."]
+    num_agreeing: Annotated[int, "Pairs between it and the rest that agree."]
+    num_contradicting: Annotated[int, "Pairs between it and the rest that contradict."]
+    num_turned: Annotated[int, "Contradicting pairs that agree on one turn of the group."]
+    turn_deg: Annotated[float | None, "Angle of that turn; null without any."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        turn = f"; {self.num_turned} agree on a turn by {self.turn_deg:.0f} deg" if self.num_turned else ""
+        return (
+            f"{len(self.images)} cameras stand apart from the rest ({first_of(list(self.images))}): "
+            f"{counted(self.num_agreeing, 'pair')} between them and the rest agree, {self.num_contradicting} "
+            f"contradict{turn}; either side may be the wrong one"
+        )
+
+
+class ToldEvidence(Record):
+    """Evidence that the fit did not use, against lenses, cameras and groups by name."""
+
+    lenses: Annotated[tuple[ContradictedLens, ...], "Lenses whose images ask for another focal length."] = ()
+    places: Annotated[tuple[AmbiguousPlace, ...], "Cameras that two sets of pairs put at two places."] = ()
+    seams: Annotated[tuple[GroupApart, ...], "Groups of cameras that stand apart from the rest."] = ()
+
+    @property
+    def statements(self) -> list[str]:
+        """A sentence for each."""
+        seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
+        return [*seams, *places, *(told.statement for told in self.lenses)]
+
+
+def tell_evidence(
+    evidence: ModelEvidence, images: Images, scale: float = 1.0, axes: FloatArray | None = None
+) -> ToldEvidence:
+    """Return what evidence says, by name.
+
+    Args:
+        evidence: by rows of images and their lenses.
+        images: with the lenses that were asked.
+        scale: from the units of the evidence to those of the output.
+        axes: (3, 3) rotation from the axes of the evidence to those of the output; the same if None.
+    """
+    return ToldEvidence(
+        lenses=tuple(_tell_lens(wrong, images.lenses[wrong.lens]) for wrong in evidence.lenses),
+        places=tuple(
+            AmbiguousPlace(
+                image=images.names[found.camera],
+                num_here=found.num_here,
+                num_there=found.num_there,
+                offset=tuple((scale * (found.offset if axes is None else axes @ found.offset)).tolist()),
+            )
+            for found in evidence.places
+        ),
+        seams=tuple(
+            GroupApart(
+                images=tuple(images.names[k] for k in seam.cameras.tolist()),
+                num_agreeing=seam.num_agreeing,
+                num_contradicting=seam.num_contradicting,
+                num_turned=seam.num_turned,
+                turn_deg=seam.turn_deg,
+            )
+            for seam in evidence.seams
+        ),
+    )
+
+
+def _tell_lens(wrong: WrongLens, lens: Lens) -> ContradictedLens:
+    asked_px = wrong.factor * lens.focal_px
+    return ContradictedLens(
+        camera=lens.id,
+        num_images=wrong.num_images,
+        focal_px=lens.focal_px,
+        asked_focal_px=asked_px,
+        asked_sigma_px=wrong.sigma * asked_px,
+    )

@@ -1,0 +1,52 @@
+"""Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
+from sfm_shapefit.judgement.left_out import question_lenses
+from sfm_shapefit.judgement.seams import Cut, Seam, find_seams
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.pipeline.doubts import ask_rotations
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.points import Points
+
+
+def gather_evidence(
+    images: Images, points: Points, pictures: Pictures, pairs: ModelEvidence, threads: int
+) -> ModelEvidence:
+    """Return the evidence of a model's pairs, and that of its points.
+
+    Args:
+        images: where the model has them; NaN where it does not.
+        points: of the images.
+        pictures: keypoints and lenses of the images.
+        pairs: evidence of its pairs.
+        threads: number of threads to use.
+    """
+    _, lenses = question_lenses(points, images, pictures, threads)
+    return ModelEvidence(lenses=lenses, places=pairs.places, seams=pairs.seams)
+
+
+def question_pairs(
+    source: MatchSource, directions: PairDirections, centers: FloatArray, threads: int
+) -> ModelEvidence:
+    """Return what the pairs of a source say against where its images stand.
+
+    Args:
+        source: the images, at the rotations of the model, and their matches.
+        directions: of all pairs, at these rotations.
+        centers: (i, 3) of the images, in any scale; NaN for those that are not in the model.
+        threads: number of threads to use.
+    """
+    fits = fit_pairs(centers, directions)
+    return ModelEvidence(places=fits.other_places(), seams=_question_cuts(source, fits.cuts(), threads))
+
+
+def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:
+    """Return the cuts that are seams, by the rotations that pairs across have by themselves."""
+    if not cuts:
+        return ()
+    across = np.concatenate([cut.contradicting for cut in cuts])
+    return find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)

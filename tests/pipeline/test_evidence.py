@@ -1,0 +1,100 @@
+"""Evidence that the fit did not use, in runs of our own and against models as they stand."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.pipeline.check import check
+from tests.scenes import COURTYARD, RING
+
+
+def with_own_lenses(source, factors):
+    """A copy whose images have a lens each; focal lengths of some, by name, are off by factors."""
+    model = pycolmap.Reconstruction()
+    for image_id in sorted(source.reg_image_ids()):
+        image = source.image(image_id)
+        camera = pycolmap.Camera(
+            model=image.camera.model, width=image.camera.width, height=image.camera.height,
+            params=image.camera.params, camera_id=image_id,
+        )  # fmt: skip
+        params = camera.params.copy()
+        params[camera.focal_length_idxs()] *= factors.get(image.name, 1.0)
+        camera.params = params
+        model.add_camera_with_trivial_rig(camera)
+        copy = pycolmap.Image(name=image.name, camera_id=image_id, image_id=image_id)
+        copy.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
+        model.add_image_with_trivial_frame(copy, image.cam_from_world())
+    return model
+
+
+@pytest.mark.parametrize(("camera", "factor"), [(4, 1.1), (5, 1.1)])
+def test_locate_names_a_wrong_lens_with_the_right_focal_length(camera, factor):
+    truth = pycolmap.Reconstruction(RING / "sparse" / "0")
+    name = sorted(image.name for image in truth.images.values())[camera]
+    wrong_id = truth.find_image_with_name(name).image_id
+    found = sfm_shapefit.locate(with_own_lenses(truth, {name: factor}), RING / "database.db")
+    (told,) = found.told_evidence.lenses
+    right_px = truth.find_image_with_name(name).camera.mean_focal_length()
+    assert told.camera == wrong_id
+    assert told.focal_px == pytest.approx(factor * right_px)
+    assert told.asked_focal_px == pytest.approx(right_px, rel=0.01)
+    assert name in found.verdict.cameras
+    assert found.verdict.grade is Grade.LOOK
+    assert sum(f"focal length of camera {wrong_id} is wrong" in warning for warning in found.warnings) == 1
+    assert found.focal_doubts == ()  # it is told once
+    assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
+
+
+def test_a_sound_run_is_not_doubted():
+    truth = pycolmap.Reconstruction(RING / "sparse" / "0")
+    found = sfm_shapefit.locate(with_own_lenses(truth, {}), RING / "database.db")
+    assert found.told_evidence.statements == []
+    assert found.verdict.grade is Grade.GOOD
+
+
+def spoiled(amount_deg=0.0, shift=0.0):
+    """The courtyard with a third of its cameras, and their points, turned about their middle, or shifted."""
+    model = pycolmap.Reconstruction(COURTYARD / "truth")
+    images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)[:8]
+    own = {image.image_id for image in images}
+    centers = np.array([image.projection_center() for image in images])
+    turn = pycolmap.Rotation3d(np.radians(amount_deg) * np.array([0.0, 0.6, 0.8]))
+    about = centers.mean(axis=0)
+    moved = pycolmap.Sim3d(1.0, turn, about + shift - turn * about)
+    for image in images:
+        rotation = image.frame.rig_from_world.rotation * turn.inverse()
+        center = moved * image.projection_center()
+        image.frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation * center))
+    for point in model.points3D.values():
+        if np.mean([element.image_id in own for element in point.track.elements]) > 0.5:
+            point.xyz = moved * point.xyz
+    return model, {image.name for image in images}
+
+
+@pytest.mark.parametrize(("amount_deg", "shift"), [(10.0, 0.0), (90.0, 0.0), (0.0, 3.0)])
+def test_a_group_that_is_moved_as_a_whole_is_named_and_the_model_not_to_be_used(tmp_path, amount_deg, shift):
+    model, wrong = spoiled(amount_deg, shift)
+    model.write(tmp_path)
+    facts = check(tmp_path, COURTYARD / "database.db").facts
+    named = {name for seam in facts.evidence.seams for name in seam.images}
+    assert len(named & wrong) >= 7
+    assert len(named - wrong) <= 1
+    assert facts.verdict.grade is Grade.DO_NOT_USE
+    assert any("stand apart from the rest" in reason for reason in facts.verdict.reasons)
+    assert any("cameras stand apart from the rest (" in warning for warning in facts.warnings)
+
+
+def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path):
+    model = pycolmap.Reconstruction(COURTYARD / "truth")
+    image = model.image(sorted(model.reg_image_ids())[7])
+    pose = image.frame.rig_from_world
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([2.0, 0.0, 0.0]))
+    model.write(tmp_path)
+    facts = check(tmp_path, COURTYARD / "database.db").facts
+    (told,) = [place for place in facts.evidence.places if place.image == image.name]
+    assert np.linalg.norm(told.offset) == pytest.approx(2.0, rel=0.05)
+    assert told.num_there > 2 * told.num_here
+    assert f"{told.num_there} put it 2" in told.statement
+    assert image.name in facts.verdict.cameras
