@@ -132,7 +132,7 @@ def test_an_image_before_a_flat_wall_says_nothing_of_its_lens():
 
 
 def test_what_a_pose_can_make_up_for_or_noise_hides_is_not_observable():
-    figures = np.array([[0.1, 0.005, 1e-3], [0.1, 0.005, 1e-5], [0.1, 0.05, 1e-3], [np.nan] * 3]).T
+    figures = np.array([[0.1, 0.005, 1e-3], [0.1, 0.005, 1e-6], [0.1, 0.05, 1e-3], [np.nan] * 3]).T
     left_out = LeftOut(np.full(4, 100), *figures, np.ones(4))
     assert left_out.observable.tolist() == [True, False, False, False]
 
