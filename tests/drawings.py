@@ -141,6 +141,7 @@ def _facts(names):
             method_reason="small",
         ),
         finish=Finish(
+            reweighted=None,
             start=start,
             refined=True,
             reason="the better one",
