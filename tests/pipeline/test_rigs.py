@@ -227,7 +227,7 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
         yield loose
 
     monkeypatch.setattr(rigs_stage, "place_pieces", place_pieces)
-    monkeypatch.setattr(rigs_stage, "_count_held", lambda _: 0)
+    monkeypatch.setattr(rigs_stage, "_count_held", lambda *_: 0)
     measured = SimpleNamespace(groups=[], num_points=9, without_points=lambda: "without points")
     assert list(rigs_stage.place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())) == [loose]
 
