@@ -171,7 +171,8 @@ class LocateResult(Displayed):
     control_points: tuple[ControlPoint, ...] = ()
     """Ground control points with their residuals, where some are given."""
     suspicions: tuple[str, ...] = ()
-    """What those who gave the rotations saw that speaks against the model, for its verdict."""
+    """What speaks against the model beside its own evidence: steps that failed, and what those who gave the
+    rotations saw."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
 

@@ -59,8 +59,8 @@ def pull_cameras(stand: Stand, options: PlacementOptions) -> Stand:
         return stand
     try:
         pulled = pull_to_priors(stand.placement, stand.gauge, priors, options)
-    except UnsolvableError:  # too large a factor
-        return stand
+    except UnsolvableError as error:
+        return stand.failed(f"the position priors do not pull its cameras: {error}")
     frames = stand.source.images.frame_of[pulled.placement.nodes[pulled.anchors.indices]]
     held = pulled.anchors._replace(indices=frames)
     return stand._replace(placement=pulled.placement, gauge=pulled.gauge, held=held)

@@ -96,7 +96,7 @@ def _locate_component(
         found,
         triplet_scores=scores[:, 0],
         matched_shares=scores[:, 1],
-        suspicions=tuple(_suspicions(averaging)),
+        suspicions=(*found.suspicions, *_suspicions(averaging)),
     )
 
 

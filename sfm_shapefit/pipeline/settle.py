@@ -13,7 +13,6 @@ told of positions says how large it is, and where.
 """
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -208,6 +207,7 @@ def finish_piece(
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
         control_points=brought.control_points,
+        suspicions=stand.failures,
     )
 
 
@@ -227,9 +227,11 @@ def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
     adjusts = options.placement.refines and options.freedom.adjusts_cameras(num_cameras)
     if is_small or not (adjusts and stand.source.economy.adjustment):
         return stand
-    with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-        return adjust_placed(stand, options, clock)
-    return stand
+    with clock("adjustment"):
+        try:
+            return adjust_placed(stand, options, clock)
+        except UnsolvableError as error:
+            return stand.failed(f"its cameras are not adjusted to the pixels: {error}")
 
 
 def _judge(stand: Stand, options: PlacingOptions, before: Images, clock: Clock) -> Judged:
@@ -299,6 +301,7 @@ def _collect_warnings(stand: Stand, judged: Judged, kept: BoolArray, num_points:
     yield from quality_warnings(judged)
     yield from trust_warnings(judged, kept)
     yield from ambiguity_warnings(judged)
+    yield from stand.failures
     if stand.gauge.warning:
         yield stand.gauge.warning
     if stand.source.economy.statement:

@@ -55,6 +55,8 @@ class Stand(NamedTuple):
     """Length of the solver's unit in units of the estimate."""
     adjustment: Estimate | None = None
     """How this placement was adjusted; None if it was not."""
+    failures: tuple[str, ...] = ()
+    """Steps that failed and were left out, a clause each; the model is to be looked at for them."""
 
     @classmethod
     def of(
@@ -70,6 +72,10 @@ class Stand(NamedTuple):
         lenses, moves = given.intrinsics, given.frees_rigs(options.freedom.rigs)
         freedom = Freedom(focal=lenses.focal, distortion=lenses.distortion, has_sensors=moves)
         return cls(given, source, directions, placement, gauge, freedom, lenses)
+
+    def failed(self, how: str) -> "Stand":
+        """Return the same without a step that failed; `how` says which and why, a clause."""
+        return self._replace(failures=(*self.failures, how))
 
     def place(self, kept: BoolArray | None = None) -> Images:
         """Return all images where they are placed, fixed ones as they were; NaN where neither.

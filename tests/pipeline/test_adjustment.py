@@ -6,8 +6,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.grade import Grade
 from tests.models import posed
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -137,3 +139,16 @@ def test_a_focal_length_that_is_the_databases_guess_is_found(tmp_path):
     errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0")
     assert errors.position.max < 1e-3 * errors.extent
     assert not any("focal" in warning for warning in found.warnings)
+
+
+def test_an_adjustment_that_fails_is_a_warning_and_no_model_without_it_is_good(monkeypatch):
+    def fail(*_):
+        raise UnsolvableError("no 3D point can be triangulated")
+
+    assert sfm_shapefit.locate(RING / "sparse" / "0").verdict.grade is Grade.GOOD
+    monkeypatch.setattr("sfm_shapefit.pipeline.settle.adjust_placed", fail)
+    found = sfm_shapefit.locate(RING / "sparse" / "0")
+    said = "its cameras are not adjusted to the pixels: no 3D point can be triangulated"
+    assert said in found.warnings
+    assert found.verdict.grade is Grade.LOOK
+    assert said in found.verdict.reasons
