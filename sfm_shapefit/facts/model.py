@@ -35,7 +35,6 @@ from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
 from sfm_shapefit.facts.scene import (
     DistanceFacts,
     Loop,
-    describe_doubtful_pairs,
     describe_line,
     describe_loops,
 )
@@ -264,7 +263,6 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             row("control points", describe_control_points(self.control_points)),
             row("straight", describe_line(self.line_sigma)),
             row("video", describe_loops(self.loops)),
-            row("doubtful pairs", describe_doubtful_pairs(self.num_doubtful_pairs)),
         ]
 
     def expert_sentences(self) -> list[str]:

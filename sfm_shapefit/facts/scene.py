@@ -1,4 +1,4 @@
-"""What is told of a scene: loops of videos, straight drives, doubtful pairs, and known distances."""
+"""What is told of a scene: loops of videos, straight drives, repeated structure, and known distances."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated
@@ -88,21 +88,6 @@ def describe_line(sigma: float | None) -> str:
     return (
         "the cameras stand on one line, along which only points determine lengths: positions along it are "
         f"known to {100.0 * sigma:.2g}% of its length (standard deviation)"
-    )
-
-
-def describe_doubtful_pairs(count: int) -> str:
-    """Say what to do with pairs that look like repeated structure; empty where there are none."""
-    if not count:
-        return ""
-    if count == 1:
-        return (
-            "1 pair in use looks like repeated structure, though no position contradicts it; --without "
-            "doubtful_pairs.csv leaves it out"
-        )
-    return (
-        f"{count} pairs in use look like repeated structure, though no position contradicts them; --without "
-        "doubtful_pairs.csv leaves them out"
     )
 
 
