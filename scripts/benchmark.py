@@ -13,7 +13,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     subparsers = parser.add_subparsers(dest="name", required=True)
     words = sys.argv[1:] if argv is None else list(argv)
     for name, purpose in INDEX.items():
-        subparser = subparsers.add_parser(name, help=purpose, description=purpose)
+        shown = purpose.replace("%", "%%")  # argparse takes a bare one for a format
+        subparser = subparsers.add_parser(name, help=shown, description=shown)
         if words and words[0] == name:
             # Only the module that is asked for is loaded: another may need what it does not.
             module = import_module(f"benchmarks.{name}")

@@ -29,6 +29,14 @@ def test_the_index_names_every_module_and_every_section_the_command_that_writes_
         assert f"python scripts/benchmark.py {name}" in (RESULTS / f"{name}.md").read_text().splitlines()[2]
 
 
+def test_the_help_lists_every_benchmark_whatever_its_purpose_has_in_it(capsys):
+    with pytest.raises(SystemExit) as ended:
+        benchmark.main(["--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in INDEX)
+
+
 def test_the_readme_names_every_benchmark_script_and_section():
     text = (SCRIPTS / "README.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE)
