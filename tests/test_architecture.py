@@ -30,7 +30,7 @@ FLOORS = [
 ]
 # Arrows that still go up or across, type checking counted. The list may only become shorter.
 STILL_UPWARD: set[tuple[str, str]] = set()
-MOST_ARROWS = 91  # between rooms, beside those to base/; the list may only become shorter
+MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only become shorter
 
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
