@@ -12,7 +12,6 @@ Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averagin
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.files.colmap.database_images import rotations_of
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
@@ -41,7 +40,11 @@ def average_by_pycolmap(num_images: int, relative: RelativeRotations) -> Average
         options.filter_unregistered = again
         if not pycolmap.run_rotation_averaging(options, graph, model, []):
             raise RuntimeError("pycolmap.run_rotation_averaging reports failure")
-    rotations, registered = rotations_of(model, list(range(1, num_images + 1)))
+    images = [model.image(image_id) for image_id in range(1, num_images + 1)]
+    registered = np.array([image.has_pose for image in images], dtype=np.bool_)
+    rotations = np.tile(np.eye(3), (num_images, 1, 1))
+    for k in np.flatnonzero(registered).tolist():
+        rotations[k] = images[k].cam_from_world().rotation.matrix()
     unknown = np.full(num_images, np.nan)
     return AveragedRotations(
         rotations=rotations,
