@@ -65,6 +65,8 @@ def check_command(
     with report_errors():
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
+        if report is not None and not report.absolute().parent.is_dir():
+            raise InputError(f"the folder of {report} does not exist; make it, or name another page")
         if report is not None and report.exists() and not overwrite:
             raise InputError(
                 f"{report} exists already; choose another with --report, or replace it with --overwrite"
