@@ -14,7 +14,7 @@ import matplotlib as mpl
 
 mpl.use("Agg")
 
-NAMES = ("courtyard", "noise_robustness", "phase_transition", "pipeline", "theory_plot")
+NAMES = ("beyond", "courtyard", "noise_robustness", "phase_transition", "pipeline", "theory_plot")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -37,10 +37,13 @@ _SHARES = (0.02, 0.999)  # least and largest share of right pairs; at 0 and 1 no
 _LEAST_LEVEL_RAD = 1e-4  # radians; rays of exact directions still meet within their rounding
 # Meetings of two rays that are tried for a node; drawn by a fixed seed where it has more.
 _MOST_PROPOSALS = 1500
+_STRIDE = 1_000_003  # a prime above that; its multiples visit each pair of rays once, and neighbors far apart
+_MISSED = 1e-4  # odds of missing a better place; more proposals are not tried (Fischler and Bolles 1981)
 _REACH = 3.0  # radii; beyond, a place must be paid for
 _SWEEPS = 3  # visits of all nodes, at most; the next placement does the rest
 _PRIOR_POWER = 3.0  # power of the heavy tail; the density of places falls as r^-6
 _MOVE_COST = 1.0  # nats that a move must gain; a smaller gain is that of chance
+_LEAST_LOG_ODDS = -5.0  # log odds; a pair of less says nothing for a place
 _PARALLEL = 1e-3  # squared sine of two rays; less parallel ones meet where noise says
 _SHORT = 1e-12  # length of a baseline; a shorter one has no direction
 _LEAST_LEVEL2 = 1e-12  # rad^2; exact directions still have a finite density
@@ -173,11 +176,13 @@ def put_by_consensus(
 
 @inner_kernel
 def _propose(proposal: int, seed: int, starts: Any, rays: Any, place: Any) -> bool:
-    """Write where two of a node's rays meet: pair by pair if there are few, else drawn by a hash."""
+    """Write where two of a node's rays meet: each pair of rays once if they are few, else by a hash."""
     degree = len(starts)
-    if degree * (degree - 1) // 2 <= _MOST_PROPOSALS:
-        x = np.int64((1.0 + np.sqrt(1.0 + 8.0 * proposal)) / 2.0)
-        y = proposal - x * (x - 1) // 2
+    count = degree * (degree - 1) // 2
+    if count <= _MOST_PROPOSALS:
+        pair = proposal * _STRIDE % count
+        x = np.int64((1.0 + np.sqrt(1.0 + 8.0 * pair)) / 2.0)
+        y = pair - x * (x - 1) // 2
     else:
         key = mix_bits(mix_bits(np.uint64(seed)) + np.uint64(proposal))
         x = np.int64(key % np.uint64(degree))
@@ -212,19 +217,44 @@ def _penalty(place: Any, middle: Any, reach: float) -> float:
 
 
 @inner_kernel
-def _score(place: Any, starts: Any, rays: Any, peak: Any, variances: Any) -> float:
-    """Return sum_e log(1 + odds l_e) at a place; pairs of less than e^-5 are wrong there."""
+def _enough(share: float) -> int:
+    """Return how many random pairs of rays hardly miss a place that this share of all rays speaks for."""
+    if share <= 0.0:
+        return _MOST_PROPOSALS
+    return int(np.ceil(np.log(_MISSED) / np.log1p(-min(share * share, 0.99))))
+
+
+@inner_kernel
+def _gain(log_odds: float) -> float:
+    """Return log(1 + e^x), by which a pair of log odds x speaks for a place."""
+    return float(np.log1p(np.exp(min(log_odds, 30.0))))
+
+
+@inner_kernel
+def _score(place: Any, rays: Any, least: float) -> float:
+    """Return sum_e log(1 + odds l_e) at a place, or less than `least` if it is less.
+
+    Pairs of less than e^-5 are wrong there.
+
+    `rays`: starts, directions, log odds at the peak, variances, and the most that all from each on may add.
+    """
+    starts, directions, peak, variances, most = rays
     total, d = 0.0, len(place)
     for k in range(len(peak)):
+        if total + most[k] < least:
+            break
         length2, dot = 0.0, 0.0
         for a in range(d):
             along = place[a] - starts[k, a]
             length2 += along * along
-            dot += along * rays[k, a]
+            dot += along * directions[k, a]
+        cosine = 1.0 - (peak[k] - _LEAST_LOG_ODDS) * variances[k]
+        if cosine > 0.0 and (dot < 0.0 or dot * dot < cosine * cosine * length2):
+            continue
         # The squared chord 2 - 2 cos; its rounding is far below the least level.
-        gain = peak[k] - (1.0 - dot / np.sqrt(max(length2, 1e-300))) / variances[k]
-        if gain > -5.0:
-            total += np.log1p(np.exp(min(gain, 30.0)))
+        log_odds = peak[k] - (1.0 - dot / np.sqrt(max(length2, 1e-300))) / variances[k]
+        if log_odds > _LEAST_LOG_ODDS:
+            total += _gain(log_odds)
     return total
 
 
@@ -246,24 +276,28 @@ def _resect(graph: Any, order: Any, t: Any, has_moved: Any, middle: Any, reach: 
         if not is_due:
             continue
         starts, rays = np.empty((degree, d)), np.empty((degree, d))
-        peak, variances = np.empty(degree), np.empty(degree)
-        for k in range(degree):
+        peak, variances, most = np.empty(degree), np.empty(degree), np.zeros(degree + 1)
+        for k in range(degree - 1, -1, -1):
             e = edge_of[first + k]
             peak[k], variances[k] = all_peaks[e], all_variances[e]
+            most[k] = most[k + 1] + _gain(peak[k])
             for a in range(d):
                 starts[k, a] = t[neighbors[first + k], a]
                 rays[k, a] = v[e, a] if edges[e, 0] == node else -v[e, a]
-        best = -np.inf
-        for proposal in range(-1, min(degree * (degree - 1) // 2, _MOST_PROPOSALS)):
+        best, proposal = -np.inf, -2
+        enough = min(degree * (degree - 1) // 2, _MOST_PROPOSALS)
+        while proposal + 1 < enough:
+            proposal += 1
             if proposal < 0:
                 for a in range(d):
                     place[a] = t[node, a]
             elif not _propose(proposal, node, starts, rays, place):
                 continue
-            score = _score(place, starts, rays, peak, variances)
-            score -= _penalty(place, middle, reach) - (_MOVE_COST if proposal < 0 else 0.0)
+            price = _penalty(place, middle, reach) - (_MOVE_COST if proposal < 0 else 0.0)
+            score = _score(place, (starts, rays, peak, variances, most), best + price) - price
             if score > best:
                 best = score
+                enough = min(enough, _enough(best / most[0]))
                 for a in range(d):
                     best_place[a] = place[a]
         for a in range(d):

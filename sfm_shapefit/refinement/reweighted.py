@@ -5,9 +5,10 @@ program but its weights: at the posterior of each pair, in the place of 1, the t
 the certified program is solved at weights, its residuals say more about the pairs, and so on:
 
 1. *From the usual answer.* The posteriors of its residuals are the weights, after a consensus has put each
-   node where most of its rays meet.
+   node where most of its rays meet. Where it moves none, the usual answer stays: other weights change it by
+   less than the noise then.
 2. *From triangles*, where even that explains few of the pairs: their posteriors are the first weights; after
-   each solve the residuals of a consensus are heard too, at a level that shrinks.
+   each solve and refinement the residuals of a consensus are heard too, at a level that shrinks.
 
 Each goes on as 1 does while the evidence of `consensus` grows. Every answer is refined in angles from the
 certified optimum at weights that are kept with it: the certificate is that of the program at those weights,
@@ -41,7 +42,7 @@ _FEW = 0.35  # share of right pairs; answers that explain fewer are looked for a
 _FEWEST_NODES = 10  # nodes; the residuals of fewer say nothing of noise and shares
 _LEAST_REDUNDANCY = 2.0  # equations per unknown; with fewer any answer explains about half of the pairs
 _LEAST_WEIGHT = 1e-4  # relative weight of a pair that is certainly wrong; 0 would leave cameras loose
-_TRIANGLE_ROUNDS = 6  # solves from triangles, at most; three or four do where the truth is found
+_TRIANGLE_ROUNDS = 10  # solves from triangles, at most; three or four do where the truth is plain
 _CONSENSUS_ROUNDS = 4  # solves from residuals, at most; two do mostly
 _GAIN = 0.1  # evidence in nats; a smaller gain is none
 _GAIN_SHARE = 1e-4  # share of the evidence; on large graphs a smaller gain is worth no further solve
@@ -88,11 +89,12 @@ def solve_reweighted(
     search = _Search(measured, options, refine)
     mixture = fit_mixture(measured, usual)
     found = search.climb(usual, mixture)
-    if found.mixture.shares[0] < _FEW:
+    if (mixture if found is None else found.mixture).shares[0] < _FEW:
         from_triangles = search.follow(weigh_by_triangles(measured.graph))
-        if from_triangles.mixture.evidence > found.mixture.evidence:
+        if found is None or from_triangles.mixture.evidence > found.mixture.evidence:
             found = from_triangles
-    return found if found.mixture.evidence > max(_more(mixture.evidence), 0.0) else None
+    needed = max(_more(mixture.evidence), 0.0)
+    return None if found is None or found.mixture.evidence <= needed else found
 
 
 def can_be_reweighted(graph: ViewGraph) -> bool:
@@ -108,11 +110,16 @@ class _Search:
     def __init__(self, measured: MeasuredGraph, options: SolverOptions, refine: Refine) -> None:
         self._measured, self._options, self._refine = measured, options, refine
 
-    def climb(self, locations: FloatArray, mixture: ResidualMixture) -> Reweighted:
-        """Return the answer of most evidence from locations (n, d) on, which may have less than they."""
+    def climb(self, locations: FloatArray, mixture: ResidualMixture) -> Reweighted | None:
+        """Return the answer of most evidence from locations (n, d) on, which may have less than they.
+
+        None if each of their nodes is where most of its rays meet.
+        """
         graph, best = self._measured.graph, None
         for _ in range(_CONSENSUS_ROUNDS):
             moved = put_by_consensus(graph, locations, mixture.log_odds, mixture.variances)
+            if best is None and np.array_equal(moved, locations):
+                return None
             there, least = fit_mixture(self._measured, moved), _more(mixture.evidence)
             if best is not None and there.evidence <= least:
                 break
@@ -124,7 +131,6 @@ class _Search:
                 locations, mixture = placed.locations, placed.mixture
             if mixture.evidence <= least:
                 break
-        assert best is not None
         return best
 
     def follow(self, triangles: TriangleEvidence) -> Reweighted:
@@ -132,19 +138,22 @@ class _Search:
         graph, prior, weights = self._measured.graph, triangles.prior, triangles.posterior
         level, factor, candidates = _FIRST_LEVEL_RAD, 2.0 * _LEVEL, list[tuple[FloatArray, ResidualMixture]]()
         for _ in range(_TRIANGLE_ROUNDS):
-            solved = solve(self._weighted(weights), self._options).locations
-            residual = _weighted_median(residual_angles(graph, solved), weights)
+            weighted = self._weighted(weights)
+            # Unrefined, noise draws the optimum together, and what it says of the pairs is too weak.
+            placed = self._refine(weighted, solve(weighted, self._options).locations).locations
+            residual = _weighted_median(residual_angles(graph, placed), weights)
             level, factor = float(np.clip(factor * residual, _LEAST_LEVEL_RAD, level)), _LEVEL
             odds, variances = np.full(graph.num_edges, logit(prior)), np.full(graph.num_edges, level**2)
-            moved = put_by_consensus(graph, solved, odds, variances, sweeps=1)
-            candidates += [(t, fit_mixture(self._measured, t)) for t in (solved, moved)]
+            moved = put_by_consensus(graph, placed, odds, variances, sweeps=1)
+            candidates += [(t, fit_mixture(self._measured, t)) for t in (placed, moved)]
             heard = np.clip(log_ratio(residual_angles(graph, moved), variances, graph.dimension), *_HEARD)
             new = expit(triangles.log_odds + odds + heard)
             prior = float(np.clip(np.mean(new), *_PRIORS))
             change, weights = float(np.mean(np.abs(new - weights))), new
             if change < _STILL:
                 break
-        return self.climb(*max(candidates, key=lambda candidate: candidate[1].evidence))
+        best, mixture = max(candidates, key=lambda candidate: candidate[1].evidence)
+        return self.climb(best, mixture) or self._place(mixture.posterior)
 
     def _weighted(self, posterior: FloatArray) -> ViewGraph:
         """Return the graph with the weights of a posterior (m,) on top of its own."""

@@ -60,6 +60,15 @@ def test_figure_1_has_a_quick_mode(name, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_beyond_the_breakdown_point_place_recovers_what_the_usual_programs_lose(tmp_path, capsys):
+    figure.main(["beyond", "--out", str(tmp_path / "f.png"), "--quick", "--processes", "1"])
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    said = capsys.readouterr().out
+    assert "LUD, random, p = 1/2: all exact up to q = 0\n" in said
+    assert "place, random, p = 1/2: all exact up to q = 0.6\n" in said
+
+
+@pytest.mark.slow
 def test_figure_2_has_a_quick_mode_and_its_slope_is_one(tmp_path, capsys):
     figure.main(["noise_robustness", "--out", str(tmp_path / "f.png"), "--quick"])
     assert (tmp_path / "f.png").stat().st_size > 5000
