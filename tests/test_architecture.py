@@ -46,7 +46,7 @@ MOST_LINES = {
     "pairs": 1550,
     "pipeline": 5510,
     "placement": 2060,
-    "refinement": 2090,
+    "refinement": 2110,
     "report": 1660,
     "rotations": 2270,
     "scene": 2010,

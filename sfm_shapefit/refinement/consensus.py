@@ -46,7 +46,9 @@ _MOVE_COST = 1.0  # nats that a move must gain; a smaller gain is that of chance
 _LEAST_LOG_ODDS = -5.0  # log odds; a pair of less says nothing for a place
 _PARALLEL = 1e-3  # squared sine of two rays; less parallel ones meet where noise says
 _SHORT = 1e-12  # length of a baseline; a shorter one has no direction
-_LEAST_LEVEL2 = 1e-12  # rad^2; exact directions still have a finite density
+# Least and largest variance, rad^2: exact directions still have a finite density, and of more than 0.3 rad
+# right ones are no longer told from wrong ones.
+_LEVELS2 = (1e-12, 0.3**2)
 _SETTLED = 1e-4  # relative change of shares and levels; a smaller one ends the fit
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -88,7 +90,7 @@ def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixtu
     shares = np.full(count, 0.5)
     levels2 = np.array([np.median(angles[classes == k]) ** 2 if k in classes else 1.0 for k in range(count)])
     for _ in range(_EM_ROUNDS):
-        before, levels2 = (shares, levels2), np.maximum(levels2, _LEAST_LEVEL2)
+        before, levels2 = (shares, levels2), np.clip(levels2, *_LEVELS2)
         total, odds = levels2[classes] + own, logit(shares)[classes]
         right = expit(log_ratio(angles, total, d) + odds)
         shares = np.clip(np.bincount(classes, right, count) / numbers, *_SHARES)
@@ -97,10 +99,10 @@ def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixtu
         levels2 = levels2 * wanted / np.maximum(np.bincount(classes, right / total, count), _TINY)
         if np.allclose(before, (shares, levels2), rtol=_SETTLED, atol=0.0):
             break
-    total, odds = np.maximum(levels2, _LEAST_LEVEL2)[classes] + own, logit(shares)[classes]
+    total, odds = np.clip(levels2, *_LEVELS2)[classes] + own, logit(shares)[classes]
     ratio = log_ratio(angles, total, d)
     likelihood = np.sum(np.logaddexp(odds + ratio, 0.0) + np.log1p(-shares)[classes])
-    unknowns, level2 = d * (graph.num_nodes - 1) - 1, max(float(levels2[0]), _LEAST_LEVEL2)
+    unknowns, level2 = d * (graph.num_nodes - 1) - 1, max(float(levels2[0]), _LEVELS2[0])
     cost = penalty_of_strays(locations) - 0.5 * unknowns * min(float(np.log(level2)), 0.0)
     return ResidualMixture(
         shares=shares,

@@ -34,6 +34,7 @@ from sfm_shapefit.refinement.consensus import (
 )
 from sfm_shapefit.refinement.posterior import TriangleEvidence, weigh_by_triangles
 from sfm_shapefit.solver.options import SolverOptions, SolverResult
+from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.solve import solve
 
 POOR_SHARE = 0.7
@@ -80,6 +81,8 @@ def solve_reweighted(
 ) -> Reweighted | None:
     """Return the best reweighted ShapeFit; None if no weights give more evidence, or all may be wrong.
 
+    None too where most directions, weighed as usual, point against it: it has no scale then.
+
     Args:
         measured: a parallel-rigid piece of nodes that move by themselves.
         usual: (n, d) the usual answer.
@@ -93,8 +96,9 @@ def solve_reweighted(
         from_triangles = search.follow(weigh_by_triangles(measured.graph))
         if found is None or from_triangles.mixture.evidence > found.mixture.evidence:
             found = from_triangles
-    needed = max(_more(mixture.evidence), 0.0)
-    return None if found is None or found.mixture.evidence <= needed else found
+    if found is None or found.mixture.evidence <= max(_more(mixture.evidence), 0.0):
+        return None
+    return found if projected_length(measured.graph, found.locations) > 0.0 else None
 
 
 def can_be_reweighted(graph: ViewGraph) -> bool:

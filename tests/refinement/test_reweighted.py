@@ -74,6 +74,17 @@ def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch
     assert place(problem.view_graph).refined.reweighted is None
 
 
+def test_an_answer_that_most_directions_point_against_has_no_scale_and_is_not_taken(hopeless, monkeypatch):
+    monkeypatch.setattr(reweighted, "projected_length", lambda *_: -1.0)
+    assert place(hopeless.view_graph).refined.reweighted is None
+
+
+def test_an_answer_too_far_off_for_any_level_explains_nothing():
+    problem = corrupted(0.9)
+    mixture = fit_mixture(MeasuredGraph(problem.view_graph), np.random.default_rng(0).normal(size=(100, 3)))
+    assert mixture.shares[0] < 0.3  # a level of a radian would explain all
+
+
 def test_a_consensus_puts_a_node_back_and_leaves_those_that_stand_right():
     problem = corrupted(0.5)
     graph, moved = problem.view_graph, problem.locations.copy()
