@@ -3,7 +3,8 @@
 Figures 1 and 2 of the paper with most directions wrong: mean errors of ShapeFit, LUD and `place`, white is 0
 and black is 1 or more, over the number of locations n, the odds p of a pair, and the share q of wrong
 directions, random ones and such as agree with one another; and the error over the noise at q = 0.7. What is
-drawn, and how errors are measured, are those of Hand, Lee, Voroninski (2015), section 4.
+drawn, and how errors are measured, are those of Hand, Lee, Voroninski (2015), section 4. Below, the table
+published with Cycle-Sync (NeurIPS 2025), by its generator and measure, with `place` above it.
 """
 
 import argparse
@@ -15,7 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
+from benchmarks.corruption import PUBLISHED, SEEDS, draw_published, errors
 from paper.trials import Cell, Results, run_trials
+from sfm_shapefit import place
 
 SHOWN = {"ShapeFit": "ShapeFit", "LUD": "LUD", "refined": "place"}
 """Methods of `paper.trials` and what they are called."""
@@ -70,6 +73,19 @@ def draw_noise(axis: Axes, results: Results, noisy: list[Cell]) -> None:
     axis.legend()
 
 
+def draw_table(axis: Axes) -> None:
+    """Write the published table, ours above."""
+    drawn = draw_published("uniform", 0.8, 0.0, 100, SEEDS["published"])
+    ours = errors(place(drawn.graph), drawn.truth)
+    rows = {"place": (f"{ours.median:.1e}", f"{ours.mean:.1e}"), **PUBLISHED}
+    axis.axis("off")
+    axis.set_title("errors at q = 0.8, no noise")
+    cells = [list(row) for row in rows.values()]
+    axis.table(
+        cells, rowLabels=list(rows), colLabels=["median", "mean"], loc="center", bbox=(0.4, 0.1, 0.6, 0.8)
+    )
+
+
 def run(args: argparse.Namespace) -> Figure:
     """Draw all, and print the largest share of wrong directions at which every problem is recovered."""
     rows, noisy, trials = ROWS, NOISY, args.trials
@@ -85,7 +101,8 @@ def run(args: argparse.Namespace) -> Figure:
             mesh = draw_phases(figure.add_subplot(grid[y, x]), row, method, results)
             print(f"{SHOWN[method]}, {row.title}: {_describe_exact(row, method, results)}")
     figure.colorbar(mesh, ax=figure.axes, label="mean relative error", shrink=0.5, location="left")
-    draw_noise(figure.add_subplot(grid[:2, 3]), results, noisy)
+    draw_noise(figure.add_subplot(grid[:-1, 3]), results, noisy)
+    draw_table(figure.add_subplot(grid[-1, 3]))
     return figure
 
 
