@@ -44,7 +44,6 @@ missed: scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's 
 (0.9999 and 3) try nearly every pair 50 times.
 """
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
-_LIKELY_SHARE = 0.6  # mean robust weight; a pose known beforehand that fits as well needs no trial
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
 _PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
 _STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
@@ -57,6 +56,8 @@ class LikelyPoses(NamedTuple):
     """(k, 3, 3) cam_j_from_cam_i."""
     translations: FloatArray
     """(k, 3) unit vectors in axes of camera j; NaN for pairs of which nothing is known."""
+    least_weights: FloatArray
+    """(k,) mean robust weights; a pose near the likely one that reaches it needs no trial."""
 
 
 def estimate_relative_rotations(
@@ -76,7 +77,7 @@ def estimate_relative_rotations(
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
         num_pairs: pairs of the whole database; if many, each is tried less often.
-        likely: poses of the batch's pairs. Where most matches fit near one, that is the answer; the trials,
+        likely: poses of the batch's pairs. Where the matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
     firsts = range(0, len(batch.pairs), _PAIRS_PER_SLICE)
@@ -125,6 +126,7 @@ def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotatio
         information=np.zeros((0, 3, 3)),
         num_matches=np.zeros(0, dtype=np.int64),
         weight_shares=np.zeros(0),
+        translations=np.zeros((0, 3)),
     )
     names = [field.name for field in fields(RelativeRotations)]
     columns = {name: np.concatenate([getattr(part, name) for part in (nothing, *parts)]) for name in names}
@@ -142,7 +144,7 @@ def _estimate_slice(
         near = _refine(
             batch.rays_of(likely_pairs), likely.rotations[likely_pairs], likely.translations[likely_pairs]
         )
-        fits = near.weight_shares >= _LIKELY_SHARE
+        fits = near.weight_shares >= likely.least_weights[likely_pairs]
         estimates, places = [near.subset(fits)], [likely_pairs[fits]]
         pairs = np.setdiff1d(pairs, likely_pairs[fits])
     matches = batch.rays_of(pairs)
@@ -161,6 +163,7 @@ def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray
         information=poses.information,
         num_matches=np.diff(matches.offsets),
         weight_shares=poses.weight_shares,
+        translations=poses.translations,
     )
 
 

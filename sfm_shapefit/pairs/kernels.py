@@ -1,8 +1,9 @@
 """The estimator of one direction from the matches of one pair, compiled; the package's header has the math.
 
-Every kernel works on the matches of one pair, a row of ten numbers each: the unit rays a and b in world axes,
-their epipolar normal, which is a x b in pixels, and its length, the parallax. Lengths and residuals are in
-pixels.
+Every kernel works on the matches of one pair, ten numbers each: the unit rays a and b in world axes, their
+epipolar normal, which is a x b in pixels, and its length, the parallax. Lengths and residuals are in pixels.
+Matches stand in blocks of 32, in each the first numbers of all, then their second ones: what is computed of
+each match alone is computed of several at once. Sums are in the order of the matches.
 """
 
 import numpy as np
@@ -15,6 +16,9 @@ MIN_MATCHES = 5  # matches; two fix a direction, but a robust fit to fewer means
 MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual_px", "parallax_rad")
 """What is counted and measured of a pair, in this order."""
 
+_LANES = 32  # matches of a block; a multiple of what processors compute at once
+_NUMBERS = 10  # of each match
+_BLOCK = _NUMBERS * _LANES  # numbers of a block; of the last one, those without a match are 0
 _MIN_NOISE_PX = 1e-3  # pixels; exact matches still get a finite information
 _WIDTH = 4.0  # kernel width in standard deviations of the noise; 95 % efficient, as simulated
 _MIN_WIDTH_PX = 0.5  # pixels; matches are never better
@@ -51,85 +55,105 @@ def estimate_pairs(
         first, last = offsets[p], offsets[p + 1]
         if last - first < MIN_MATCHES:
             continue
-        matches = np.empty((last - first, 10))
+        blocks = -(-(last - first) // _LANES)
+        matches, residuals = np.zeros(blocks * _BLOCK), np.empty(blocks * _LANES)
         _fill_matches(rays_i[first:last], rays_j[first:last], pixel_angles[p], matches)
         d = directions[p]
-        _find_hypothesis(matches, threshold_px, num_hypotheses, d)
-        residuals = np.empty(last - first)
-        noise_px, cap_px = _refine(matches, threshold_px, d, residuals)
-        _fill_moments(matches, d, residuals, noise_px, cap_px, moments[p])
-        sign = _measure(matches, d, residuals, threshold_px, noise_px, pixel_angles[p], measures[p])
-        _count_rivals(matches, residuals, threshold_px, noise_px, num_hypotheses, measures[p])
+        _find_hypothesis(matches, last - first, threshold_px, num_hypotheses, d)
+        noise_px, cap_px = _refine(matches, last - first, threshold_px, d, residuals)
+        _fill_moments(matches, last - first, d, residuals, noise_px, cap_px, moments[p])
+        sign = _measure(
+            matches, last - first, d, residuals, threshold_px, noise_px, pixel_angles[p], measures[p]
+        )
+        _count_rivals(matches, last - first, residuals, threshold_px, noise_px, num_hypotheses, measures[p])
         for c in range(3):
             d[c] *= sign
 
 
 @inner_kernel
+def _place(k: int) -> int:
+    """Return where the numbers of match k begin, each _LANES after the last."""
+    return (k // _LANES) * _BLOCK + k % _LANES
+
+
+@inner_kernel
 def _fill_matches(a: FloatArray, b: FloatArray, pixel_angle: float, matches: FloatArray) -> None:
-    """Fill the rows of matches with rays a and b (n, 3)."""
+    """Fill the blocks of matches with rays a and b (n, 3)."""
     for k in range(len(a)):
-        match = matches[k]
+        match = matches[_place(k) :]
         for c in range(3):
-            match[c], match[3 + c] = a[k, c], b[k, c]
-        match[6] = (a[k, 1] * b[k, 2] - a[k, 2] * b[k, 1]) / pixel_angle
-        match[7] = (a[k, 2] * b[k, 0] - a[k, 0] * b[k, 2]) / pixel_angle
-        match[8] = (a[k, 0] * b[k, 1] - a[k, 1] * b[k, 0]) / pixel_angle
-        match[9] = np.sqrt(match[6] * match[6] + match[7] * match[7] + match[8] * match[8])
-
-
-@kernel
-def _residual(match: FloatArray, d: FloatArray) -> float:
-    """Return the signed Sampson error in px; its divisor has a floor where rays run along the baseline."""
-    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
-    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
-    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
-    return float((match[6] * d[0] + match[7] * d[1] + match[8] * d[2]) / np.sqrt(square))
+            match[c * _LANES], match[(3 + c) * _LANES] = a[k, c], b[k, c]
+        x = (a[k, 1] * b[k, 2] - a[k, 2] * b[k, 1]) / pixel_angle
+        y = (a[k, 2] * b[k, 0] - a[k, 0] * b[k, 2]) / pixel_angle
+        z = (a[k, 0] * b[k, 1] - a[k, 1] * b[k, 0]) / pixel_angle
+        match[6 * _LANES], match[7 * _LANES], match[8 * _LANES] = x, y, z
+        match[9 * _LANES] = np.sqrt(x * x + y * y + z * z)
 
 
 @inner_kernel
-def _squared_residual(match: FloatArray, d: FloatArray) -> float:
-    """Return the squared Sampson error in px^2, without a root: most of the time is spent here."""
-    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
-    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
-    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
-    volume = match[6] * d[0] + match[7] * d[1] + match[8] * d[2]
-    return float(volume * volume / square)
+def _fill_residuals(matches: FloatArray, d: FloatArray, residuals: FloatArray) -> None:
+    """Fill the signed Sampson errors in px; their divisor has a floor where rays run along the baseline."""
+    for at in range(len(residuals) // _LANES):
+        m, out = matches[at * _BLOCK : (at + 1) * _BLOCK], residuals[at * _LANES : (at + 1) * _LANES]
+        x, y, z = d[0], d[1], d[2]
+        for k in range(_LANES):
+            along_a = m[k] * x + m[_LANES + k] * y + m[2 * _LANES + k] * z
+            along_b = m[3 * _LANES + k] * x + m[4 * _LANES + k] * y + m[5 * _LANES + k] * z
+            square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+            volume = m[6 * _LANES + k] * x + m[7 * _LANES + k] * y + m[8 * _LANES + k] * z
+            out[k] = volume / np.sqrt(square)
 
 
 @inner_kernel
-def _find_hypothesis(matches: FloatArray, threshold_px: float, num_hypotheses: int, best: FloatArray) -> None:
+def _fill_squares(m: FloatArray, x: float, y: float, z: float, limit: float, squares: FloatArray) -> None:
+    """Fill the squared Sampson errors of a block in px^2, at most `limit`, without a root."""
+    for k in range(_LANES):
+        along_a = m[k] * x + m[_LANES + k] * y + m[2 * _LANES + k] * z
+        along_b = m[3 * _LANES + k] * x + m[4 * _LANES + k] * y + m[5 * _LANES + k] * z
+        square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+        volume = m[6 * _LANES + k] * x + m[7 * _LANES + k] * y + m[8 * _LANES + k] * z
+        squares[k] = min(volume * volume / square, limit)
+
+
+@inner_kernel
+def _find_hypothesis(
+    matches: FloatArray, number: int, threshold_px: float, num_hypotheses: int, best: FloatArray
+) -> None:
     """Fill `best` with the two-match direction of least truncated cost; its draws are fixed."""
-    count = np.uint64(len(matches))
+    count = np.uint64(number)
     best[0], best[1], best[2] = 1.0, 0.0, 0.0
     best_cost = np.inf
-    d = np.empty(3)
+    squares = np.empty(_LANES)
     limit = threshold_px * threshold_px
     state = np.uint64(0x9E3779B97F4A7C15)
     for _ in range(num_hypotheses):
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        m = matches[np.int64((state >> np.uint64(33)) % count)]
+        m = matches[_place(np.int64((state >> np.uint64(33)) % count)) + 6 * _LANES :]
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        n = matches[np.int64((state >> np.uint64(33)) % count)]
-        x = m[7] * n[8] - m[8] * n[7]
-        y = m[8] * n[6] - m[6] * n[8]
-        z = m[6] * n[7] - m[7] * n[6]
+        n = matches[_place(np.int64((state >> np.uint64(33)) % count)) + 6 * _LANES :]
+        x = m[_LANES] * n[2 * _LANES] - m[2 * _LANES] * n[_LANES]
+        y = m[2 * _LANES] * n[0] - m[0] * n[2 * _LANES]
+        z = m[0] * n[_LANES] - m[_LANES] * n[0]
         length = np.sqrt(x * x + y * y + z * z)
         if length <= 1e-12:
             continue
-        d[0], d[1], d[2] = x / length, y / length, z / length
+        x, y, z = x / length, y / length, z / length
         cost = 0.0
-        for k in range(len(matches)):
-            cost += min(_squared_residual(matches[k], d), limit)
+        for at in range(0, number, _LANES):
+            first = (at // _LANES) * _BLOCK
+            _fill_squares(matches[first : first + _BLOCK], x, y, z, limit, squares)
+            for k in range(min(_LANES, number - at)):
+                cost += squares[k]
             if cost >= best_cost:
                 break
         if cost < best_cost:
             best_cost = cost
-            best[0], best[1], best[2] = d[0], d[1], d[2]
+            best[0], best[1], best[2] = x, y, z
 
 
 @inner_kernel
 def _refine(
-    matches: FloatArray, threshold_px: float, d: FloatArray, residuals: FloatArray
+    matches: FloatArray, number: int, threshold_px: float, d: FloatArray, residuals: FloatArray
 ) -> tuple[float, float]:
     """Move d to the nearest minimum of the robust cost; fill its residuals.
 
@@ -139,24 +163,27 @@ def _refine(
         The standard deviation of the residuals, and the parallax up to which a match has full weight, in px.
     """
     noise_px, cap_px = threshold_px, np.inf
-    basis, work = np.empty((2, 3)), np.empty(len(matches))
-    for k in range(len(matches)):
-        residuals[k] = _residual(matches[k], d)
+    basis, work, lines = np.empty((2, 3)), np.empty(number), np.empty(4 * _LANES)
+    _fill_residuals(matches, d, residuals)
     for step in range(_STEPS):
         if step < _RESCALINGS:
-            noise_px, cap_px = _measure_noise(matches, residuals, _width(noise_px), work)
+            noise_px, cap_px = _measure_noise(matches, number, residuals, _width(noise_px), work)
         width = _width(noise_px)
         fill_basis(d, basis)
         h00, h01, h11, g0, g1 = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(len(matches)):
-            r = residuals[k]
-            x, y, _, leverage = _linearize(matches[k], d, basis, r, cap_px)
-            weight = leverage / (1.0 + (r / width) ** 2) ** 2
-            h00 += weight * x * x
-            h01 += weight * x * y
-            h11 += weight * y * y
-            g0 += weight * x * r
-            g1 += weight * y * r
+        for at in range(0, number, _LANES):
+            first = (at // _LANES) * _BLOCK
+            r = residuals[at : at + _LANES]
+            _linearize(matches[first : first + _BLOCK], d, basis, r, cap_px, lines)
+            for k in range(_LANES):
+                lines[3 * _LANES + k] /= (1.0 + (r[k] / width) ** 2) ** 2
+            for k in range(min(_LANES, number - at)):
+                x, y, weight = lines[k], lines[_LANES + k], lines[3 * _LANES + k]
+                h00 += weight * x * x
+                h01 += weight * x * y
+                h11 += weight * y * y
+                g0 += weight * x * r[k]
+                g1 += weight * y * r[k]
         determinant = h00 * h11 - h01 * h01
         if not determinant > 1e-14 * (h00 + h11) ** 2:
             break  # exactly degenerate, such as identical rays
@@ -168,8 +195,7 @@ def _refine(
         norm = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         for c in range(3):
             d[c] /= norm
-        for k in range(len(matches)):
-            residuals[k] = _residual(matches[k], d)
+        _fill_residuals(matches, d, residuals)
         if step >= _RESCALINGS and length < 1e-10:
             break
     return noise_px, cap_px
@@ -183,7 +209,7 @@ def _width(noise_px: float) -> float:
 
 @inner_kernel
 def _measure_noise(
-    matches: FloatArray, residuals: FloatArray, cutoff_px: float, work: FloatArray
+    matches: FloatArray, number: int, residuals: FloatArray, cutoff_px: float, work: FloatArray
 ) -> tuple[float, float]:
     """Return the noise and the leverage cap in px, from the matches whose residual is below the cutoff.
 
@@ -191,16 +217,17 @@ def _measure_noise(
     taken from matches with parallax: few near points among many far ones are not suspicious.
     """
     count, seen = 0, 0
-    for k in range(len(matches)):
+    for k in range(number):
         if abs(residuals[k]) < cutoff_px:
             work[count] = abs(residuals[k])
             count += 1
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
     noise_px = max(SIGMA_PER_MEDIAN * median(work, int(count)) * count / (count - 2.0), _MIN_NOISE_PX)
-    for k in range(len(matches)):
-        if abs(residuals[k]) < cutoff_px and matches[k, 9] > _VOTE_SIGMAS * noise_px:
-            work[seen] = matches[k, 9]
+    for k in range(number):
+        parallax_px = matches[_place(k) + 9 * _LANES]
+        if abs(residuals[k]) < cutoff_px and parallax_px > _VOTE_SIGMAS * noise_px:
+            work[seen] = parallax_px
             seen += 1
     if seen < MIN_MATCHES:
         return noise_px, np.inf
@@ -266,31 +293,35 @@ def fill_basis(d: FloatArray, basis: FloatArray) -> None:
 
 @inner_kernel
 def _linearize(
-    match: FloatArray, d: FloatArray, basis: FloatArray, residual: float, cap_px: float
-) -> tuple[float, float, float, float]:
-    """Return what a match says as d moves orthogonally to itself.
+    m: FloatArray, d: FloatArray, basis: FloatArray, residuals: FloatArray, cap_px: float, lines: FloatArray
+) -> None:
+    """Fill what the matches of a block say as d moves orthogonally to itself, 4 times _LANES numbers.
 
-    The derivatives of its Sampson error along the two axes of the basis; |a x d|^2 + |b x d|^2, which divides
-    the error's square; its weight by its parallax alone, (cap / parallax)^2 beyond the cap.
+    The derivatives of their Sampson errors along the two axes of the basis; |a x d|^2 + |b x d|^2, which
+    divides the error's square; their weights by their parallax alone, (cap / parallax)^2 beyond the cap.
     """
-    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
-    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
-    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
-    root = np.sqrt(square)
-    x, y = basis[0], basis[1]
-    turn_x = along_a * (match[0] * x[0] + match[1] * x[1] + match[2] * x[2])
-    turn_x += along_b * (match[3] * x[0] + match[4] * x[1] + match[5] * x[2])
-    turn_y = along_a * (match[0] * y[0] + match[1] * y[1] + match[2] * y[2])
-    turn_y += along_b * (match[3] * y[0] + match[4] * y[1] + match[5] * y[2])
-    by_x = (match[6] * x[0] + match[7] * x[1] + match[8] * x[2]) / root + residual * turn_x / square
-    by_y = (match[6] * y[0] + match[7] * y[1] + match[8] * y[2]) / root + residual * turn_y / square
-    ratio = cap_px / max(match[9], 1e-300)
-    return by_x, by_y, square, min(1.0, ratio * ratio)
+    d0, d1, d2, x0, x1, x2 = d[0], d[1], d[2], basis[0, 0], basis[0, 1], basis[0, 2]
+    y0, y1, y2 = basis[1, 0], basis[1, 1], basis[1, 2]
+    for k in range(_LANES):
+        a0, a1, a2 = m[k], m[_LANES + k], m[2 * _LANES + k]
+        b0, b1, b2 = m[3 * _LANES + k], m[4 * _LANES + k], m[5 * _LANES + k]
+        n0, n1, n2 = m[6 * _LANES + k], m[7 * _LANES + k], m[8 * _LANES + k]
+        along_a, along_b = a0 * d0 + a1 * d1 + a2 * d2, b0 * d0 + b1 * d1 + b2 * d2
+        square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+        root, residual = np.sqrt(square), residuals[k]
+        turn_x = along_a * (a0 * x0 + a1 * x1 + a2 * x2) + along_b * (b0 * x0 + b1 * x1 + b2 * x2)
+        turn_y = along_a * (a0 * y0 + a1 * y1 + a2 * y2) + along_b * (b0 * y0 + b1 * y1 + b2 * y2)
+        ratio = cap_px / max(m[9 * _LANES + k], 1e-300)
+        lines[k] = (n0 * x0 + n1 * x1 + n2 * x2) / root + residual * turn_x / square
+        lines[_LANES + k] = (n0 * y0 + n1 * y1 + n2 * y2) / root + residual * turn_y / square
+        lines[2 * _LANES + k] = square
+        lines[3 * _LANES + k] = min(1.0, ratio * ratio)
 
 
 @inner_kernel
 def _fill_moments(
     matches: FloatArray,
+    number: int,
     d: FloatArray,
     residuals: FloatArray,
     noise_px: float,
@@ -306,12 +337,16 @@ def _fill_moments(
     width = _width(noise_px)
     total, curved, squared, count = 0.0, 0.0, 0.0, 0
     feigned, basis, jacobian = np.empty((3, 3)), np.empty((2, 3)), np.empty(3)
+    lines = np.empty(4 * _LANES)
     fill_basis(d, basis)
     flat, steep = moments[0], moments[1]
     feigned[:] = 0.0
-    for k in range(len(matches)):
-        r, match = residuals[k], matches[k]
-        x, y, square, leverage = _linearize(match, d, basis, r, cap_px)
+    for k in range(number):
+        r, match, lane = residuals[k], matches[_place(k) :], k % _LANES
+        if lane == 0:
+            _linearize(match[:_BLOCK], d, basis, residuals[k : k + _LANES], cap_px, lines)
+        x, y = lines[lane], lines[_LANES + lane]
+        square, leverage = lines[2 * _LANES + lane], lines[3 * _LANES + lane]
         u = (r / width) ** 2
         w = 1.0 / (1.0 + u) ** 2
         count += u < 1.0
@@ -324,7 +359,8 @@ def _fill_moments(
             for column in range(3):
                 outer = w * leverage * jacobian[row] * jacobian[column]
                 noise = 2.0 if row == column else 0.0
-                noise = noise - match[row] * match[column] - match[3 + row] * match[3 + column]
+                noise = noise - match[row * _LANES] * match[column * _LANES]
+                noise = noise - match[(3 + row) * _LANES] * match[(3 + column) * _LANES]
                 flat[row, column] += outer
                 steep[row, column] += leverage * outer
                 feigned[row, column] += leverage * w * r * r * noise / square
@@ -338,19 +374,26 @@ def _fill_moments(
 
 @inner_kernel
 def _count_sides(
-    matches: FloatArray, d: FloatArray, threshold_px: float, noise_px: float
+    matches: FloatArray,
+    number: int,
+    d: FloatArray,
+    residuals: FloatArray,
+    threshold_px: float,
+    noise_px: float,
 ) -> tuple[int, int, int]:
     """Return the votes on the sign of d: how many matches that agree with d meet in front of both cameras for
     the baseline +d, how many behind both, and how many have enough parallax to vote.
     """
     front, behind, voters = 0, 0, 0
     vote_px = max(_MIN_VOTE_PX, _VOTE_SIGMAS * noise_px)
-    for k in range(len(matches)):
-        match = matches[k]
-        if match[9] > vote_px and abs(_residual(match, d)) <= threshold_px:
-            cosine = match[0] * match[3] + match[1] * match[4] + match[2] * match[5]
-            along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
-            along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
+    for k in range(number):
+        match = matches[_place(k) :]
+        if match[9 * _LANES] > vote_px and abs(residuals[k]) <= threshold_px:
+            cosine, along_a, along_b = 0.0, 0.0, 0.0
+            for c in range(3):
+                cosine += match[c * _LANES] * match[(3 + c) * _LANES]
+                along_a += match[c * _LANES] * d[c]
+                along_b += match[(3 + c) * _LANES] * d[c]
             depth_i, depth_j = cosine * along_b - along_a, along_b - cosine * along_a
             voters += 1
             front += depth_i > 0.0 and depth_j > 0.0
@@ -361,6 +404,7 @@ def _count_sides(
 @inner_kernel
 def _measure(
     matches: FloatArray,
+    number: int,
     d: FloatArray,
     residuals: FloatArray,
     threshold_px: float,
@@ -369,13 +413,15 @@ def _measure(
     measures: FloatArray,
 ) -> float:
     """Fill what the inliers say, see MEASURES; return the sign of d with more points in front."""
-    front, behind, voters = _count_sides(matches, d, threshold_px, noise_px)
-    sizes, angles, count = np.empty(len(matches)), np.empty(len(matches)), 0
-    for k in range(len(matches)):
+    front, behind, voters = _count_sides(matches, number, d, residuals, threshold_px, noise_px)
+    sizes, angles, count = np.empty(number), np.empty(number), 0
+    for k in range(number):
         if abs(residuals[k]) <= threshold_px:
-            match = matches[k]
-            cosine = match[0] * match[3] + match[1] * match[4] + match[2] * match[5]
-            sizes[count], angles[count] = abs(residuals[k]), np.arctan2(match[9] * pixel_angle, cosine)
+            match, cosine = matches[_place(k) :], 0.0
+            for c in range(3):
+                cosine += match[c * _LANES] * match[(3 + c) * _LANES]
+            sizes[count] = abs(residuals[k])
+            angles[count] = np.arctan2(match[9 * _LANES] * pixel_angle, cosine)
             count += 1
     measures[0], measures[1], measures[2], measures[3] = count, max(front, behind), min(front, behind), voters
     if count > 0:
@@ -386,6 +432,7 @@ def _measure(
 @inner_kernel
 def _count_rivals(
     matches: FloatArray,
+    number: int,
     residuals: FloatArray,
     threshold_px: float,
     noise_px: float,
@@ -394,18 +441,21 @@ def _count_rivals(
 ) -> None:
     """Fill how many of the others agree on a second direction, in front, and how many inliers do not."""
     measures[5] = measures[0]
-    others, count = np.empty((len(matches), 10)), 0
-    for k in range(len(matches)):
+    others, rivals, count = np.zeros(len(matches)), np.empty(len(residuals)), 0
+    for k in range(number):
         if abs(residuals[k]) > 2.0 * max(threshold_px, 2.0 * noise_px):
-            for c in range(10):
-                others[count, c] = matches[k, c]
+            other, match = others[_place(count) :], matches[_place(k) :]
+            for c in range(_NUMBERS):
+                other[c * _LANES] = match[c * _LANES]
             count += 1
     if count < MIN_MATCHES:
         return
     d = np.empty(3)
-    _find_hypothesis(others[:count], threshold_px, num_hypotheses, d)
-    front, behind, _ = _count_sides(others[:count], d, threshold_px, noise_px)
+    _find_hypothesis(others, count, threshold_px, num_hypotheses, d)
+    _fill_residuals(others, d, rivals)
+    front, behind, _ = _count_sides(others, count, d, rivals, threshold_px, noise_px)
+    _fill_residuals(matches, d, rivals)
     loyal = 0
-    for k in range(len(matches)):
-        loyal += abs(residuals[k]) <= threshold_px and abs(_residual(matches[k], d)) > threshold_px
+    for k in range(number):
+        loyal += abs(residuals[k]) <= threshold_px and abs(rivals[k]) > threshold_px
     measures[4], measures[5] = max(front, behind), loyal

@@ -28,13 +28,15 @@ class RelativeRotations:
     """(k,) n, the inlier matches of the database."""
     weight_shares: FloatArray
     """(k,) W, the mean robust weight of a pair's matches, in (0, 1]: how well one pose explains them."""
+    translations: FloatArray | None = None
+    """(k, 3) unit vectors in axes of camera j, with which the rotations were found; None where none was."""
 
     def subset(self, rows: IntArray | BoolArray) -> Self:
         """Return the given pairs, in that order."""
         columns: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(RelativeRotations)
         }
-        return replace(self, **{name: column[rows] for name, column in columns.items()})
+        return replace(self, **{name: column[rows] for name, column in columns.items() if column is not None})
 
     def residuals_deg(self, rotations: FloatArray) -> FloatArray:
         """Return the angle between each pair's rotation and that of absolute rotations (n, 3, 3), (k,)."""

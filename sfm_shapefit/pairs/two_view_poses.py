@@ -49,6 +49,7 @@ _NARROWING_STEPS = 3  # steps over which the width falls; in equal ratios
 _STEPS = 12  # steps, a bound; most pairs converge in fewer
 _LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
 _CONVERGED_RAD = 1e-7  # radians; a shorter step is the last
+_LANES = 32  # matches that are linearized at once, a multiple of what processors compute at once
 _UNKNOWNS = 5  # three of the rotation, two of the unit translation; its length is free
 _LEAST_PIVOT = 1e-13  # share of the trace; a smaller pivot is rounding, a parallax of 3e-7 focal lengths
 _LEAST_INFORMATION = 1.0  # rad^-2; a rotation is never known less
@@ -123,13 +124,18 @@ def refine_pairs(
     system, basis, step = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.empty((2, 3)), np.empty(_UNKNOWNS)
     for p in range(begin, end):
         first, last = offsets[p], offsets[p + 1]
-        a, b, count = rays_i[first:last], rays_j[first:last], last - first
+        count = last - first
+        rays = np.zeros(-(-count // _LANES) * 6 * _LANES)
+        for k in range(count):
+            ray = rays[(k // _LANES) * 6 * _LANES + k % _LANES :]
+            for c in range(3):
+                ray[c * _LANES], ray[(3 + c) * _LANES] = rays_i[first + k, c], rays_j[first + k, c]
         rotation, t = rotations[p], translations[p]
         sizes = np.empty(count)
         width_px = _FIRST_WIDTH_PX
         for k in range(_STEPS):
             fill_basis(t, basis)
-            _fill_system(a, b, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
+            _fill_system(rays, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
             length = _solve(system, step)
             _move(step, min(1.0, _LONGEST_STEP_RAD / max(length, 1e-300)), basis, rotation, t)
             if k >= _NARROWING_STEPS - 1 and length < _CONVERGED_RAD:
@@ -137,15 +143,14 @@ def refine_pairs(
             if k < _NARROWING_STEPS - 1:
                 width_px *= (LAST_WIDTH_PX / _FIRST_WIDTH_PX) ** (1.0 / (_NARROWING_STEPS - 1))
         fill_basis(t, basis)
-        total = _fill_system(a, b, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
+        total = _fill_system(rays, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
         weight_shares[p] = total / max(count, 1)
         _fill_information(system, sizes, width_px, information[p])
 
 
 @inner_kernel
 def _fill_system(
-    a: FloatArray,
-    b: FloatArray,
+    rays: FloatArray,
     pixel_angle: float,
     rotation: FloatArray,
     t: FloatArray,
@@ -156,57 +161,74 @@ def _fill_system(
 ) -> float:
     """Fill the lower triangle of sum w (J, r) (J, r)^T (6, 6), and |r| of each match in px; return sum w.
 
-    Unknowns are the translation along the two axes of `basis` and the rotation w, in this order.
+    Unknowns are the translation along the two axes of `basis` and the rotation w, in this order. `rays` has, by
+    blocks of _LANES matches, their first rays, coordinate by coordinate, then their second ones.
     """
-    line = np.empty(_UNKNOWNS + 1)
-    total = 0.0
+    lines, count, total = np.empty((_UNKNOWNS + 2) * _LANES), len(sizes), 0.0
     for row in range(_UNKNOWNS + 1):
         for column in range(_UNKNOWNS + 1):
             system[row, column] = 0.0
-    for k in range(len(a)):
-        _linearize(a[k], b[k], pixel_angle, rotation, t, basis, line)
-        ratio = line[_UNKNOWNS] / width_px
-        weight = 1.0 / (1.0 + ratio * ratio)
-        weight *= weight
-        total += weight
-        sizes[k] = abs(line[_UNKNOWNS])
-        for row in range(_UNKNOWNS + 1):
-            weighted = weight * line[row]
-            for column in range(row + 1):
-                system[row, column] += weighted * line[column]
+    for at in range(0, count, _LANES):
+        _linearize(rays[6 * at : 6 * (at + _LANES)], pixel_angle, rotation, t, basis, width_px, lines)
+        for k in range(min(_LANES, count - at)):
+            line = lines[k:]
+            weight = line[(_UNKNOWNS + 1) * _LANES]
+            total += weight
+            sizes[at + k] = abs(line[_UNKNOWNS * _LANES])
+            for row in range(_UNKNOWNS + 1):
+                weighted = weight * line[row * _LANES]
+                for column in range(row + 1):
+                    system[row, column] += weighted * line[column * _LANES]
     return total
 
 
 @inner_kernel
 def _linearize(
-    a: FloatArray,
-    b: FloatArray,
+    m: FloatArray,
     pixel_angle: float,
     rotation: FloatArray,
     t: FloatArray,
     basis: FloatArray,
-    line: FloatArray,
+    width_px: float,
+    lines: FloatArray,
 ) -> None:
-    """Fill a residual's derivatives by the five unknowns, then it in px; q has a floor along the baseline."""
-    a0 = rotation[0, 0] * a[0] + rotation[0, 1] * a[1] + rotation[0, 2] * a[2]
-    a1 = rotation[1, 0] * a[0] + rotation[1, 1] * a[1] + rotation[1, 2] * a[2]
-    a2 = rotation[2, 0] * a[0] + rotation[2, 1] * a[1] + rotation[2, 2] * a[2]
-    b0, b1, b2, t0, t1, t2 = b[0], b[1], b[2], t[0], t[1], t[2]
-    n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-    along_a, along_b = a0 * t0 + a1 * t1 + a2 * t2, b0 * t0 + b1 * t1 + b2 * t2
-    q = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
-    scale = 1.0 / (np.sqrt(q) * pixel_angle)
-    e = n0 * t0 + n1 * t1 + n2 * t2
-    by_a, by_b = e * along_a / q, e * along_b / q
-    d0, d1, d2 = n0 + by_a * a0 + by_b * b0, n1 + by_a * a1 + by_b * b1, n2 + by_a * a2 + by_b * b2
-    line[0] = scale * (d0 * basis[0, 0] + d1 * basis[0, 1] + d2 * basis[0, 2])
-    line[1] = scale * (d0 * basis[1, 0] + d1 * basis[1, 1] + d2 * basis[1, 2])
-    # Both terms are a' x (...).
-    m0, m1, m2 = b1 * t2 - b2 * t1 + by_a * t0, b2 * t0 - b0 * t2 + by_a * t1, b0 * t1 - b1 * t0 + by_a * t2
-    line[2] = scale * (a1 * m2 - a2 * m1)
-    line[3] = scale * (a2 * m0 - a0 * m2)
-    line[4] = scale * (a0 * m1 - a1 * m0)
-    line[5] = scale * e
+    """Fill a block's derivatives by the five unknowns, its residuals in px, then its weights, 7 x _LANES.
+
+    q has a floor along the baseline.
+    """
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    x0, x1, x2, y0, y1, y2 = basis[0, 0], basis[0, 1], basis[0, 2], basis[1, 0], basis[1, 1], basis[1, 2]
+    t0, t1, t2 = t[0], t[1], t[2]
+    for k in range(_LANES):
+        p0, p1, p2 = m[k], m[_LANES + k], m[2 * _LANES + k]
+        b0, b1, b2 = m[3 * _LANES + k], m[4 * _LANES + k], m[5 * _LANES + k]
+        a0 = r00 * p0 + r01 * p1 + r02 * p2
+        a1 = r10 * p0 + r11 * p1 + r12 * p2
+        a2 = r20 * p0 + r21 * p1 + r22 * p2
+        n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+        along_a, along_b = a0 * t0 + a1 * t1 + a2 * t2, b0 * t0 + b1 * t1 + b2 * t2
+        q = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+        scale = 1.0 / (np.sqrt(q) * pixel_angle)
+        e = n0 * t0 + n1 * t1 + n2 * t2
+        by_a, by_b = e * along_a / q, e * along_b / q
+        d0, d1, d2 = n0 + by_a * a0 + by_b * b0, n1 + by_a * a1 + by_b * b1, n2 + by_a * a2 + by_b * b2
+        # Both terms of the rotation's are a' x (...).
+        m0, m1, m2 = (
+            b1 * t2 - b2 * t1 + by_a * t0,
+            b2 * t0 - b0 * t2 + by_a * t1,
+            b0 * t1 - b1 * t0 + by_a * t2,
+        )
+        ratio = scale * e / width_px
+        weight = 1.0 / (1.0 + ratio * ratio)
+        lines[k] = scale * (d0 * x0 + d1 * x1 + d2 * x2)
+        lines[_LANES + k] = scale * (d0 * y0 + d1 * y1 + d2 * y2)
+        lines[2 * _LANES + k] = scale * (a1 * m2 - a2 * m1)
+        lines[3 * _LANES + k] = scale * (a2 * m0 - a0 * m2)
+        lines[4 * _LANES + k] = scale * (a0 * m1 - a1 * m0)
+        lines[5 * _LANES + k] = scale * e
+        lines[6 * _LANES + k] = weight * weight
 
 
 @inner_kernel

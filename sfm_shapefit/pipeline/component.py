@@ -74,11 +74,12 @@ def _locate_component(
 ) -> LocateResult:
     """Place one component: adjust a first placement, and locate from the rotations of that."""
     images, inputs = run.pose(members, averaging.rotations), run.inputs
+    _, among = pairs_among(relative, members)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
-        _, among = pairs_among(relative, members)
         inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
     given = _given(run, images, inputs)
     source, first = see_matches(run.matches, images, inputs, run.options), None
+    source = replace(source, alone=among)
     if run.options.freedom.adjust != "none":
         with run.clock("first placement"):
             first = adjust_first_placement(given, source, run.options, run.clock)

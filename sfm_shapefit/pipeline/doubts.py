@@ -36,6 +36,9 @@ deviations, of trials 10 %: these end beside the best pose. Pairs turned by 0.5 
 the turn. On photographs (liberty-calibrated) some false pairs would be believed as they are given, so that
 where pairs are fewer all are asked without prejudice. 0.7 is as good on two made rings and a facade.
 """
+_AS_WELL = 0.95
+"""Share of the robust weight with which `map` found a pair's pose; near that pose, with other intrinsics and
+fewer matches, it is the answer again if it keeps as much. Other trials would end there, or at a worse one."""
 _MOST_PAIRS = 40
 """Pairs of a camera that are asked at most, those with most matches; a thousand take more than a second.
 
@@ -68,8 +71,8 @@ def ask_pairs(
     for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.images, batch, rows, _MOST_MATCHES)
-        likely = None
-        if num_pairs > MANY_PAIRS:
+        likely = _poses_alone(source.alone, rays.pairs)
+        if likely is None and num_pairs > MANY_PAIRS:
             asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
             likely = _poses_as_given(source.images, directions, np.array(asked, dtype=np.int64))
         parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
@@ -84,7 +87,19 @@ def _poses_as_given(images: Images, directions: PairDirections, rows: IntArray) 
     i, j = directions.pairs[rows].T
     translations = np.einsum("kab,kb->ka", images.rotations[j], directions.directions[rows])
     translations[fit_as_placed(directions)[rows] < _LIKELY] = np.nan
-    return LikelyPoses(images.rotations[j] @ images.rotations[i].transpose(0, 2, 1), translations)
+    rotations = images.rotations[j] @ images.rotations[i].transpose(0, 2, 1)
+    return LikelyPoses(rotations, translations, np.full(len(rows), _LIKELY))
+
+
+def _poses_alone(alone: RelativeRotations | None, pairs: IntArray) -> LikelyPoses | None:
+    """Return the relative poses that pairs (k, 2) have by themselves, as far as that was asked before."""
+    if alone is None or alone.translations is None or not len(alone.pairs):
+        return None
+    key = np.array([1 + max(int(alone.pairs.max()), int(pairs.max(initial=0))), 1])
+    known, wanted = alone.pairs @ key, pairs @ key
+    rows = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+    translations = np.where((known[rows] == wanted)[:, None], alone.translations[rows], np.nan)
+    return LikelyPoses(alone.rotations[rows], translations, _AS_WELL * alone.weight_shares[rows])
 
 
 def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
@@ -93,7 +108,8 @@ def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> Relativ
     for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.images, batch, rows, _MOST_MATCHES)
-        parts.append(estimate_relative_rotations(rays, threads, num_pairs=len(wanted)))
+        likely = _poses_alone(source.alone, rays.pairs)
+        parts.append(estimate_relative_rotations(rays, threads, num_pairs=len(wanted), likely=likely))
     return concatenate_rotations(parts)
 
 

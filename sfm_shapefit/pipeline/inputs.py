@@ -13,6 +13,7 @@ from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, o
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, View
@@ -31,6 +32,8 @@ class MatchSource:
     inputs: Inputs
     """Where they come from."""
     economy: Economy = ECONOMIES[0]
+    alone: RelativeRotations | None = None
+    """What pairs, ascending, said of their rotations alone, before anything was placed; None if not asked."""
 
     @property
     def images(self) -> Images:

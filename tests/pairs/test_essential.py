@@ -119,7 +119,7 @@ def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_ch
 
     without = estimate_relative_rotations(batch)
     monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
-    likely = LikelyPoses(rotations, translations)
+    likely = LikelyPoses(rotations, translations, np.full(len(rotations), 0.6))
     found = estimate_relative_rotations(batch, likely=likely)
     is_tried = np.array([pair in tried for pair in batch.pairs.tolist()])
     assert is_tried[2::3].all()

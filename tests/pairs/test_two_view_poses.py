@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from sfm_shapefit.base.geometry import angle_between_deg, normalized, rotation_angles_deg
 from sfm_shapefit.pairs.kernels import fill_basis
-from sfm_shapefit.pairs.two_view_poses import _linearize, refine_two_view_poses
+from sfm_shapefit.pairs.two_view_poses import _LANES, _linearize, refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches
 
 PIXEL = 1e-3
@@ -93,7 +93,7 @@ def test_the_information_is_the_inverse_of_the_covariance():
 
 def test_derivatives_are_those_of_differences():
     rng = np.random.default_rng(4)
-    basis, line = np.empty((2, 3)), np.empty(6)
+    basis, lines = np.empty((2, 3)), np.empty(7 * _LANES)
     for _ in range(20):
         a, b, t = normalized(rng.normal(size=(3, 3)))
         turn = Rotation.random(random_state=rng).as_matrix()
@@ -102,14 +102,16 @@ def test_derivatives_are_those_of_differences():
         def residual(unknowns, a=a, b=b, t=t, turn=turn):
             moved = normalized(t + unknowns[:2] @ basis)
             x = Rotation.from_rotvec(unknowns[2:]).as_matrix() @ turn @ a
-            lines = np.cross(x, moved), np.cross(b, moved)
-            return moved @ np.cross(x, b) / np.sqrt(sum(v @ v for v in lines)) / PIXEL
+            ends = np.cross(x, moved), np.cross(b, moved)
+            return moved @ np.cross(x, b) / np.sqrt(sum(v @ v for v in ends)) / PIXEL
 
-        _linearize(a, b, PIXEL, turn, t, basis, line)
+        _linearize(np.repeat([*a, *b], _LANES), PIXEL, turn, t, basis, 1.5, lines)
+        line = lines[_LANES - 1 :: _LANES]
         steps = 1e-5 * np.eye(5)
         differences = [(residual(step) - residual(-step)) / 2e-5 for step in steps]
         assert line[5] == pytest.approx(residual(np.zeros(5)), rel=1e-12)
         np.testing.assert_allclose(line[:5], differences, rtol=1e-6, atol=1e-4)
+        assert line[6] == pytest.approx((1.0 + (line[5] / 1.5) ** 2) ** -2, rel=1e-12)
 
 
 def test_neither_threads_nor_batches_change_a_bit():
