@@ -11,6 +11,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+_LARGE_KB = 400_000  # kilobytes of memory, at most; the program alone takes 230,000
+
 AnyArray = TypeVar("AnyArray", bound=npt.NDArray[Any])
 
 
@@ -33,15 +35,23 @@ def frozen(array: AnyArray) -> AnyArray:
     return view
 
 
+def peak_memory_kb() -> int:
+    """Return the most memory that this process has taken, on Linux."""
+    import resource  # which not every system has
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
 def hand_back_memory() -> None:
     """Hand back what the C library keeps of freed memory, where it is glibc; elsewhere nothing is done.
 
     glibc keeps arrays of up to 32 MB in its heap, of which only the end goes back by itself: one object that
     lives on keeps all below it. After the first placement of 2,500 images that is 345 of 837 MB. To hand it
-    back takes milliseconds, so it is done between stages, and before what takes most.
+    back takes milliseconds, so it is done between stages, and before what takes most; to be given it again
+    takes more, a twentieth of a short run, so a process that has never been large keeps it.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
+    if trim is not None and peak_memory_kb() > _LARGE_KB:
         trim(ctypes.c_size_t(0))
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import llvmlite.binding as llvm
-from numba.core.codegen import JITCodeLibrary
+from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.environment import Environment
 from numba.core.runtime import rtsys
@@ -31,10 +31,12 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
     @classmethod
     def load(cls, codegen: Any, name: str, machine_code: bytes, llvm_code: bytes) -> "LoadedLibrary":
         """Return a library that is ready to run."""
-        library = cls(codegen, name)
-        library.enable_object_caching()
-        library._set_compiled_object(machine_code)
-        library._finalize_final_module()
+        library = cls.__new__(cls)
+        CodeLibrary.__init__(library, codegen, name)  # numba's own sets up a module to compile
+        library._linking_libraries, library._shared_module, library._finalized = [], None, True
+        engine = codegen._engine._ee
+        engine.add_object_file(llvm.ObjectFileRef.from_data(machine_code))
+        engine.finalize_object()
         library._llvm_code = llvm_code
         return library
 
