@@ -327,7 +327,7 @@ def _pull(
     by_points, by_frames = np.empty((longest, 2, 3)), np.zeros((longest, 2, 6))
     errors, weights = np.empty((longest, 2, count + 1)), np.empty(longest)
     basis, p_x, p_y = np.empty(num_fields), np.ones(8), np.ones(8)
-    sums, along = np.empty((3, count + 1)), np.empty(3)
+    sums, along, left = np.empty((3, count + 1)), np.empty(3), np.empty((2, count + 1))
     degree = 0
     while (degree + 1) * (degree + 2) < 2 * num_fields:
         degree += 1
@@ -352,13 +352,13 @@ def _pull(
             y = (pixels[k, 1] - windows[camera, 1]) / windows[camera, 3]
             _write_polynomials(x, y, degree, p_x, p_y, basis)
             for axis in range(2):
-                for s in range(count):
-                    error = 0.0
-                    for a in range(3):
-                        error += by_frames[at, axis, 3 + a] * turns[frame, a, s]
-                    for t in range(num_fields):
-                        error += basis[t] * fields[camera, axis, t, s]
-                    errors[at, axis, s] = error
+                errors[at, axis, :] = 0.0
+                for a in range(3):
+                    for s in range(count):
+                        errors[at, axis, s] += by_frames[at, axis, 3 + a] * turns[frame, a, s]
+                for t in range(num_fields):
+                    for s in range(count):
+                        errors[at, axis, s] += basis[t] * fields[camera, axis, t, s]
                 errors[at, axis, count] = residual[axis]
             for a in range(3):
                 u, v = weights[at] * by_points[at, 0, a], weights[at] * by_points[at, 1, a]
@@ -376,22 +376,25 @@ def _pull(
             w, node = weights[at], node_of_frame[frame_of_camera[cameras[k]]]
             if w == 0.0:
                 continue
+            x_left, y_left = left[0], left[1]
             for s in range(count + 1):
-                left_x, left_y = errors[at, 0, s], errors[at, 1, s]
-                for a in range(3):
-                    left_x -= by_points[at, 0, a] * sums[a, s]
-                    left_y -= by_points[at, 1, a] * sums[a, s]
-                if has_squares:
-                    for q in range(count + 1):
-                        squares[q, s] += w * (errors[at, 0, q] * left_x + errors[at, 1, q] * left_y)
-                if node < 0:
-                    continue
-                for a in range(slots):
-                    pull = w * (by_frames[at, 0, a] * left_x + by_frames[at, 1, a] * left_y)
-                    if s < count:
-                        by_field[node, a, s] += pull
-                    elif has_groups:
-                        by_group[node, a, groups[p]] += pull
+                x_left[s], y_left[s] = errors[at, 0, s], errors[at, 1, s]
+            for a in range(3):
+                for s in range(count + 1):
+                    x_left[s] -= by_points[at, 0, a] * sums[a, s]
+                    y_left[s] -= by_points[at, 1, a] * sums[a, s]
+            if has_squares:
+                for q in range(count + 1):
+                    for s in range(count + 1):
+                        squares[q, s] += w * (errors[at, 0, q] * x_left[s] + errors[at, 1, q] * y_left[s])
+            if node < 0:
+                continue
+            for a in range(slots):
+                by_x, by_y = by_frames[at, 0, a], by_frames[at, 1, a]
+                for s in range(count):
+                    by_field[node, a, s] += w * (by_x * x_left[s] + by_y * y_left[s])
+                if has_groups:
+                    by_group[node, a, groups[p]] += w * (by_x * x_left[count] + by_y * y_left[count])
 
 
 @inner_kernel

@@ -35,24 +35,20 @@ def frozen(array: AnyArray) -> AnyArray:
     return view
 
 
-def peak_memory_kb() -> int:
-    """Return the most memory that this process has taken, on Linux."""
-    import resource  # which not every system has
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
 def hand_back_memory() -> None:
     """Hand back what the C library keeps of freed memory, where it is glibc; elsewhere nothing is done.
 
     glibc keeps arrays of up to 32 MB in its heap, of which only the end goes back by itself: one object that
     lives on keeps all below it. After the first placement of 2,500 images that is 345 of 837 MB. To hand it
-    back takes milliseconds, so it is done between stages, and before what takes most; to be given it again
-    takes more, a twentieth of a short run, so a process that has never been large keeps it.
+    back takes milliseconds, so it is done between stages, and before what takes most. A process that has not
+    been large keeps it: to be given it again takes a twentieth of a short run.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None and peak_memory_kb() > _LARGE_KB:
-        trim(ctypes.c_size_t(0))
+    if trim is not None:
+        import resource  # which not every system has
+
+        if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > _LARGE_KB:
+            trim(ctypes.c_size_t(0))
 
 
 Int32Array = npt.NDArray[np.int32]

@@ -6,6 +6,8 @@ Matches stand in blocks of 32, in each the first numbers of all, then their seco
 each match alone is computed of several at once. Sums are in the order of the matches.
 """
 
+from typing import Any
+
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
@@ -17,8 +19,7 @@ MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual
 """What is counted and measured of a pair, in this order."""
 
 _LANES = 32  # matches of a block; a multiple of what processors compute at once
-_NUMBERS = 10  # of each match
-_BLOCK = _NUMBERS * _LANES  # numbers of a block; of the last one, those without a match are 0
+_BLOCK = 10 * _LANES  # numbers of a block; those without a match, in the last one, are 0
 _MIN_NOISE_PX = 1e-3  # pixels; exact matches still get a finite information
 _WIDTH = 4.0  # kernel width in standard deviations of the noise; 95 % efficient, as simulated
 _MIN_WIDTH_PX = 0.5  # pixels; matches are never better
@@ -34,18 +35,10 @@ _VOTE_SIGMAS = 6.0  # standard deviations of parallax, likewise; without any, ra
 
 @kernel
 def estimate_pairs(
-    begin: int,
-    end: int,
-    offsets: IntArray,
-    rays_i: FloatArray,
-    rays_j: FloatArray,
-    pixel_angles: FloatArray,
-    threshold_px: float,
-    num_hypotheses: int,
-    directions: FloatArray,
-    measures: FloatArray,
-    moments: FloatArray,
-) -> None:
+    begin: int, end: int, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray, pixel_angles: FloatArray,
+    threshold_px: float, num_hypotheses: int, directions: FloatArray, measures: FloatArray, moments:
+    FloatArray,
+) -> None:  # fmt: skip
     """Fill the output rows of the pairs begin..end-1, which hold zeros; MIN_MATCHES at least change them.
 
     Outputs: directions (k, 3); measures (k, 8) in the order of MEASURES; moments (k, 2, 3, 3), the curvature
@@ -71,7 +64,7 @@ def estimate_pairs(
 
 
 @inner_kernel
-def _place(k: int) -> int:
+def _place(k: Any) -> Any:
     """Return where the numbers of match k begin, each _LANES after the last."""
     return (k // _LANES) * _BLOCK + k % _LANES
 
@@ -320,14 +313,9 @@ def _linearize(
 
 @inner_kernel
 def _fill_moments(
-    matches: FloatArray,
-    number: int,
-    d: FloatArray,
-    residuals: FloatArray,
-    noise_px: float,
-    cap_px: float,
+    matches: FloatArray, number: int, d: FloatArray, residuals: FloatArray, noise_px: float, cap_px: float,
     moments: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill the expected curvature of the cost (slice 0) and the variance of its slope (slice 1) at d.
 
     With psi = w r the slope is sum v psi J, so its variance is mean(psi^2) sum v^2 J J^T and its
@@ -374,13 +362,9 @@ def _fill_moments(
 
 @inner_kernel
 def _count_sides(
-    matches: FloatArray,
-    number: int,
-    d: FloatArray,
-    residuals: FloatArray,
-    threshold_px: float,
-    noise_px: float,
-) -> tuple[int, int, int]:
+    matches: FloatArray, number: int, d: FloatArray, residuals: FloatArray, threshold_px: float, noise_px:
+    float,
+) -> tuple[int, int, int]:  # fmt: skip
     """Return the votes on the sign of d: how many matches that agree with d meet in front of both cameras for
     the baseline +d, how many behind both, and how many have enough parallax to vote.
     """
@@ -403,15 +387,9 @@ def _count_sides(
 
 @inner_kernel
 def _measure(
-    matches: FloatArray,
-    number: int,
-    d: FloatArray,
-    residuals: FloatArray,
-    threshold_px: float,
-    noise_px: float,
-    pixel_angle: float,
-    measures: FloatArray,
-) -> float:
+    matches: FloatArray, number: int, d: FloatArray, residuals: FloatArray, threshold_px: float, noise_px:
+    float, pixel_angle: float, measures: FloatArray,
+) -> float:  # fmt: skip
     """Fill what the inliers say, see MEASURES; return the sign of d with more points in front."""
     front, behind, voters = _count_sides(matches, number, d, residuals, threshold_px, noise_px)
     sizes, angles, count = np.empty(number), np.empty(number), 0
@@ -431,21 +409,16 @@ def _measure(
 
 @inner_kernel
 def _count_rivals(
-    matches: FloatArray,
-    number: int,
-    residuals: FloatArray,
-    threshold_px: float,
-    noise_px: float,
-    num_hypotheses: int,
-    measures: FloatArray,
-) -> None:
+    matches: FloatArray, number: int, residuals: FloatArray, threshold_px: float, noise_px: float,
+    num_hypotheses: int, measures: FloatArray,
+) -> None:  # fmt: skip
     """Fill how many of the others agree on a second direction, in front, and how many inliers do not."""
     measures[5] = measures[0]
     others, rivals, count = np.zeros(len(matches)), np.empty(len(residuals)), 0
     for k in range(number):
         if abs(residuals[k]) > 2.0 * max(threshold_px, 2.0 * noise_px):
             other, match = others[_place(count) :], matches[_place(k) :]
-            for c in range(_NUMBERS):
+            for c in range(10):
                 other[c * _LANES] = match[c * _LANES]
             count += 1
     if count < MIN_MATCHES:

@@ -49,7 +49,7 @@ _NARROWING_STEPS = 3  # steps over which the width falls; in equal ratios
 _STEPS = 12  # steps, a bound; most pairs converge in fewer
 _LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
 _CONVERGED_RAD = 1e-7  # radians; a shorter step is the last
-_LANES = 32  # matches that are linearized at once, a multiple of what processors compute at once
+_LANES = 32  # matches that are linearized together; a multiple of what processors compute at once
 _UNKNOWNS = 5  # three of the rotation, two of the unit translation; its length is free
 _LEAST_PIVOT = 1e-13  # share of the trace; a smaller pivot is rounding, a parallax of 3e-7 focal lengths
 _LEAST_INFORMATION = 1.0  # rad^-2; a rotation is never known less
@@ -109,17 +109,9 @@ def refine_two_view_poses(
 
 @kernel
 def refine_pairs(
-    begin: int,
-    end: int,
-    offsets: IntArray,
-    rays_i: FloatArray,
-    rays_j: FloatArray,
-    pixel_angles: FloatArray,
-    rotations: FloatArray,
-    translations: FloatArray,
-    information: FloatArray,
-    weight_shares: FloatArray,
-) -> None:
+    begin: int, end: int, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray, pixel_angles: FloatArray,
+    rotations: FloatArray, translations: FloatArray, information: FloatArray, weight_shares: FloatArray,
+) -> None:  # fmt: skip
     """Refine rotations and translations of the pairs begin..end-1; fill information and weight shares."""
     system, basis, step = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.empty((2, 3)), np.empty(_UNKNOWNS)
     for p in range(begin, end):
@@ -150,19 +142,13 @@ def refine_pairs(
 
 @inner_kernel
 def _fill_system(
-    rays: FloatArray,
-    pixel_angle: float,
-    rotation: FloatArray,
-    t: FloatArray,
-    basis: FloatArray,
-    width_px: float,
-    system: FloatArray,
-    sizes: FloatArray,
-) -> float:
+    rays: FloatArray, pixel_angle: float, rotation: FloatArray, t: FloatArray, basis: FloatArray, width_px:
+    float, system: FloatArray, sizes: FloatArray,
+) -> float:  # fmt: skip
     """Fill the lower triangle of sum w (J, r) (J, r)^T (6, 6), and |r| of each match in px; return sum w.
 
-    Unknowns are the translation along the two axes of `basis` and the rotation w, in this order. `rays` has, by
-    blocks of _LANES matches, their first rays, coordinate by coordinate, then their second ones.
+    Unknowns are the translation along the two axes of `basis` and the rotation w, in this order. `rays` has
+    blocks of _LANES matches: their first rays, coordinate by coordinate, then their second ones.
     """
     lines, count, total = np.empty((_UNKNOWNS + 2) * _LANES), len(sizes), 0.0
     for row in range(_UNKNOWNS + 1):
@@ -184,14 +170,9 @@ def _fill_system(
 
 @inner_kernel
 def _linearize(
-    m: FloatArray,
-    pixel_angle: float,
-    rotation: FloatArray,
-    t: FloatArray,
-    basis: FloatArray,
-    width_px: float,
-    lines: FloatArray,
-) -> None:
+    m: FloatArray, pixel_angle: float, rotation: FloatArray, t: FloatArray, basis: FloatArray, width_px:
+    float, lines: FloatArray,
+) -> None:  # fmt: skip
     """Fill a block's derivatives by the five unknowns, its residuals in px, then its weights, 7 x _LANES.
 
     q has a floor along the baseline.

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     AveragingPairs,
@@ -121,6 +122,7 @@ class _Answer(NamedTuple):
     last: Linearized
 
 
+@one_blas_thread()  # as each factor asks; asked for once, it costs what a small factor does
 def _choose(
     given: AveragingPairs, votes: FloatArray, subsets: list[BoolArray], threads: int
 ) -> AveragedRotations:

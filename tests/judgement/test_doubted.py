@@ -1,5 +1,7 @@
 """Trust by what the pairs say of rotations, on real matches of a bundled scene."""
 
+from contextlib import closing
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,11 +10,18 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs import essential as relative_rotations
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import doubts as doubts_stage
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.doubts import ask_pairs
+from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
+from sfm_shapefit.pipeline.measure import measure
+from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from tests.models import posed
 from tests.problems import turn
 from tests.scenes import BUNDLED, COURTYARD
@@ -108,6 +117,34 @@ def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch
     assert {row.name for row in found.cameras if not row.placed} == wrong
     touching = [any(found.images.names[k] in wrong for k in pair) for pair in tried]
     assert np.mean(touching) > 0.9
+
+
+def test_what_pairs_said_alone_is_the_answer_again_without_trials(monkeypatch):
+    tried, trials = [], relative_rotations._start_by_trials
+
+    def trying(matches, num_pairs):
+        tried.extend(matches.pairs.tolist())
+        return trials(matches, num_pairs)
+
+    model, _ = turned(COURTYARD, (7,), 5.0)
+    images = read_model(model).images
+    with closing(open_database(COURTYARD / "database.db", images.names)) as matches:
+        source = see_matches(matches, images, inputs_from(COURTYARD / "database.db"))
+        directions = measure(source, DirectionOptions(), Clock()).directions
+        alone = measure_rotations(matches.at(images.apart()))
+        anew = ask_pairs(source, directions, 1)
+        monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
+        again = ask_pairs(replace(source, alone=alone), directions, 1)
+        assert len(tried) < 0.1 * len(again.pairs)
+        np.testing.assert_array_equal(again.pairs, anew.pairs)
+        apart = rotation_angles_deg(again.rotations.transpose(0, 2, 1) @ anew.rotations)
+        assert np.quantile(apart, 0.9) < 1e-3  # the same optimum, but of a few pairs that have two
+        # Of pairs that said nothing before, and of those that fit much worse now, the trials decide.
+        tried.clear()
+        better = replace(alone, weight_shares=2.0 * alone.weight_shares).subset(alone.pairs[:, 0] < 5)
+        found = ask_pairs(replace(source, alone=better), directions, 1)
+        np.testing.assert_array_equal(found.rotations, anew.rotations)
+        assert len(tried) == len(anew.pairs)
 
 
 def test_a_camera_that_is_turned_a_little_is_put_right():
