@@ -8,7 +8,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.left_out import WrongLens
+from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
-from sfm_shapefit.judgement.left_out import WrongLens
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
+from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
 
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
@@ -27,10 +27,8 @@ class PairFits:
 
     centers: FloatArray
     """(n, 3) where cameras stand; NaN for those that are not asked."""
-    pairs: IntArray
-    """(k, 2) cameras."""
-    directions: FloatArray
-    """(k, 3) measured; NaN for pairs without one."""
+    directions: PairDirections
+    """As measured."""
     residuals_deg: FloatArray
     """(k,) NaN where there is no direction, or no baseline."""
     level_deg: float
@@ -42,14 +40,14 @@ class PairFits:
 
     def other_places(self) -> tuple[OtherPlace, ...]:
         """Return the cameras for which many of the contradicting pairs agree on another place."""
-        rows = np.isfinite(self.residuals_deg)
-        return find_other_places(
-            self.centers, self.pairs[rows], self.directions[rows], self.agrees[rows], self.level_deg
-        )
+        rows, measured = np.isfinite(self.residuals_deg), self.directions
+        pairs, directions = measured.pairs[rows], measured.directions[rows]
+        return find_other_places(self.centers, pairs, directions, self.agrees[rows], self.level_deg)
 
     def cuts(self) -> tuple[Cut, ...]:
         """Return the groups that contradictions cut off."""
-        return find_cuts(self.pairs[self.agrees], self.pairs[self.contradicts], len(self.centers))
+        pairs = self.directions.pairs
+        return find_cuts(pairs[self.agrees], pairs[self.contradicts], len(self.centers))
 
 
 def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
@@ -66,8 +64,7 @@ def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
     against[directions.contradicting()] = True
     return PairFits(
         centers=centers,
-        pairs=pairs,
-        directions=directions.directions,
+        directions=directions,
         residuals_deg=residuals,
         level_deg=level,
         agrees=usable & (residuals <= limit),

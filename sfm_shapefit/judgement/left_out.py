@@ -11,13 +11,6 @@ of a pixel. Rotation, shift and focal length of the image are then fitted to its
 on a robust loss (Cauchy's), with that covariance carried into the pixels. What an image changes beyond its
 standard deviations is an error of its own, which the fit of the model could not hide.
 
-A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Where one
-took several, their points have bent to a wrong focal length, so that its value shows less than that the
-images ask for unlike ones: it is wrong if half of them change by more than 0.4 % and three deviations. With
-right lenses, no image of 17 scenes changed so, and half of those of a lens changed by 0.2 % at most, or by
-two deviations; with all lenses wrong by 0.8 to 1.3 and the points adjusted to that, half of them changed by
-0.5 % or more.
-
 A focal length is not observable where the other six unknowns can do what it does: before a flat wall that is
 seen from the front, for one. Then the share of its column that they leave, `free_shares`, is tiny, and errors
 that keypoints share, as those of distortion are, grow by one over its root.
@@ -25,12 +18,12 @@ that keypoints share, as those of distortion are, grow by one over its root.
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, normalized
+from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.images import Images, Pictures
@@ -51,11 +44,6 @@ _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where 
 _ANGULAR = ("EQUIRECTANGULAR", "FOV")  # lenses beside the fisheyes whose pictures grow with the angle
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
 
-# Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
-# which half of the images of a lens show that it is; see the header.
-_ONE, _HALF = (0.025, 10.0), (0.004, 3.0)
-_FEWEST_IMAGES = 3  # images of a lens of which a half is asked for; each of fewer is asked alone
-_RIVAL = 0.5  # share of the highest score; what is named as clearly is taken out at once, for time's sake
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
 
@@ -78,40 +66,6 @@ class LeftOut:
     def observable(self) -> BoolArray:
         """Images (i,) whose focal length the points determine; of NaN is none."""
         return np.asarray((self.sigmas <= LARGEST_SIGMA) & (self.free_shares >= _LEAST_FREE))
-
-
-class WrongLens(NamedTuple):
-    """A lens whose images contradict its focal length."""
-
-    lens: int
-    """Its row."""
-    factor: float
-    """Focal length that its images ask for, the median one, over the given one."""
-    sigma: float
-    """Standard deviation of it: by the noise for one image, by the scatter over several."""
-    num_images: int
-    """Images that were asked."""
-    score: float
-    """Change in standard deviations, the median one of its images."""
-
-
-def question_lenses(
-    points: Points, images: Images, pictures: Pictures, threads: int = 1
-) -> tuple[LeftOut, tuple[WrongLens, ...]]:
-    """Return what images say when they are left out, and the lenses that they contradict, the worst first.
-
-    The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
-    the points of all, unless it took half of the images or more, until no other lens is named.
-    """
-    believed = np.ones(images.num_images, dtype=np.bool_)
-    while True:
-        left_out = leave_one_out(points, images, pictures, threads, believed)
-        wrong = wrong_lenses(left_out, images)
-        fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
-        gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= _RIVAL * fresh[0].score])
-        if not fresh or 2 * np.sum(~believed | gone) >= images.num_images:
-            return left_out, wrong
-        believed &= ~gone
 
 
 def leave_one_out(
@@ -155,27 +109,6 @@ def leave_one_out(
         with ThreadPoolExecutor(threads) as pool:
             list(pool.map(run, cuts[:-1], cuts[1:]))
     return LeftOut(counts, *figures.T)
-
-
-def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
-    """Return the lenses that the images contradict when they are left out, the most contradicted first."""
-    found = []
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scores = np.abs(left_out.log_factors) / left_out.sigmas
-    for lens in range(len(images.lenses)):
-        rows = np.flatnonzero((images.lens_of == lens) & left_out.observable)
-        changes = left_out.log_factors[rows]
-        if not len(rows):
-            continue
-        least, deviations = _HALF if len(rows) >= _FEWEST_IMAGES else _ONE
-        middle = float(np.median(changes))
-        sigma = float(left_out.sigmas[rows].max())
-        if len(rows) >= _FEWEST_IMAGES:
-            sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
-        score = float(np.median(scores[rows]))
-        if np.median(np.abs(changes)) > least and score > deviations:
-            found.append(WrongLens(lens, float(np.exp(middle)), sigma, len(rows), score))
-    return tuple(sorted(found, key=lambda item: -item.score))
 
 
 def _look(points: Points, images: Images, pictures: Pictures) -> tuple[Points, FloatArray, FloatArray]:

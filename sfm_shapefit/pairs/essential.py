@@ -169,23 +169,17 @@ def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray
 
 def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return which pairs got a pose, (k,), their rotations (k, 3, 3) and unit translations (k, 3)."""
-    k, counts = len(matches.pairs), np.diff(matches.offsets)
+    k, tried = len(matches.pairs), matches.thinned(_TRIAL_MATCHES)
     rotations, translations = np.full((k, 3, 3), np.nan), np.full((k, 3), np.nan)
-    tried = np.minimum(counts, _TRIAL_MATCHES)
-    ends = np.append(0, np.cumsum(tried))
-    position = np.arange(ends[-1]) - np.repeat(ends[:-1], tried)
-    rows = np.repeat(matches.offsets[:-1], tried) + position * np.repeat(counts, tried) // np.repeat(
-        tried, tried
-    )
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=1, height=1, params=[2.0 * np.pi, np.pi])
-    pixels = [camera.img_from_cam(rays[rows]) for rays in (matches.rays_i, matches.rays_j)]
+    pixels = [np.asarray(camera.img_from_cam(rays)) for rays in (tried.rays_i, tried.rays_j)]
     options = pycolmap.RANSACOptions()
     options.min_num_trials, options.max_num_trials, options.random_seed = _LEAST_TRIALS, _MOST_TRIALS, 0
     if num_pairs > MANY_PAIRS:
         options.mergedict(_FEWER_TRIALS)
     for p in range(k):
         options.max_error = _INLIER_PX * float(matches.pixel_angles[p])
-        first, second = (side[ends[p] : ends[p + 1]] for side in pixels)
+        first, second = (side[tried.offsets[p] : tried.offsets[p + 1]] for side in pixels)
         estimate = pycolmap.estimate_essential_matrix(first, second, camera, camera, options)
         if estimate is None:
             continue

@@ -1,9 +1,8 @@
 """`check MODEL`: the verdict on a COLMAP model as it stands; nothing is placed.
 
-A pair contradicts the model if the direction that its matches say is off the model's baseline by more than a
-degree, and by more than six times what is usual. A camera is weak if it sees fewer than 30 points, if its
-reprojection error is above 0.75 px and above twice what is usual, if its points cover less than 15 % of the
-picture, or if more than a third of its pairs contradict it, and more than twice the usual share.
+Which pairs contradict the model `judgement.evidence` says. A camera is weak if it sees fewer than 30 points,
+if its reprojection error is above 0.75 px and above twice what is usual, if its points cover less than 15 %
+of the picture, or if more than a third of its pairs contradict it, and more than twice the usual share.
 
 A model is not to be used if its pairs say nothing of where its cameras stand, if they are typically off by
 more than 5 degrees, or if less than a quarter of them agree; else its weak cameras are to be looked at.
@@ -36,14 +35,13 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, fit_pairs
 from sfm_shapefit.judgement.grade import (
     LEAST_PAIRS,
     MOST_LEVEL_DEG,
@@ -55,7 +53,6 @@ from sfm_shapefit.judgement.grade import (
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
@@ -69,7 +66,6 @@ if TYPE_CHECKING:
     from sfm_shapefit.report.drawing import Drawing
 
 # The header says what set these limits.
-_FAR_DEG, _FAR_LEVELS = 1.0, 6.0  # degrees and usual levels; a pair that is off by both contradicts the model
 _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
 _LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _LEAST_COVERAGE = 0.15  # share of the picture with points; an image with less is weak
@@ -148,10 +144,10 @@ def check_source(
         options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
-    quality, directions = _measure(model, matches, options, clock)
-    pairs, level_deg = _judge_pairs(model.images, directions)
+    quality, fits = _measure(model, matches, options, clock)
+    pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     cameras = _judge_cameras(model, quality, pairs)
-    evidence = _question(model, matches, directions, clock)
+    evidence = _question(model, matches, fits, clock)
     verdict = _grade(model, cameras, pairs, level_deg, weigh_evidence(evidence, model.images))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
@@ -163,58 +159,48 @@ def check_source(
 
 def _measure(
     model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
-) -> tuple[ImageQuality, PairDirections | None]:
-    """Return how well points hold the images, and the directions of pairs; None where no pair shares any."""
+) -> tuple[ImageQuality, PairFits | None]:
+    """Return how well points hold the images, and how pairs fit; None where no pair shares matches."""
     images = model.images
     with clock("points"):
         pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
         quality = image_quality(points_of(model.reconstruction, images), images, pictures)
     with clock("directions"):
         try:
-            return quality, measure(matches, options, clock).directions
+            return quality, fit_pairs(images.centers, measure(matches, options, clock).directions)
         except UnsolvableError:
             return quality, None
 
 
-def _question(
-    model: ColmapModel, matches: MatchSource, directions: PairDirections | None, clock: Clock
-) -> ModelEvidence:
+def _question(model: ColmapModel, matches: MatchSource, fits: PairFits | None, clock: Clock) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use."""
     images, evidence = model.images, ModelEvidence()
     with clock("evidence"):
-        if directions is not None:
-            evidence = question_pairs(matches, directions, images.centers, clock.threads)
+        if fits is not None:
+            evidence = question_pairs(matches, fits, clock.threads)
         points = points_of(model.reconstruction, images)
         pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
         return gather_evidence(images, points, pictures, evidence, clock.threads)
 
 
-def _judge_pairs(images: Images, directions: PairDirections | None) -> tuple[list[PairRow], float]:
-    """Return a row per pair, and the level of the residuals in degrees; NaN where no pair has any."""
-    if directions is None:
-        return [], np.nan
-    i, j = directions.pairs.T
-    usable, baselines = directions.usable(), images.centers[i] - images.centers[j]
-    usable = usable[np.linalg.norm(baselines[usable], axis=1) > 0.0]
-    residuals = np.full(len(i), np.nan)
-    residuals[usable] = angle_between_deg(directions.directions[usable], normalized(baselines[usable]))
-    level = SIGMA_PER_MEDIAN * float(np.median(residuals[usable])) if len(usable) else np.nan
-    limit = max(_FAR_DEG, _FAR_LEVELS * min(np.nan_to_num(level), MOST_LEVEL_DEG))
-    rows = []
+def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
+    """Return a row per pair."""
+    rows, directions = [], fits.directions
     for e, status in enumerate(directions.status):
-        is_judged = bool(np.isfinite(residuals[e]))
+        i, j = directions.pairs[e]
+        is_judged = bool(np.isfinite(fits.residuals_deg[e]))
         rows.append(
             PairRow(
-                name1=images.names[i[e]],
-                name2=images.names[j[e]],
+                name1=images.names[i],
+                name2=images.names[j],
                 direction=tuple(directions.directions[e].tolist()) if is_judged else (),
                 support=int(directions.num_inliers[e]),
-                residual_deg=float(residuals[e]),
-                verdict=(Verdict.INLIER if residuals[e] <= limit else Verdict.OUTLIER).value,
+                residual_deg=float(fits.residuals_deg[e]),
+                verdict=(Verdict.INLIER if fits.agrees[e] else Verdict.OUTLIER).value,
                 reason="" if is_judged else status.value,
             )
         )
-    return rows, level
+    return rows
 
 
 def _judge_cameras(model: ColmapModel, quality: ImageQuality, pairs: list[PairRow]) -> list[CameraRow]:

@@ -235,21 +235,12 @@ def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
 
 def _thin(images: Images, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:
     """Return some pairs with at most so many matches, taken evenly, their rays in camera axes."""
-    counts = np.diff(batch.offsets)[rows]
-    taken = np.minimum(counts, most)
-    offsets = np.append(0, np.cumsum(taken))
-    position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
-    chosen = np.repeat(batch.offsets[:-1][rows], taken) + position * np.repeat(counts, taken) // np.repeat(
-        taken, taken
+    thin = batch.rays_of(rows).thinned(most)
+    turns = np.repeat(images.rotations[thin.pairs], np.diff(thin.offsets), axis=0)
+    rays_i, rays_j = (
+        np.einsum("kab,kb->ka", turns[:, side], own) for side, own in enumerate((thin.rays_i, thin.rays_j))
     )
-    pairs = batch.pairs[rows]
-    rays = []
-    for side, own in ((0, batch.rays_i), (1, batch.rays_j)):
-        rotations = images.rotations[np.repeat(pairs[:, side], taken)]
-        rays.append(np.einsum("kab,kb->ka", rotations, own[chosen]))
-    return RayMatches(
-        pairs=pairs, offsets=offsets, rays_i=rays[0], rays_j=rays[1], pixel_angles=batch.pixel_angles[rows]
-    )
+    return replace(thin, rays_i=rays_i, rays_j=rays_j)
 
 
 def _agreements(placement: Judged, directions: PairDirections) -> FloatArray:

@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
-from sfm_shapefit.judgement.left_out import question_lenses
+from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.seams import Cut, Seam, find_seams
-from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images, Pictures
@@ -29,18 +27,14 @@ def gather_evidence(
     return ModelEvidence(lenses=lenses, places=pairs.places, seams=pairs.seams)
 
 
-def question_pairs(
-    source: MatchSource, directions: PairDirections, centers: FloatArray, threads: int
-) -> ModelEvidence:
+def question_pairs(source: MatchSource, fits: PairFits, threads: int) -> ModelEvidence:
     """Return what the pairs of a source say against where its images stand.
 
     Args:
         source: the images, at the rotations of the model, and their matches.
-        directions: of all pairs, at these rotations.
-        centers: (i, 3) of the images, in any scale; NaN for those that are not in the model.
+        fits: of all pairs, their directions measured at these rotations.
         threads: number of threads to use.
     """
-    fits = fit_pairs(centers, directions)
     return ModelEvidence(places=fits.other_places(), seams=_question_cuts(source, fits.cuts(), threads))
 
 

@@ -22,7 +22,6 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
-from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -38,7 +37,7 @@ from sfm_shapefit.facts.warnings import (
 )
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import build_seed
-from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.pipeline.adjustment import (
     adjust_placed,
@@ -50,7 +49,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
-from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, GaugeRule
+from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.known import bring_to_known
@@ -67,8 +66,7 @@ from sfm_shapefit.pipeline.rigs import place_cameras
 from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
-from sfm_shapefit.placement.options import Scale
-from sfm_shapefit.placement.prior_pairs import compare_with_priors
+from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.scene.images import Images
 
 _SMALLEST_ADJUSTED = 8
@@ -148,13 +146,10 @@ def finish_piece(
         intrinsics = intrinsics.after(seeded.adjusted, before.lenses_of(seeded.adjusted.images))
     sensors = _refined_sensors(stand, first, seeded.adjusted)
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
-    images, source, directions = seeded.images, stand.source, stand.directions
-    unsupported = [images.names[k] for k in np.flatnonzero(seeded.unsupported).tolist()]
-    centers = images.centers
+    images, source = seeded.images, stand.source
     kept &= images.is_posed[judged.cameras]
     with clock("trust"):
         evidence = _question(stand, kept, seeded, clock)
-    told = tell_evidence(evidence, images, gauge.similarity.scale, gauge.axes)
     # What adjustments or points say of a lens is known better than by the matches of pairs.
     named = {wrong.lens for wrong in evidence.lenses}
     focal_doubts = tuple(
@@ -165,19 +160,15 @@ def finish_piece(
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
-    prior_angles = None
-    priors = given.known.priors
-    if priors is not None and gauge.scale == "prior" and gauge.axes is not None:
-        prior_angles = compare_with_priors(directions.pairs, directions.directions, priors, gauge, centers)
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
-    return LocateResult(
+    found = LocateResult(
         reconstruction=reconstruction,
         inputs=given.inputs,
         options=options,
         images=source.images,
         placed=images,
         image_names=given.template.image_names,
-        directions=directions,
+        directions=stand.directions,
         placement=judged,
         kept=kept,
         num_seen=seeded.num_seen,
@@ -189,19 +180,10 @@ def finish_piece(
         adjustment=stand.adjustment,
         turned_deg=turned,
         timings_s=clock.seconds,
-        warnings=(
-            *told.statements,
-            *focal_warnings(source.images.lenses, focal_doubts, intrinsics.undetermined),
-            *intrinsics_warnings(intrinsics.rows(images)),
-            *_collect_warnings(stand, judged, kept, seeded.points.num_points),
-            *prior_warnings(prior_angles, directions.pairs, images.names),
-            *_gauge_warnings(given.rule, gauge, centers, options.gauge.scale),
-            *brought.warnings,
-            *support_warnings(unsupported, is_kept=options.trust.min_trust == 0.0),
-        ),
+        warnings=(),
         fixed=given.rigid.fixed,
         distances=given.distances,
-        prior_angles=prior_angles,
+        prior_angles=_compare_with_priors(stand, images, gauge),
         focal_doubts=tuple(one._replace(camera=images.lenses[one.camera].id) for one in focal_doubts),
         evidence=evidence,
         intrinsics=intrinsics,
@@ -209,6 +191,8 @@ def finish_piece(
         control_points=brought.control_points,
         suspicions=stand.failures,
     )
+    doubts = focal_warnings(source.images.lenses, focal_doubts, intrinsics.undetermined)
+    return replace(found, warnings=(*doubts, *_warnings(found, stand), *brought.warnings))
 
 
 def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
@@ -263,7 +247,7 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     placement, source = stand.placement, stand.source
     centers = np.full((source.images.num_images, 3), np.nan)
     centers[placement.cameras[kept]] = placement.locations[kept]
-    pairs = question_pairs(source, stand.directions, centers, clock.threads)
+    pairs = question_pairs(source, fit_pairs(centers, stand.directions), clock.threads)
     pictures = ModelPictures(seeded.images, source.view.keypoints)
     return gather_evidence(seeded.images, seeded.points, pictures, pairs, clock.threads)
 
@@ -287,26 +271,36 @@ def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estim
     return sigmas
 
 
-def _gauge_warnings(rule: GaugeRule, gauge: Gauge, centers: FloatArray, asked: Scale) -> Iterator[str]:
-    """Yield what else is known of the size of a model and contradicts it, or did not get its way."""
-    there = np.flatnonzero(np.isfinite(centers[:, 0]))
-    yield from rule.check(gauge, there, centers[there])
-    if asked == "unit" and gauge.scale != "unit":
-        yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
+def _compare_with_priors(stand: Stand, images: Images, gauge: Gauge) -> PriorAngles | None:
+    """Return what the pairs say of position priors where these set the axes; else None."""
+    priors, directions = stand.given.known.priors, stand.directions
+    if priors is None or gauge.scale != "prior" or gauge.axes is None:
+        return None
+    return compare_with_priors(directions.pairs, directions.directions, priors, gauge, images.centers)
 
 
-def _collect_warnings(stand: Stand, judged: Judged, kept: BoolArray, num_points: int) -> Iterator[str]:
-    """Yield what the user should know of pairs, cameras, points and the database beyond the tables."""
+def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
+    """Yield what the user should know of a finished piece beyond the tables."""
+    images, rule, gauge = found.placed, stand.given.rule, found.gauge
+    yield from found.told_evidence.statements
+    yield from intrinsics_warnings(found.intrinsics.rows(images))
     yield from match_warnings(stand.directions)
-    yield from quality_warnings(judged)
-    yield from trust_warnings(judged, kept)
-    yield from ambiguity_warnings(judged)
+    yield from quality_warnings(found.placement)
+    yield from trust_warnings(found.placement, found.kept)
+    yield from ambiguity_warnings(found.placement)
     yield from stand.failures
     if stand.gauge.warning:
         yield stand.gauge.warning
     if stand.source.economy.statement:
         yield f"to stay below max_memory_mb, {stand.source.economy.statement}"
-    if num_points == 0:
+    if found.reconstruction.num_points3D() == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
+    yield from prior_warnings(found.prior_angles, stand.directions.pairs, images.names)
+    there = np.flatnonzero(images.is_posed)
+    yield from rule.check(gauge, there, images.centers[there])
+    if found.options.gauge.scale == "unit" and gauge.scale != "unit":
+        yield f"the scale unit was not used, but that of {SETS_SCALE[gauge.scale]}"
+    unsupported = [images.names[k] for k in np.flatnonzero(found.unsupported).tolist()]
+    yield from support_warnings(unsupported, is_kept=found.options.trust.min_trust == 0.0)

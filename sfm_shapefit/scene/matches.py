@@ -68,6 +68,22 @@ class RayMatches:
             pixel_angles=self.pixel_angles[chosen],
         )
 
+    def thinned(self, most: int) -> "RayMatches":
+        """Return the pairs with at most so many matches each, taken evenly."""
+        counts = np.diff(self.offsets)
+        taken = np.minimum(counts, most)
+        offsets = np.append(0, np.cumsum(taken))
+        position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
+        steps = position * np.repeat(counts, taken) // np.repeat(taken, taken)
+        rows = np.repeat(self.offsets[:-1], taken) + steps
+        return RayMatches(
+            pairs=self.pairs,
+            offsets=offsets,
+            rays_i=self.rays_i[rows],
+            rays_j=self.rays_j[rows],
+            pixel_angles=self.pixel_angles,
+        )
+
 
 def join_rays(parts: Sequence[RayMatches]) -> RayMatches:
     """Return the pairs of all parts, in order; there may be no parts."""

@@ -9,9 +9,9 @@ import sfm_shapefit
 from sfm_shapefit import synthetic
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
-from sfm_shapefit.judgement.left_out import WrongLens
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from tests.program import run

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out, question_lenses, wrong_lenses
+from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
+from sfm_shapefit.judgement.wrong_lenses import question_lenses, wrong_lenses
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.points import Points

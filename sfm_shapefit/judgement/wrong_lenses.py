@@ -1,0 +1,79 @@
+"""Wrong lenses: whose images ask for another focal length when they are left out, one by one.
+
+A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Where one
+took several, their points have bent to a wrong focal length, so that its value shows less than that the
+images ask for unlike ones: it is wrong if half of them change by more than 0.4 % and three deviations. With
+right lenses, no image of 17 scenes changed so, and half of those of a lens changed by 0.2 % at most, or by
+two deviations; with all lenses wrong by 0.8 to 1.3 and the points adjusted to that, half of them changed by
+0.5 % or more.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.points import Points
+
+# Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
+# which half of the images of a lens show that it is; see the header.
+_ONE, _HALF = (0.025, 10.0), (0.004, 3.0)
+_FEWEST_IMAGES = 3  # images of a lens of which a half is asked for; each of fewer is asked alone
+_RIVAL = 0.5  # share of the highest score; what is named as clearly is taken out at once, for time's sake
+
+
+class WrongLens(NamedTuple):
+    """A lens whose images contradict its focal length."""
+
+    lens: int
+    """Its row."""
+    factor: float
+    """Focal length that its images ask for, the median one, over the given one."""
+    sigma: float
+    """Standard deviation of it: by the noise for one image, by the scatter over several."""
+    num_images: int
+    """Images that were asked."""
+    score: float
+    """Change in standard deviations, the median one of its images."""
+
+
+def question_lenses(
+    points: Points, images: Images, pictures: Pictures, threads: int = 1
+) -> tuple[LeftOut, tuple[WrongLens, ...]]:
+    """Return what images say when they are left out, and the lenses that they contradict, the worst first.
+
+    The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
+    the points of all, unless it took half of the images or more, until no other lens is named.
+    """
+    believed = np.ones(images.num_images, dtype=np.bool_)
+    while True:
+        left_out = leave_one_out(points, images, pictures, threads, believed)
+        wrong = wrong_lenses(left_out, images)
+        fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
+        gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= _RIVAL * fresh[0].score])
+        if not fresh or 2 * np.sum(~believed | gone) >= images.num_images:
+            return left_out, wrong
+        believed &= ~gone
+
+
+def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
+    """Return the lenses that the images contradict when they are left out, the most contradicted first."""
+    found = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scores = np.abs(left_out.log_factors) / left_out.sigmas
+    for lens in range(len(images.lenses)):
+        rows = np.flatnonzero((images.lens_of == lens) & left_out.observable)
+        changes = left_out.log_factors[rows]
+        if not len(rows):
+            continue
+        least, deviations = _HALF if len(rows) >= _FEWEST_IMAGES else _ONE
+        middle = float(np.median(changes))
+        sigma = float(left_out.sigmas[rows].max())
+        if len(rows) >= _FEWEST_IMAGES:
+            sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
+        score = float(np.median(scores[rows]))
+        if np.median(np.abs(changes)) > least and score > deviations:
+            found.append(WrongLens(lens, float(np.exp(middle)), sigma, len(rows), score))
+    return tuple(sorted(found, key=lambda item: -item.score))
