@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.judgement.options import TrustOptions
     from sfm_shapefit.pairs.options import DirectionOptions
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
-    from sfm_shapefit.pipeline.check import CheckResult, check
+    from sfm_shapefit.pipeline.check import check
+    from sfm_shapefit.pipeline.checked import CheckResult
     from sfm_shapefit.pipeline.convert import convert
     from sfm_shapefit.pipeline.evaluate import evaluate
     from sfm_shapefit.pipeline.inspect import inspect
@@ -58,7 +59,8 @@ _HOMES = {
     "files.colmap.quiet": ("hear_pycolmap",),
     "adjustment.options": ("AdjustmentOptions",),
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
-    "pipeline.check": ("CheckResult", "check"),
+    "pipeline.check": ("check",),
+    "pipeline.checked": ("CheckResult",),
     "pipeline.convert": ("convert",),
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),

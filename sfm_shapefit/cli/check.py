@@ -30,7 +30,7 @@ from sfm_shapefit.cli.flags import (
 from sfm_shapefit.cli.root import app
 
 if TYPE_CHECKING:
-    from sfm_shapefit.pipeline.check import CheckResult
+    from sfm_shapefit.pipeline.checked import CheckResult
 
 
 @app.command(
@@ -50,6 +50,13 @@ def check_command(
     ] = None,
     images: ImageFolder = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
+    second_opinion: Annotated[
+        bool,
+        typer.Option(
+            "--second-opinion/--no-second-opinion",
+            help="Map the database anew, and judge by pairs what stands elsewhere there.",
+        ),
+    ] = True,
     as_json: Json = False,
     strict: Annotated[
         bool, typer.Option("--strict", help='End with exit code 4 where the verdict is "do not use".')
@@ -77,7 +84,7 @@ def check_command(
 
         catch_termination()
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
-            found = check(source, database, progress=progress)
+            found = check(source, database, second_opinion=second_opinion, progress=progress)
         if report is not None:
             _write_page(found, report, images)
         if as_json:

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
@@ -73,18 +73,47 @@ class GroupApart(Record):
         )
 
 
+class ToldOpinion(Record):
+    """How the model compares with another one of the same matches, which took nothing of it."""
+
+    num_common: Annotated[int, "Cameras of both."]
+    usual: Annotated[float, "Median distance between both, over the median one of cameras from their middle."]
+    wrong: Annotated[tuple[str, ...], "Images that stand elsewhere there, which pairs support."]
+    undecided: Annotated[tuple[str, ...], "Images that stand elsewhere there, where pairs support neither."]
+    num_for: Annotated[int, "Pairs that support this model against the other, of wrong images."]
+    num_against: Annotated[int, "Pairs of these that support the other."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        by = "in the model that map made of the same database"
+        parts = []
+        if self.wrong:
+            parts.append(
+                f"{_cameras(self.wrong)} elsewhere {by}: "
+                f"{counted(self.num_against, 'pair')} support that, {self.num_for} where they are"
+            )
+        if self.undecided:
+            parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
+        usual = f"{self.num_common} cameras are compared, {self.usual:.2%} apart in the median"
+        return f"{'; '.join(parts) or f'nothing speaks for another place {by}'} ({usual})"
+
+
 class ToldEvidence(Record):
     """Evidence that the fit did not use, against lenses, cameras and groups by name."""
 
     lenses: Annotated[tuple[ContradictedLens, ...], "Lenses whose images ask for another focal length."] = ()
     places: Annotated[tuple[AmbiguousPlace, ...], "Cameras that two sets of pairs put at two places."] = ()
     seams: Annotated[tuple[GroupApart, ...], "Groups of cameras that stand apart from the rest."] = ()
+    second: Annotated[ToldOpinion | None, "How another model of the same matches compares."] = None
 
     @property
     def statements(self) -> list[str]:
         """A sentence for each."""
         seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
-        return [*seams, *places, *(told.statement for told in self.lenses)]
+        lenses, second = (told.statement for told in self.lenses), self.second
+        differs = second is not None and (second.wrong or second.undecided)
+        return [*seams, *places, *lenses, *([second.statement] if second is not None and differs else [])]
 
 
 def tell_evidence(
@@ -119,7 +148,27 @@ def tell_evidence(
             )
             for seam in evidence.seams
         ),
+        second=None if evidence.second is None else _tell_opinion(evidence.second, images),
     )
+
+
+def _tell_opinion(second: SecondOpinion, images: Images) -> ToldOpinion:
+    wrong, undecided = (
+        tuple(images.names[k] for k in rows.tolist()) for rows in (second.wrong, second.undecided)
+    )
+    return ToldOpinion(
+        num_common=second.num_common,
+        usual=second.usual,
+        wrong=wrong,
+        undecided=undecided,
+        num_for=second.num_for,
+        num_against=second.num_against,
+    )
+
+
+def _cameras(names: tuple[str, ...]) -> str:
+    stand = "stands" if len(names) == 1 else "stand"
+    return f"{counted(len(names), 'camera')} ({first_of(names)}) {stand}"
 
 
 def _tell_lens(wrong: WrongLens, lens: Lens) -> ContradictedLens:

@@ -354,6 +354,8 @@ class CheckedFacts(FactsOfModel):
         weak = [f"{row.name}: {row.reason}" for row in cameras if row.reason]
         figures = [*self.key_rows()[:2], row("points", self.points_statement), Row("weak", weak)]
         figures += [row("matches", self.inputs.directions)]
+        if self.evidence.second is not None:
+            figures += [row("second opinion", self.evidence.second.statement)]
         return Telling(
             counted(self.num_images, "image"), figures, elsewhere="see --report", step=self.next_step
         )

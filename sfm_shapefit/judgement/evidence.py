@@ -3,21 +3,26 @@
 A pair agrees with where its cameras stand if its direction is off their baseline by at most a degree, or six
 times what is usual, but never more than two degrees, lest a model that is wrong throughout set the limit by
 which it is judged; and by three of its own standard deviations where these are more. It contradicts if it is
-farther off, or if most of its matches contradict the rotations, so that it has no direction at all.
+farther off and knows its direction to a degree, or if most of its matches contradict the rotations, so that
+it has none at all. Half of the pairs between fisheyes in a park know theirs worse, and are off by 40 degrees
+though the model is sound.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
 
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
+_EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
 _OWN_SIGMAS = 3.0  # standard deviations of the pair's own direction; far points make it inexact
 
 
@@ -32,7 +37,7 @@ class PairFits:
     residuals_deg: FloatArray
     """(k,) NaN where there is no direction, or no baseline."""
     level_deg: float
-    """Standard deviation per axis of these, by their median; NaN without any."""
+    """Standard deviation per axis of the exact ones, else of all, by their median; NaN without any."""
     agrees: BoolArray
     """(k,) pairs that agree."""
     contradicts: BoolArray
@@ -43,6 +48,13 @@ class PairFits:
         rows, measured = np.isfinite(self.residuals_deg), self.directions
         pairs, directions = measured.pairs[rows], measured.directions[rows]
         return find_other_places(self.centers, pairs, directions, self.agrees[rows], self.level_deg)
+
+    def count_held(self) -> int:
+        """Return the number of cameras in the largest rigid piece of the pairs that agree."""
+        pairs = self.directions.pairs[self.agrees]
+        if not len(pairs):
+            return 0
+        return len(np.unique(pairs[parallel_rigid_pieces(len(self.centers), pairs, 3) == 0]))
 
     def cuts(self) -> tuple[Cut, ...]:
         """Return the groups that contradictions cut off."""
@@ -58,8 +70,11 @@ def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
     usable = known & np.isfinite(directions.directions).all(axis=1)
     residuals = np.full(len(pairs), np.nan)
     residuals[usable] = angle_between_deg(directions.directions[usable], baselines[usable])
-    level = SIGMA_PER_MEDIAN * float(np.median(residuals[usable])) if usable.any() else np.nan
-    limit = np.maximum(np.clip(_LEVELS * level, *_FAR_DEG), _OWN_SIGMAS * directions.sigma_deg())
+    sigmas = directions.sigma_deg()
+    exact = usable & (sigmas <= _EXACT_DEG)
+    best = exact if exact.any() else usable
+    level = SIGMA_PER_MEDIAN * float(np.median(residuals[best])) if usable.any() else np.nan
+    limit = np.maximum(np.clip(_LEVELS * level, *_FAR_DEG), _OWN_SIGMAS * sigmas)
     against = np.zeros(len(pairs), dtype=np.bool_)
     against[directions.contradicting()] = True
     return PairFits(
@@ -68,8 +83,27 @@ def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
         residuals_deg=residuals,
         level_deg=level,
         agrees=usable & (residuals <= limit),
-        contradicts=(usable & (residuals > limit)) | (known & against),
+        contradicts=(exact & (residuals > limit)) | (known & against),
     )
+
+
+class SecondOpinion(NamedTuple):
+    """How a model compares with another one of the same matches."""
+
+    num_common: int
+    """Cameras of both."""
+    usual: float
+    """Median distance between the places of a camera in both, over the spread of cameras."""
+    wrong: IntArray
+    """Rows of the cameras that stand elsewhere in the other model, which pairs support there."""
+    undecided: IntArray
+    """Rows of those that stand elsewhere, where pairs support neither."""
+    confirmed: IntArray
+    """Rows of those that are no farther apart than is usual between the two."""
+    num_for: int
+    """Pairs that support this model against the other, of `wrong` cameras."""
+    num_against: int
+    """Pairs of these that support the other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,3 +116,5 @@ class ModelEvidence:
     """By rows of the images."""
     seams: tuple[Seam, ...] = ()
     """By rows of the images."""
+    second: SecondOpinion | None = None
+    """How another model of the same matches compares; None if there is none."""

@@ -5,9 +5,9 @@ Do not use, if any of these holds:
     the residuals of the pairs that agree have a level above 5 degrees
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
-    fewer than a quarter of the pairs that say anything of a direction agree
     fewer than half of the cameras that were placed are in the output, or of all images
-    more than a tenth of the cameras stand apart from the rest (`seams`)
+    more than a tenth of the cameras stand apart from the rest (`seams`), or elsewhere in another model of
+    the same matches, which pairs support there (`second_opinion`)
     evidence that the fit did not use speaks against more than a third of them (`evidence`)
 
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
@@ -47,7 +47,6 @@ UNCERTAIN_SHARE = 0.05
 MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
 # Share of observations that contradict, and share that sees a point: see the header.
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
-LEAST_PAIRS = 0.25  # share of agreeing pairs; below, the model is not to be used
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
 _LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
 _MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
@@ -117,10 +116,15 @@ NOTHING_AGAINST = Against((), (), ())
 def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     """Return what evidence says against a model of some images; the others are not posed."""
     apart = [camera for seam in evidence.seams for camera in seam.cameras.tolist()]
+    second = evidence.second
+    wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
+    if len(wrong) > 1:  # which side of a seam is wrong, and where it runs, is known better so
+        apart = wrong
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
     lenses = [wrong.lens for wrong in evidence.lenses]
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
-    named = dict.fromkeys([*apart, *(place.camera for place in evidence.places), *through.tolist()])
+    places = (place.camera for place in evidence.places)
+    named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
     count = int(images.is_posed.sum())
     suspicions: list[str] = []
     reasons: list[str] = []
@@ -184,8 +188,6 @@ def _reasons_against(placement: Judged, shares: Shares) -> Iterator[str]:
         yield f"the directions are {level:.0f} degrees off the cameras"
     if shares.contradicting >= _MOST_CONTRADICTING:
         yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
-    if shares.pairs < LEAST_PAIRS:
-        yield f"only {shares.pairs:.0%} of the pairs agree"
     if shares.kept < _LEAST_KEPT:
         yield f"only {shares.kept:.0%} of the placed cameras are trusted"
     if shares.placed < _LEAST_PLACED:

@@ -43,6 +43,8 @@ class OtherPlace(NamedTuple):
     """Rejected pairs that agree on the other place."""
     offset: FloatArray
     """(3,) the other place minus this one."""
+    pairs_here: IntArray
+    """(num_here, 2) the pairs that agree with this place alone."""
 
 
 def find_other_places(
@@ -73,11 +75,13 @@ def find_other_places(
         sides = (agrees[own], ~agrees[own])
         right, wrong = (_Rays(centers[others[side]], (signs * directions[own])[side]) for side in sides)
         there, place = wrong.best_place(near_deg)
-        agreeing, shared = len(right.origins), int(right.pass_at(place[None], near_deg).sum())
+        both = right.pass_at(place[None], near_deg)[0]
+        agreeing, shared = len(both), int(both.sum())
         is_other = there >= max(_FEWEST_PAIRS, _LEAST_SHARE * (agreeing - shared))
         is_other &= shared <= _MOST_SHARED * agreeing
         if is_other and np.linalg.norm(place - centers[camera]) > least:
-            found.append(OtherPlace(int(camera), agreeing - shared, there, place - centers[camera]))
+            here = pairs[own[agrees[own]][~both]]
+            found.append(OtherPlace(int(camera), len(here), there, place - centers[camera], here))
     return tuple(found)
 
 

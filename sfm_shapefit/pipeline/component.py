@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from sfm_shapefit.facts.map_result import MappedModel
 from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.components import pairs_among
 from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
 from sfm_shapefit.pipeline.given import Given
@@ -77,19 +79,8 @@ def _locate_component(
     _, among = pairs_among(relative, members)
     if averaging.num_repeated:  # the false pairs have most matches, and would fold the images again
         inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
-    given = _given(run, images, inputs)
-    source, first = see_matches(run.matches, images, inputs, run.options), None
-    source = replace(source, alone=among)
-    if run.options.freedom.adjust != "none":
-        with run.clock("first placement"):
-            first = adjust_first_placement(given, source, run.options, run.clock)
-        source = source.at(run.pose(members, first.rotations, first.adjusted))
-        given = given._replace(
-            rigid=find_rigid_parts(source.images, run.options.placement),
-            intrinsics=given.intrinsics.after(first.adjusted, images.lenses_of(first.adjusted.images)),
-        )
-    with run.clock("locate"):
-        found = _settle(run, source, _with_told(run, given, members), first)
+    source = replace(see_matches(run.matches, images, inputs, run.options), alone=among)
+    found = act(partial(_place, run, members), _given(run, images, inputs), source, run.options)
     ends = members[found.directions.pairs].tolist()
     unknown = (np.nan, np.nan)
     scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
@@ -99,6 +90,21 @@ def _locate_component(
         matched_shares=scores[:, 1],
         suspicions=(*found.suspicions, *_suspicions(averaging)),
     )
+
+
+def _place(run: MapRun, members: IntArray, given: Given, source: MatchSource) -> LocateResult:
+    """Adjust a first placement of some images, and locate them from the rotations of that."""
+    images, first = given.images, None
+    if run.options.freedom.adjust != "none":
+        with run.clock("first placement"):
+            first = adjust_first_placement(given, source, run.options, run.clock)
+        source = source.at(run.pose(members, first.rotations, first.adjusted))
+        given = given._replace(
+            rigid=find_rigid_parts(source.images, run.options.placement),
+            intrinsics=given.intrinsics.after(first.adjusted, images.lenses_of(first.adjusted.images)),
+        )
+    with run.clock("locate"):
+        return _settle(run, source, _with_told(run, given, members), first)
 
 
 def _settle(run: MapRun, source: MatchSource, given: Given, first: FirstPlacement | None) -> LocateResult:

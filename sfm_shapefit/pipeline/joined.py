@@ -30,7 +30,7 @@ from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
-from sfm_shapefit.pipeline.check import check_source
+from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches

@@ -5,6 +5,7 @@ Each stage is one function from values to a new value; the input is never change
 
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.template import template_of
+from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
@@ -107,4 +109,4 @@ def locate(
             distances=options.gauge.known_distance,
             known=known,
         )
-        return settle(told, source, options, clock)
+        return act(partial(settle, options=options, clock=clock), told, source, options)

@@ -132,7 +132,7 @@ def seam_of(cameras):
 
 
 def place_of(camera):
-    return OtherPlace(camera, 5, 6, np.ones(3))
+    return OtherPlace(camera, 5, 6, np.ones(3), np.zeros((5, 2), dtype=int))
 
 
 def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(found):

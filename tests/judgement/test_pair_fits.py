@@ -52,10 +52,22 @@ def test_the_limit_is_six_levels_but_within_one_and_two_degrees(centers, usual_d
     assert fits.agrees.sum() >= len(EVERY) - 1
 
 
-def test_a_pair_that_knows_its_direction_badly_agrees_within_three_of_its_deviations(centers):
+def test_a_pair_that_knows_its_direction_badly_agrees_within_three_of_its_deviations_and_never_contradicts(
+    centers,
+):
     fits = fit_pairs(centers, measured(centers, off_deg=4.0, sigma_deg=1.5))
     assert fits.agrees.all()
     assert fit_pairs(centers, measured(centers, off_deg=4.0, sigma_deg=1.0)).contradicts.all()
+    vague = fit_pairs(centers, measured(centers, off_deg=40.0, sigma_deg=1.5))
+    assert not (vague.agrees | vague.contradicts).any()
+
+
+def test_the_cameras_that_agreeing_pairs_hold_are_counted(centers):
+    assert fit_pairs(centers, measured(centers)).count_held() == N
+    moved = centers.copy()
+    moved[GROUP] += [0.0, 3.0, 0.0]
+    assert fit_pairs(moved, measured(centers)).count_held() == N - len(GROUP)
+    assert fit_pairs(-centers, measured(centers)).count_held() == 0
 
 
 def test_pairs_whose_matches_contradict_the_rotations_count_and_others_without_direction_do_not(centers):

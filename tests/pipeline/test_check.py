@@ -107,9 +107,9 @@ def spoiled(folder, place=None, *, points=True, num_posed=None, names=None):
 
 RNG = np.random.default_rng(0)
 WRONG = {
-    "negated": ({"place": np.negative}, "degrees off"),
-    "random": ({"place": lambda _: RNG.normal(size=3)}, "degrees off"),
-    "mirrored": ({"place": lambda center: center * [-1.0, 1.0, 1.0]}, "degrees off"),
+    "negated": ({"place": np.negative}, "the pairs that agree hold only"),
+    "random": ({"place": lambda _: RNG.normal(size=3)}, "the pairs that agree hold only"),
+    "mirrored": ({"place": lambda center: center * [-1.0, 1.0, 1.0]}, "the pairs that agree hold only"),
     "all centers equal": ({"place": lambda _: np.full(3, 2.0)}, "at the same place"),
     "all centers zero": ({"place": np.zeros_like}, "at the same place"),
 }
@@ -157,6 +157,9 @@ def test_a_model_of_one_image_or_none_is_refused_in_a_sentence(tmp_path):
 def test_json_has_the_figures_and_pictures_need_a_page(tmp_path):
     facts = json.loads(run("check", RING / "sparse" / "0", "--json", code=0).stdout)
     assert problems(facts, "check") == []
+    assert facts["evidence"]["second"]["num_common"] == 8
+    alone = json.loads(run("check", RING / "sparse" / "0", "--json", "--no-second-opinion", code=0).stdout)
+    assert alone["evidence"]["second"] is None
     assert facts["verdict"]["grade"] == "good"
     assert "--report" in run_refused("check", RING / "sparse" / "0", "--images", tmp_path)
     page = ("--report", tmp_path / "page.html", "--images", tmp_path)

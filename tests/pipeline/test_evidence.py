@@ -34,7 +34,8 @@ def test_locate_names_a_wrong_lens_with_the_right_focal_length(camera, factor):
     truth = pycolmap.Reconstruction(RING / "sparse" / "0")
     name = sorted(image.name for image in truth.images.values())[camera]
     wrong_id = truth.find_image_with_name(name).image_id
-    found = sfm_shapefit.locate(with_own_lenses(truth, {name: factor}), RING / "database.db")
+    model = with_own_lenses(truth, {name: factor})
+    found = sfm_shapefit.locate(model, RING / "database.db", intrinsics="held")
     (told,) = found.told_evidence.lenses
     right_px = truth.find_image_with_name(name).camera.mean_focal_length()
     assert told.camera == wrong_id

@@ -1,0 +1,122 @@
+"""A second opinion: which cameras stand elsewhere in another model of the same matches, and who is right.
+
+A group that is wrong as a whole agrees in itself, and where false pairs tie it to the rest too, no test of
+the model alone finds it. Another model that takes nothing of the first errs elsewhere, if at all. Both are
+brought together by a similarity that half of the cameras may fail (`fit_similarity_l1`). A camera stands
+elsewhere if it is off by more than is usual between the two, and by more than a hundredth of the scene or a
+degree.
+
+Which of the two is right there, the pairs say that it has with cameras on which both agree, and whose
+direction each model measures by its own rotations and lenses: a pair speaks for one of them if it misses the
+other by four levels of error or more, and by twice as much. A camera that few pairs tie to those follows the
+others that stand elsewhere. The one with twice as many pairs is right; without that, neither is believed.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.geometry import (
+    fit_similarity_l1,
+    mean_rotation_l1,
+    median_spread,
+    rotation_angles_deg,
+)
+from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
+from sfm_shapefit.scene.images import Images
+
+_FEWEST_COMMON = 4  # cameras of both; of three, one that is off takes the similarity along
+_CAP = 0.03  # spreads; farther off, a camera is lost, and half of them may be
+_OF_USUAL = 6.0  # usual differences; more is elsewhere, if it is more than the next as well
+_FAR, _TURNED_DEG = 0.01, 0.5  # spreads and degrees; what is nearer needs no judge
+_LEVELS, _RATIO = 4.0, 2.0  # levels, and residuals of the better one; a pair that misses by both speaks
+_LEAST_LEVEL_DEG = 0.05  # degrees; good rotations leave as much in any direction
+_OUTNUMBERED = 2.0  # pairs for one of the two over pairs for the other; it is right then
+_FEWEST_PAIRS = 3  # pairs that speak for one of them; fewer are chance
+_NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the rotations, as badly as can be
+
+
+def compare_models(
+    images: Images, fits: PairFits, others: Images, other_fits: PairFits
+) -> SecondOpinion | None:
+    """Return how images compare with others of the same names; None if too few are common.
+
+    Args:
+        images: of the model.
+        fits: how the pairs of matches fit it.
+        others: images of the other model, some of them posed.
+        other_fits: how the pairs fit that.
+    """
+    row_of = {name: k for k, name in enumerate(others.names) if others.is_posed[k]}
+    mine = np.array([k for k, name in enumerate(images.names) if name in row_of], dtype=np.int64)
+    if len(mine) < _FEWEST_COMMON:
+        return None
+    theirs = np.array([row_of[images.names[k]] for k in mine.tolist()])
+    spread = median_spread(images.centers[mine])
+    if not spread > 0.0:
+        return None
+    aligned = fit_similarity_l1(others.centers[theirs], images.centers[mine], cap=_CAP * spread)
+    distances = np.linalg.norm(aligned.apply(others.centers[theirs]) - images.centers[mine], axis=1) / spread
+    turns = np.swapaxes(others.rotations[theirs], 1, 2) @ images.rotations[mine]
+    angles = rotation_angles_deg(np.swapaxes(turns, 1, 2) @ mean_rotation_l1(turns))
+    usual = float(np.median(distances))
+    unlike = distances > _OF_USUAL * usual, angles > _OF_USUAL * np.median(angles)
+    elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > _TURNED_DEG))
+    residuals = _residuals(fits, mine), _residuals(other_fits, theirs)
+    votes = _count_votes(*residuals, elsewhere)
+    votes[votes.sum(axis=1) < _FEWEST_PAIRS] = votes.sum(axis=0)
+    here, there = votes.T
+    wrong = elsewhere & (there >= np.maximum(_OUTNUMBERED * here, _FEWEST_PAIRS))
+    right = elsewhere & (here >= np.maximum(_OUTNUMBERED * there, _FEWEST_PAIRS))
+    undecided = elsewhere & ~wrong & ~right & (here + there >= _FEWEST_PAIRS)
+    num_for, num_against = _count_votes(*residuals, wrong).sum(axis=0).tolist()
+    return SecondOpinion(
+        num_common=len(mine),
+        usual=usual,
+        wrong=mine[wrong],
+        undecided=mine[undecided],
+        confirmed=mine[~(unlike[0] | unlike[1])],
+        num_for=num_for,
+        num_against=num_against,
+    )
+
+
+class _Residuals(NamedTuple):
+    """Residuals of pairs of common cameras."""
+
+    keys: IntArray
+    """(m,) i * k + j of cameras i < j of k common ones; ascending."""
+    degrees: FloatArray
+    """(m,)"""
+    level_deg: float
+
+
+def _residuals(fits: PairFits, rows: IntArray) -> _Residuals:
+    """Return the residuals of the pairs among some cameras (k,), by their rows in the fits."""
+    place = np.full(len(fits.centers), -1)
+    place[rows] = np.arange(len(rows))
+    ends = np.sort(place[fits.directions.pairs], axis=1)
+    residuals = np.where(
+        np.isnan(fits.residuals_deg) & fits.contradicts, _NO_DIRECTION_DEG, fits.residuals_deg
+    )
+    there = np.flatnonzero((ends >= 0).all(axis=1) & np.isfinite(residuals))
+    keys = ends[there, 0] * len(rows) + ends[there, 1]
+    order = np.argsort(keys)
+    return _Residuals(keys[order], residuals[there[order]], max(fits.level_deg, _LEAST_LEVEL_DEG))
+
+
+def _count_votes(here: _Residuals, there: _Residuals, elsewhere: BoolArray) -> IntArray:
+    """Return how many pairs of each camera that stands elsewhere support each model, (k, 2); 0 for others."""
+    count = len(elsewhere)
+    votes = np.zeros((count, 2), dtype=np.int64)
+    keys, a, b = np.intersect1d(here.keys, there.keys, assume_unique=True, return_indices=True)
+    ends = np.column_stack(np.divmod(keys, count))
+    across = elsewhere[ends].sum(axis=1) == 1
+    ends, mine, theirs = ends[across], here.degrees[a][across], there.degrees[b][across]
+    away = np.where(elsewhere[ends[:, 0]], ends[:, 0], ends[:, 1])
+    least = _LEVELS * min(here.level_deg, there.level_deg)
+    for side, (good, bad) in enumerate(((mine, theirs), (theirs, mine))):
+        speaks = (bad > least) & (bad > _RATIO * good)
+        votes[:, side] = np.bincount(away[speaks], minlength=count)
+    return votes

@@ -1,0 +1,112 @@
+"""Act on evidence where that is safe: a lens that is wrong is freed, a camera goes where most pairs put it.
+
+Once only, and what comes of it counts only if less speaks against it afterwards. The side of a seam is never
+guessed: nothing says which of two groups is wrong.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.facts.options import PlacingOptions
+from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.intrinsics import in_doubt, with_focal_length
+from sfm_shapefit.pipeline.given import Given
+from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.scene.lens import Origin
+
+_OUTNUMBERED = 2  # pairs for another place over those for this one; fewer, and a camera stays
+
+
+class Remedy(NamedTuple):
+    """What to start from in place of what evidence speaks against."""
+
+    given: Given
+    source: MatchSource
+    freed: tuple[int, ...]
+    """Rows of the lenses that may change now, and start from the focal length that their images ask for."""
+    moved: tuple[str, ...]
+    """Names of cameras whose pairs for this place are left out, as twice as many agree on another."""
+
+    def told(self, found: LocateResult) -> tuple[str, ...]:
+        """Return what was done, a sentence each, where it led to this result."""
+        ids = {found.placed.lenses[row].id for row in self.freed}
+        lenses = (row.statement for row in found.intrinsics.rows(found.placed) if row.camera in ids)
+        told = [f"{one}: its images contradicted what was given, unless --intrinsics held" for one in lenses]
+        moved = f"{', '.join(self.moved)}: placed without the pairs that twice as many contradict"
+        return (*told, *([moved] if self.moved else []))
+
+    def cures(self, after: LocateResult, before: LocateResult) -> bool:
+        """Return whether less speaks against a result than before, with lenses known and no camera lost."""
+        less = _count(after) < _count(before)
+        open_ = after.intrinsics.undetermined[list(self.freed)].any()
+        return bool(less and not open_ and after.kept.sum() >= before.kept.sum())
+
+
+def act(
+    place: Callable[[Given, MatchSource], LocateResult],
+    given: Given,
+    source: MatchSource,
+    options: PlacingOptions,
+) -> LocateResult:
+    """Place the images of a source, and once more where evidence against the result can be acted on.
+
+    Args:
+        place: from what is known of the images, and their matches, to a result.
+        given: what is known.
+        source: the images and their matches.
+        options: of the run.
+    """
+    found = place(given, source)
+    remedy = find_remedy(found, given, source, options)
+    if remedy is None:
+        return found
+    again = place(remedy.given, remedy.source)
+    if not remedy.cures(again, found):
+        return found
+    return replace(again, warnings=(*remedy.told(again), *again.warnings))
+
+
+def find_remedy(
+    found: LocateResult, given: Given, source: MatchSource, options: PlacingOptions
+) -> Remedy | None:
+    """Return what to start from instead; None if nothing can be done about what speaks against a result."""
+    images, intrinsics = source.images, given.intrinsics
+    may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
+    factors = {doubt.camera: doubt.factor for doubt in found.focal_doubts}
+    factors |= {images.lenses[wrong.lens].id: wrong.factor for wrong in found.evidence.lenses}
+    freed = {
+        row: factors[lens.id]
+        for row, lens in enumerate(images.lenses)
+        if may_free and lens.id in factors and lens.is_adjustable and not intrinsics.focal[row]
+    }
+    moved = [place for place in found.evidence.places if place.num_there >= _OUTNUMBERED * place.num_here]
+    if not (freed or moved):
+        return None
+    lenses, focal = list(images.lenses), intrinsics.focal.copy()
+    for row, factor in freed.items():
+        known = lenses[row]
+        if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
+            known = replace(in_doubt(known, Origin.GUESS), origin=Origin.CALIBRATION)
+        lenses[row] = with_focal_length(known, factor)
+        focal[row] = True
+    pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
+    names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
+    left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
+    inputs = replace(source.inputs, left_out=left_out)
+    view = source.matches.at(images.with_lenses(lenses), left_out, source.economy.reading)
+    return Remedy(
+        given._replace(inputs=inputs, intrinsics=replace(intrinsics, focal=focal)),
+        replace(source, inputs=inputs, view=view),
+        tuple(freed),
+        tuple(images.names[place.camera] for place in moved),
+    )
+
+
+def _count(found: LocateResult) -> int:
+    """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
+    evidence, left_out = found.evidence, int(np.sum(~found.kept))
+    lenses = len(evidence.lenses) + len(found.focal_doubts)
+    return lenses + left_out + len(evidence.places) + sum(len(seam.cameras) for seam in evidence.seams)

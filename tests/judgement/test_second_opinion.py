@@ -1,0 +1,85 @@
+"""A second opinion: who stands elsewhere in another model, and which of the two the pairs support."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.judgement.second_opinion import compare_models
+from tests.judgement.test_pair_fits import measured
+from tests.judgement.test_seams import GROUP, N
+from tests.scenes import COURTYARD
+
+
+@pytest.fixture(scope="module")
+def images():
+    return read_model(COURTYARD / "truth").images.part(np.arange(N))
+
+
+def moved(images, rows, *, shift=0.0, scale=1.0, turn_deg=0.0):
+    """The images with some of them moved about their middle."""
+    frames, own = images.frames, images.frame_of[rows]
+    turn = Rotation.from_rotvec(np.radians(turn_deg) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    centers, rotations = frames.centers.copy(), frames.rotations.copy()
+    about = centers[own].mean(axis=0)
+    centers[own] = about + shift + scale * (centers[own] - about) @ turn.T
+    rotations[own] = rotations[own] @ turn.T
+    return replace(images, frames=replace(frames, centers=centers, rotations=rotations))
+
+
+def in_other_axes(images):
+    turn = Rotation.from_rotvec([0.4, -1.0, 2.0]).as_matrix()
+    frames = images.frames
+    centers = 3.0 * frames.centers @ turn.T + [5.0, -7.0, 1.0]
+    return replace(images, frames=replace(frames, centers=centers, rotations=frames.rotations @ turn.T))
+
+
+def compare(images, others, truth):
+    """Compare two models by directions that are those of the truth, each in its own axes."""
+    fits = fit_pairs(images.centers, measured(truth.centers))
+    others, truth = in_other_axes(others), in_other_axes(truth)
+    return compare_models(images, fits, others, fit_pairs(others.centers, measured(truth.centers)))
+
+
+@pytest.mark.parametrize("how", [{"shift": 2.0}, {"scale": 1.1}, {"turn_deg": 3.0}, {"turn_deg": 90.0}])
+def test_a_group_that_is_wrong_as_a_whole_is_named_by_a_model_that_has_it_right(images, how):
+    found = compare(moved(images, GROUP, **how), images, images)
+    assert set(found.wrong.tolist()) <= set(GROUP.tolist())
+    assert len(found.wrong) >= len(GROUP) - ("scale" in how)  # one may be near the middle, which stays
+    assert found.num_against > 10 * max(found.num_for, 1)
+    assert set(found.confirmed.tolist()) >= set(range(N)) - set(GROUP.tolist())
+    assert found.usual < 1e-6
+
+
+def test_what_is_wrong_in_the_other_model_says_nothing_against_this_one(images):
+    found = compare(images, moved(images, GROUP, shift=2.0), images)
+    assert (len(found.wrong), len(found.undecided)) == (0, 0)
+    assert len(found.confirmed) == N - len(GROUP)
+
+
+def test_models_that_agree_have_all_cameras_confirmed(images):
+    found = compare(images, images, images)
+    assert (found.num_common, len(found.confirmed)) == (N, N)
+    assert (len(found.wrong), len(found.undecided)) == (0, 0)
+
+
+def test_where_pairs_support_neither_nobody_is_believed(images):
+    one, other = moved(images, [5], shift=2.0), moved(images, [5], shift=-2.0)
+    found = compare(one, other, images)
+    assert found.wrong.tolist() == []
+    half = measured(images.centers)
+    pairs = half.pairs
+    towards = np.where((np.arange(len(pairs)) % 2 == 0)[:, None], one.centers[5], other.centers[5])
+    ends = np.where((pairs == 5)[:, :, None], towards[:, None], images.centers[pairs])
+    lies = ends[:, 0] - ends[:, 1]
+    half = replace(half, directions=lies / np.linalg.norm(lies, axis=1, keepdims=True))
+    found = compare_models(one, fit_pairs(one.centers, half), other, fit_pairs(other.centers, half))
+    assert found.undecided.tolist() == [5]
+
+
+def test_without_cameras_in_common_there_is_no_opinion(images):
+    others = replace(images, names=tuple(f"other-{name}" for name in images.names))
+    assert compare(images, others, images) is None

@@ -1,0 +1,84 @@
+"""Evidence that can be acted on: a lens is freed, a camera goes where most pairs put it."""
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.evidence import ModelEvidence
+from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.pipeline.acting import find_remedy
+from sfm_shapefit.pipeline.given import Given
+from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, see_matches
+from tests.pipeline.test_evidence import with_own_lenses
+from tests.scenes import RING
+
+DATABASE = RING / "database.db"
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return pycolmap.Reconstruction(RING / "sparse" / "0")
+
+
+def test_a_lens_that_is_wrong_is_freed_and_the_cameras_stand_right(truth):
+    name = truth.image(5).name
+    found = sfm_shapefit.locate(with_own_lenses(truth, {name: 1.1}), DATABASE)
+    assert found.verdict.grade is Grade.GOOD
+    assert any(f"camera {truth.image(5).image_id}: focal length" in warning for warning in found.warnings)
+    lens = found.reconstruction.find_image_with_name(name).camera
+    assert lens.mean_focal_length() == pytest.approx(truth.image(5).camera.mean_focal_length(), rel=1e-3)
+    assert sfm_shapefit.evaluate(found.reconstruction, truth).position.max < 1e-3
+
+
+def test_intrinsics_held_forbid_it_and_the_lens_is_named(truth):
+    name = truth.image(5).name
+    found = sfm_shapefit.locate(with_own_lenses(truth, {name: 1.1}), DATABASE, intrinsics="held")
+    assert found.verdict.grade is Grade.LOOK
+    assert [told.camera for told in found.told_evidence.lenses] == [truth.image(5).image_id]
+
+
+def test_map_frees_a_lens_too(truth, tmp_path):
+    """The database says that the lens of one image was calibrated, and it is wrong."""
+    path = tmp_path / "database.db"
+    path.write_bytes(DATABASE.read_bytes())
+    with closing(sqlite3.connect(path)) as database, database:
+        lens = np.array([1100.0, 1100.0, 600.0, 450.0]).tobytes()
+        database.execute("INSERT INTO cameras VALUES (2, 1, 1200, 900, ?, 1)", (lens,))
+        database.execute("INSERT INTO rigs VALUES (2, 2, 0)")
+        database.execute("UPDATE frames SET rig_id = 2 WHERE frame_id = 5")
+        database.execute("UPDATE frame_data SET sensor_id = 2 WHERE frame_id = 5")
+        database.execute("UPDATE images SET camera_id = 2 WHERE image_id = 5")
+    (model,) = sfm_shapefit.map_database(path).models
+    assert model.located.reconstruction.camera(2).mean_focal_length() == pytest.approx(1000.0, rel=0.001)
+    assert model.located.verdict.grade is Grade.GOOD
+
+
+@pytest.mark.parametrize(("here", "moves"), [(3, True), (4, False)])
+def test_a_camera_goes_where_twice_as_many_pairs_put_it(truth, here, moves):
+    found = sfm_shapefit.locate(truth, DATABASE)
+    pairs = np.array([(0, 2), (1, 2), (2, 3), (2, 4)])[:here]
+    place = OtherPlace(2, here, 6, np.ones(3), pairs)
+    found = replace(found, evidence=ModelEvidence(places=(place,)))
+    model = read_model(RING / "sparse" / "0")
+    inputs, options = choose_inputs(RING / "sparse" / "0", DATABASE), LocateOptions()
+    with closing(open_matches(model, inputs)) as matches:
+        source = see_matches(matches, model.images, inputs, options)
+        remedy = find_remedy(found, given_of(found, inputs), source, options)
+        assert (remedy is not None) == moves
+        if moves:
+            names = model.images.names
+            assert remedy.source.inputs.left_out == {(names[i], names[j]) for i, j in pairs.tolist()}
+            assert remedy.source.view.num_pairs == source.view.num_pairs - here
+            assert remedy.told(found)[-1].startswith(names[2])
+
+
+def given_of(found, inputs):
+    return Given(None, found.images, found.intrinsics, inputs, None, None)
