@@ -47,7 +47,6 @@ from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
@@ -159,8 +158,6 @@ class LocateResult(Displayed):
     the others; NaN where there is no database."""
     contradicting_observations: float = math.nan
     """Share of the same keypoints that sees none, and most of whose matches miss the epipolar lines."""
-    focal_doubts: tuple[FocalDoubt, ...] = ()
-    """Cameras whose matches prefer another focal length than the given one, by their id."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
     """What speaks against it although it fits, by images of it."""
 
@@ -257,11 +254,10 @@ class LocateResult(Displayed):
             float(np.mean(self.placed.is_posed)),
         )
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
-        lenses = (f"the matches of camera {d.camera} prefer another focal length" for d in self.focal_doubts)
         repeats = tuple(match_warnings(self.directions))[:1]
         names = [self.images.names[camera] for camera in outside]
         against = weigh_evidence(self.evidence, self.placed)
-        return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions), against)
+        return judge_model(self.placement, shares, names, (*repeats, *self.suspicions), against)
 
     @property
     def certified(self) -> SolverResult:

@@ -6,14 +6,12 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
-from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
@@ -126,21 +124,6 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         yield (
             f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} "
             f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
-        )
-
-
-def focal_warnings(lenses: Sequence[Lens], doubts: tuple[FocalDoubt, ...], tried: BoolArray) -> Iterator[str]:
-    """Yield which cameras' matches prefer another focal length; of `tried` ones (l,) none was found."""
-    for doubt in doubts:
-        advice = "--intrinsics focal lets it change"
-        if tried[doubt.camera]:
-            advice = "the adjustment could not tell, so calibrate that camera"
-        lens = lenses[doubt.camera]
-        focal_px = lens.focal_px
-        yield (
-            f"the matches of camera {lens.id} prefer a focal length of about "
-            f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
-            f"asked); its images stand wrong if that is so: {advice}"
         )
 
 

@@ -17,7 +17,7 @@ that keypoints share, as those of distortion are, grow by one over its root.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (19
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _ANGULAR = ("EQUIRECTANGULAR", "FOV")  # lenses beside the fisheyes whose pictures grow with the angle
+_NOISY, _LEAST_NOISY_PX = 3.0, 1.0  # usual noises and pixels; an image that is above both fits nowhere
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
 
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
@@ -66,6 +67,13 @@ class LeftOut:
     def observable(self) -> BoolArray:
         """Images (i,) whose focal length the points determine; of NaN is none."""
         return np.asarray((self.sigmas <= LARGEST_SIGMA) & (self.free_shares >= _LEAST_FREE))
+
+    def of_little_noise(self, usual: BoolArray) -> "LeftOut":
+        """Return the same without the sigmas of images whose noise is far above that of `usual` ones (i,)."""
+        noise_px = self.noise_px[usual & np.isfinite(self.noise_px)]
+        most_px = _NOISY * float(np.median(noise_px)) if len(noise_px) else np.inf
+        noisy = ~usual & ~(self.noise_px <= max(most_px, _LEAST_NOISY_PX))
+        return replace(self, sigmas=np.where(noisy, np.nan, self.sigmas))
 
 
 def leave_one_out(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.scene.images import Images, Pictures
@@ -40,20 +41,22 @@ class WrongLens(NamedTuple):
 
 
 def question_lenses(
-    points: Points, images: Images, pictures: Pictures, threads: int = 1
+    points: Points, images: Images, pictures: Pictures, threads: int = 1, among: BoolArray | None = None
 ) -> tuple[LeftOut, tuple[WrongLens, ...]]:
     """Return what images say when they are left out, and the lenses that they contradict, the worst first.
 
     The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
-    the points of all, unless it took half of the images or more, until no other lens is named.
+    the points of all, unless it took half of the images or more, until no other lens is named. Images not
+    `among` those that make points (i,) are asked too, if their pixels fit about as well; None: all make them.
     """
-    believed = np.ones(images.num_images, dtype=np.bool_)
+    make = np.ones(images.num_images, dtype=np.bool_) if among is None else among
+    believed = make.copy()
     while True:
-        left_out = leave_one_out(points, images, pictures, threads, believed)
+        left_out = leave_one_out(points, images, pictures, threads, believed).of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
         fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
         gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= _RIVAL * fresh[0].score])
-        if not fresh or 2 * np.sum(~believed | gone) >= images.num_images:
+        if not fresh or 2 * np.sum(make & (~believed | gone)) >= np.sum(make):
             return left_out, wrong
         believed &= ~gone
 

@@ -75,14 +75,15 @@ def find_remedy(
     """Return what to start from instead; None if nothing can be done about what speaks against a result."""
     images, intrinsics = source.images, given.intrinsics
     may_free = options.freedom.intrinsics != "held" and options.freedom.adjusts_cameras(images.num_images)
-    factors = {doubt.camera: doubt.factor for doubt in found.focal_doubts}
-    factors |= {images.lenses[wrong.lens].id: wrong.factor for wrong in found.evidence.lenses}
     freed = {
-        row: factors[lens.id]
-        for row, lens in enumerate(images.lenses)
-        if may_free and lens.id in factors and lens.is_adjustable and not intrinsics.focal[row]
+        wrong.lens: wrong.factor
+        for wrong in found.evidence.lenses
+        if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.focal[wrong.lens]
     }
-    moved = [place for place in found.evidence.places if place.num_there >= _OUTNUMBERED * place.num_here]
+    # A camera that is fixed, or held by its rig, cannot go where its pairs are.
+    may_move = given.rigid.groups is None and not given.rigid.fixed.any()
+    places = found.evidence.places if may_move else ()
+    moved = [place for place in places if place.num_there >= _OUTNUMBERED * place.num_here]
     if not (freed or moved):
         return None
     lenses, focal = list(images.lenses), intrinsics.focal.copy()
@@ -108,5 +109,5 @@ def find_remedy(
 def _count(found: LocateResult) -> int:
     """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
     evidence, left_out = found.evidence, int(np.sum(~found.kept))
-    lenses = len(evidence.lenses) + len(found.focal_doubts)
-    return lenses + left_out + len(evidence.places) + sum(len(seam.cameras) for seam in evidence.seams)
+    apart = sum(len(seam.cameras) for seam in evidence.seams)
+    return len(evidence.lenses) + left_out + len(evidence.places) + apart

@@ -9,7 +9,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
-from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.pairs.essential import (
@@ -22,7 +21,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch, RayMatches, join_rays
+from sfm_shapefit.scene.matches import MatchBatch, RayMatches
 
 _LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
 _POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
@@ -48,10 +47,6 @@ the same cameras as all pairs; 15 and 6 do so on the facade, and on the ring one
 _MOST_ASKED = 30_000  # pairs of all cameras together; beyond 750 images each camera has fewer for it
 _FEWEST_PAIRS = 6  # pairs of a camera, however many cameras there are; see `_MOST_PAIRS`
 _MOST_MATCHES = 150  # matches of a pair that are looked at; more hardly change its rotation
-_MOST_CAMERAS = 200  # lenses whose focal lengths are asked; beyond, the pairs of each are too few
-_FOCAL_PAIRS, _FEWEST_FOCAL_PAIRS = 300, 8  # pairs, about, in all and at least of each lens; for their time
-_PAIRS_OF_TWO = 60  # pairs of each two lenses; more of the same two say nothing new
-_FOCAL_MATCHES = (20, 60)  # matches of a pair, least and most; fewer decide nothing, more take time
 _AGREEING_DEG = 3.0  # degrees; a direction so near agrees with the solution, whatever its standard deviation
 
 
@@ -70,7 +65,7 @@ def ask_pairs(
     without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
     for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
-        rays = _thin(source.images, batch, rows, _MOST_MATCHES)
+        rays = _thin(source.images, batch, rows)
         likely = _poses_alone(source.alone, rays.pairs)
         if likely is None and num_pairs > MANY_PAIRS:
             asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
@@ -107,7 +102,7 @@ def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> Relativ
     wanted, parts = set(map(tuple, pairs.tolist())), []
     for batch in source.view.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
-        rays = _thin(source.images, batch, rows, _MOST_MATCHES)
+        rays = _thin(source.images, batch, rows)
         likely = _poses_alone(source.alone, rays.pairs)
         parts.append(estimate_relative_rotations(rays, threads, num_pairs=len(wanted), likely=likely))
     return concatenate_rotations(parts)
@@ -155,43 +150,6 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
     return np.array([kind is Doubt.RIGHT for kind in kinds])
 
 
-def question_focal_lengths(
-    source: MatchSource, directions: PairDirections, threads: int
-) -> tuple[FocalDoubt, ...]:
-    """Return the cameras whose matches prefer another focal length, labelled by the rows of their lenses.
-
-    Only where several cameras took the images: a single one has nothing to be compared with.
-    """
-    images = source.images
-    if not source.has_database or not 1 < len(images.lenses) <= _MOST_CAMERAS:
-        return ()
-    is_wide = ["FISHEYE" in lens.model or "EQUIRECTANGULAR" in lens.model for lens in images.lenses]
-    lenses = Lenses(images.lens_of, images.focal_lengths_px, np.array(is_wide)[images.lens_of])
-    chosen = _pairs_of_cameras(directions, lenses.camera_of)
-    wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
-    parts = []
-    for batch in source.view.batches():
-        rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
-        parts.append(_thin(images, batch, rows, _FOCAL_MATCHES[1]))
-    return doubt_focal_lengths(join_rays(parts), images.rotations, lenses, threads)
-
-
-def _pairs_of_cameras(directions: PairDirections, camera_of: IntArray) -> IntArray:
-    """Return the pairs that are asked of focal lengths, some of each camera, of most matches first.
-
-    Pairs of images of one camera take part, too. They say less, but what they say does not hang on another.
-    """
-    cameras = np.sort(camera_of[directions.pairs], axis=1)
-    enough = np.flatnonzero(directions.num_matches >= _FOCAL_MATCHES[0])
-    counts, cameras = directions.num_matches[enough], cameras[enough]
-    num_cameras = int(camera_of.max(initial=0)) + 1
-    rank = _rank_within(cameras[:, 0] * num_cameras + cameras[:, 1], -counts)
-    # The best pair of each two cameras first, then the second, until a camera has enough.
-    by_camera = _rank_within(cameras.T.ravel(), np.tile(rank, 2), np.tile(-counts, 2)).reshape(2, -1)
-    quota = max(_FOCAL_PAIRS // num_cameras, _FEWEST_FOCAL_PAIRS)
-    return np.asarray(enough[(rank < _PAIRS_OF_TWO) & (by_camera < quota).any(axis=0)])
-
-
 def _rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
     """Return the rank of each entry among those of its label, by the keys, the first one first."""
     order = np.lexsort((*keys[::-1], labels))
@@ -233,9 +191,9 @@ def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
     return _strongest(directions, num_images)
 
 
-def _thin(images: Images, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:
-    """Return some pairs with at most so many matches, taken evenly, their rays in camera axes."""
-    thin = batch.rays_of(rows).thinned(most)
+def _thin(images: Images, batch: MatchBatch, rows: IntArray) -> RayMatches:
+    """Return some pairs with few of their matches, taken evenly, their rays in camera axes."""
+    thin = batch.rays_of(rows).thinned(_MOST_MATCHES)
     turns = np.repeat(images.rotations[thin.pairs], np.diff(thin.offsets), axis=0)
     rays_i, rays_j = (
         np.einsum("kab,kb->ka", turns[:, side], own) for side, own in enumerate((thin.rays_i, thin.rays_j))

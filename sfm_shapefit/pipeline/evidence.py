@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.seams import Cut, Seam, find_seams
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
@@ -12,7 +13,12 @@ from sfm_shapefit.scene.points import Points
 
 
 def gather_evidence(
-    images: Images, points: Points, pictures: Pictures, pairs: ModelEvidence, threads: int
+    images: Images,
+    points: Points,
+    pictures: Pictures,
+    pairs: ModelEvidence,
+    threads: int,
+    among: BoolArray | None = None,
 ) -> ModelEvidence:
     """Return the evidence of a model's pairs, and that of its points.
 
@@ -22,8 +28,9 @@ def gather_evidence(
         pictures: keypoints and lenses of the images.
         pairs: evidence of its pairs.
         threads: number of threads to use.
+        among: (i,) images that make the points; all if None.
     """
-    _, lenses = question_lenses(points, images, pictures, threads)
+    _, lenses = question_lenses(points, images, pictures, threads, among)
     return ModelEvidence(lenses=lenses, places=pairs.places, seams=pairs.seams)
 
 

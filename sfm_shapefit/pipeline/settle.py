@@ -21,14 +21,13 @@ import numpy as np
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.geometry import fit_similarity, median_spread
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.rigs import refined_rigs
 from sfm_shapefit.facts.warnings import (
     ambiguity_warnings,
-    focal_warnings,
     match_warnings,
     prior_warnings,
     quality_warnings,
@@ -46,7 +45,7 @@ from sfm_shapefit.pipeline.adjustment import (
     with_uncertainty,
 )
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
+from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
@@ -127,12 +126,6 @@ def finish_piece(
     started = pull_cameras(_start(placed, first), source.economy.limit(options.placement))
     stand = started if first is not None and started.held is None else _adjust(started, options, clock)
     with clock("trust"):
-        # Adjusted rotations have made up for a part of what a wrong focal length does to the given ones.
-        asked = stand if given.intrinsics.may_change else started
-        is_main = placed.placement.piece == 0  # the lenses of a further piece are asked with those of all
-        focal_doubts = (
-            question_focal_lengths(asked.source, asked.directions, clock.threads) if is_main else ()
-        )
         judged = _judge(stand, options, before, clock)
         kept, stand = _choose(stand, judged, options.trust.min_trust)
     del placed, started  # with their samples of errors
@@ -150,13 +143,6 @@ def finish_piece(
     kept &= images.is_posed[judged.cameras]
     with clock("trust"):
         evidence = _question(stand, kept, seeded, clock)
-    # What adjustments or points say of a lens is known better than by the matches of pairs.
-    named = {wrong.lens for wrong in evidence.lenses}
-    focal_doubts = tuple(
-        one
-        for one in focal_doubts
-        if np.isnan(intrinsics.focal_sigmas[one.camera]) and one.camera not in named
-    )
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
@@ -184,15 +170,13 @@ def finish_piece(
         fixed=given.rigid.fixed,
         distances=given.distances,
         prior_angles=_compare_with_priors(stand, images, gauge),
-        focal_doubts=tuple(one._replace(camera=images.lenses[one.camera].id) for one in focal_doubts),
         evidence=evidence,
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
         control_points=brought.control_points,
         suspicions=stand.failures,
     )
-    doubts = focal_warnings(source.images.lenses, focal_doubts, intrinsics.undetermined)
-    return replace(found, warnings=(*doubts, *_warnings(found, stand), *brought.warnings))
+    return replace(found, warnings=(*_warnings(found, stand), *brought.warnings))
 
 
 def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
@@ -248,8 +232,21 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     centers = np.full((source.images.num_images, 3), np.nan)
     centers[placement.cameras[kept]] = placement.locations[kept]
     pairs = question_pairs(source, fit_pairs(centers, stand.directions), clock.threads)
-    pictures = ModelPictures(seeded.images, source.view.keypoints)
-    return gather_evidence(seeded.images, seeded.points, pictures, pairs, clock.threads)
+    images, points, among = seeded.images, seeded.points, seeded.images.is_posed
+    if placement.piece == 0 and source.has_database:
+        images = _place_all(stand, images)
+    if (others := images.is_posed & ~among).any():
+        points = points.seen_by(others, source.view.num_keypoints, source.view.links())
+    pictures = ModelPictures(images, source.view.keypoints)
+    return gather_evidence(images, points, pictures, pairs, clock.threads, among)
+
+
+def _place_all(stand: Stand, images: Images) -> Images:
+    """Return the delivered images, and where they are placed those that were left out."""
+    before, now = stand.place().frames.centers, images.frames.centers
+    there = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
+    motion = fit_similarity(before[there], now[there])
+    return images.posed(images.frames.rotations, np.where(np.isfinite(now), now, motion.apply(before)))
 
 
 def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estimate | None) -> FloatArray:

@@ -1,12 +1,13 @@
 """The 3D points of a model, and the keypoints of images that observe them, as arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.scene.matches import KeypointMatches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,6 +64,39 @@ class Points:
             keypoints=self.keypoints[chosen],
             ids=self.ids[kept],
             errors_px=None if self.errors_px is None else self.errors_px[kept],
+        )
+
+    def seen_by(
+        self, others: BoolArray, num_keypoints: IntArray, links: Iterable[KeypointMatches]
+    ) -> "Points":
+        """Return the points with the keypoints of other images (i,) that match one of their observations.
+
+        Args:
+            others: images that see none of the points yet.
+            num_keypoints: (i,) of all images.
+            links: matches of all pairs of images.
+        """
+        begins = np.append(0, np.cumsum(num_keypoints))
+        point_of = np.full(begins[-1], -1)
+        point_of[begins[self.images] + self.keypoints] = self.points_seen()
+        found = [np.zeros((0, 3), dtype=np.int64)]
+        for batch in links:
+            ends = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0)
+            for own in (0, 1):
+                points = point_of[begins[ends[:, 1 - own]] + batch.keypoints[:, 1 - own]]
+                rows = np.flatnonzero(others[ends[:, own]] & (points >= 0))
+                found.append(np.column_stack([points[rows], ends[rows, own], batch.keypoints[rows, own]]))
+        # A keypoint sees one point, and a point is seen once in an image.
+        new = np.concatenate(found)
+        new = new[np.unique(begins[new[:, 1]] + new[:, 2], return_index=True)[1]]
+        new = new[np.unique(new[:, :2], axis=0, return_index=True)[1]]
+        points = np.append(self.points_seen(), new[:, 0])
+        order = np.argsort(points, kind="stable")
+        return replace(
+            self,
+            offsets=np.append(0, np.cumsum(np.bincount(points, minlength=self.num_points))),
+            images=np.append(self.images, new[:, 1])[order],
+            keypoints=np.append(self.keypoints, new[:, 2])[order],
         )
 
     def transformed(self, motion: Similarity) -> "Points":

@@ -8,6 +8,7 @@ from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
 from sfm_shapefit.judgement.wrong_lenses import question_lenses, wrong_lenses
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from tests.adjustment.made import look_at
 
@@ -114,6 +115,27 @@ def test_the_rays_of_a_wrong_lens_make_no_right_one_look_wrong():
     assert {item.lens: round(item.factor, 2) for item in wrong} == {0: 1.3, 2: 0.8}
     right = np.setdiff1d(np.arange(NUM_IMAGES), [0, 2])
     assert np.abs(left_out.log_factors[right]).max() < 0.003
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_an_image_that_makes_no_points_is_asked_if_its_pixels_fit(noisy):
+    scene = Scene(factors=[1.0, 1.0, 1.0, 1.2])
+    if noisy:
+        scene.plane[3] += np.random.default_rng(1).normal(0.0, 5.0 / FOCAL_PX, scene.plane[3].shape)
+    points, among = scene.points, np.arange(NUM_IMAGES) != 3
+    alone = points.taken(among[points.images])
+    keypoints = np.full(NUM_IMAGES, points.num_points)
+    links = KeypointMatches(
+        pairs=np.array([[3, 5]]),
+        offsets=np.array([0, points.num_points]),
+        keypoints=np.tile(np.arange(points.num_points)[:, None], 2),
+    )
+    seen = alone.seen_by(~among, keypoints, [links])
+    assert seen.count_seen(NUM_IMAGES).tolist() == [points.num_points] * NUM_IMAGES
+    assert (seen.keypoints == seen.points_seen()).all()  # each image numbers them as they are
+    _, wrong = question_lenses(seen, scene.images, scene, among=among)
+    assert [item.lens for item in wrong] == ([] if noisy else [3])
+    assert noisy or wrong[0].factor == pytest.approx(1.2, abs=0.015)
 
 
 def test_own_rays_have_no_part_in_the_points_of_an_image():

@@ -17,8 +17,9 @@ from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.pipeline.acting import find_remedy
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, see_matches
+from sfm_shapefit.pipeline.rigs import Rigid
 from tests.pipeline.test_evidence import with_own_lenses
-from tests.scenes import RING
+from tests.scenes import COURTYARD, RING
 
 DATABASE = RING / "database.db"
 
@@ -61,6 +62,18 @@ def test_map_frees_a_lens_too(truth, tmp_path):
     assert model.located.verdict.grade is Grade.GOOD
 
 
+def test_a_lens_whose_image_is_left_out_is_found_too():
+    """Its rotation is not believed, so that it makes no points."""
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    name = truth.image(sorted(truth.reg_image_ids())[7]).name
+    given = with_own_lenses(truth, {name: 0.6})
+    held = sfm_shapefit.locate(given, COURTYARD / "database.db", intrinsics="held")
+    assert name in {camera.name for camera in held.cameras if not camera.placed}
+    wrong = given.find_image_with_name(name).camera_id
+    assert [told.camera for told in held.told_evidence.lenses] == [wrong]
+    assert held.told_evidence.lenses[0].asked_focal_px == pytest.approx(720.0, rel=0.002)
+
+
 @pytest.mark.parametrize(("here", "moves"), [(3, True), (4, False)])
 def test_a_camera_goes_where_twice_as_many_pairs_put_it(truth, here, moves):
     found = sfm_shapefit.locate(truth, DATABASE)
@@ -81,4 +94,5 @@ def test_a_camera_goes_where_twice_as_many_pairs_put_it(truth, here, moves):
 
 
 def given_of(found, inputs):
-    return Given(None, found.images, found.intrinsics, inputs, None, None)
+    rigid = Rigid(np.zeros(found.images.num_images, dtype=bool), None, None)
+    return Given(None, found.images, found.intrinsics, inputs, rigid, None)
