@@ -35,7 +35,7 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4410,
+    "adjustment": 4480,
     "base": 1930,
     "cli": 1660,
     "facts": 3250,

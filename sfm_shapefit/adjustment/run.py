@@ -45,6 +45,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
+from sfm_shapefit.adjustment.lens_doubts import covariances_of_free_lenses, covariances_of_open_lenses
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
@@ -243,11 +244,16 @@ class AdjustmentRun:
     ) -> Estimate:
         """Return where the images stand, and how well that is known at the optimum last solved for."""
         known, free = self._center_errors(last), self.freedom.sensors(self.images) & with_sensors
+        covariances = None
+        if known is not None:
+            image_of = views_of(self.images).images[last.cameras_seeing]
+            of_open = covariances_of_open_lenses(self.images, last, image_of, self.undetermined)
+            covariances = known.covariances[self.images.frame_of] + of_open
         return Estimate(
             images=self.images,
             freedom=self.freedom,
             errors=errors,
-            covariances=None if known is None else known.covariances[self.images.frame_of],
+            covariances=covariances,
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=self.focal_sigmas,
             undetermined=self.undetermined,
@@ -269,7 +275,10 @@ class AdjustmentRun:
         is_checked = np.bincount(problem.points_seen, minlength=problem.num_points) >= self.checked_length
         checked = problem.of_points(is_checked) if is_checked.any() else problem
         try:
-            return estimate_center_errors(checked, self.options_at_optimum(), self.freedom.doubt_rad)
+            options = self.options_at_optimum()
+            known = estimate_center_errors(checked, options, self.freedom.doubt_rad)
+            of_lenses = covariances_of_free_lenses(checked, options, self.freedom)
+            return replace(known, covariances=known.covariances + of_lenses)
         except UnsolvableError:
             return None
 

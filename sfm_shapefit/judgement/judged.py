@@ -28,12 +28,17 @@ class Judged(Placement):
 
     @property
     def covariances(self) -> FloatArray:
-        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only."""
-        directions = self.assessment.covariances[: len(self.cameras)]
-        if self.adjusted_covariances is None:
-            return directions
-        known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
-        return np.where(known, self.adjusted_covariances, directions)
+        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only.
+
+        They are infinite where a standard deviation is larger than the scene: nothing holds such a camera.
+        """
+        found = self.assessment.covariances[: len(self.cameras)]
+        if self.adjusted_covariances is not None:
+            known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
+            found = np.where(known, self.adjusted_covariances, found)
+        extent = np.linalg.norm(np.ptp(self.locations, axis=0))
+        lost = np.einsum("kaa->ka", found).max(axis=1) > extent**2
+        return np.where(lost[:, None, None], np.inf, found)
 
 
 @one_blas_thread()  # as `place`: bits must depend neither on the machine nor on what runs beside

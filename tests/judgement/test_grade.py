@@ -170,3 +170,14 @@ def test_images_that_are_not_placed_are_told_and_count(found):
     assert (verdict.grade, verdict.reasons) == (Grade.LOOK, ("only 88% of the images are placed",))
     verdict = altered(found, placed=found.placed.without(np.arange(8) < 5)).verdict
     assert (verdict.grade, verdict.reasons) == (Grade.DO_NOT_USE, ("only 38% of the images are placed",))
+
+
+def test_a_camera_that_is_known_worse_than_the_scene_is_large_is_held_by_nothing(found):
+    placement = found.placement
+    covariances = placement.covariances.copy()
+    extent = np.linalg.norm(np.ptp(placement.locations, axis=0))
+    covariances[2] = (1.1 * extent) ** 2 * np.eye(3)
+    covariances[3] = (0.9 * extent) ** 2 * np.eye(3)
+    known = replace(placement, adjusted_covariances=covariances).covariances
+    assert np.isinf(known[2]).all()
+    assert np.isfinite(np.delete(known, 2, axis=0)).all()

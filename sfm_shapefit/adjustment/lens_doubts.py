@@ -1,0 +1,59 @@
+"""What lenses that are not known add to the covariances of centers.
+
+A lens that moved with the poses adds what its freedom adds for independent noise. Errors that keypoints
+share are left to lenses that are held (`shared_errors`): smooth fields drawn at random would go straight into
+a free focal length. A lens whose focal length the points left open stays as it was given, off by its own
+doubt s: its camera stands off along its view by s times the depth of what it sees, and no other follows.
+"""
+
+import numpy as np
+
+from sfm_shapefit.adjustment.covariance import estimate_covariances
+from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.scene.images import Images
+
+
+def covariances_of_free_lenses(
+    problem: AdjustmentProblem, options: AdjustmentOptions, freedom: Freedom
+) -> FloatArray:
+    """Return what lenses that are free add to the covariances of the frames' centers, (n, 3, 3).
+
+    Args:
+        problem: at its minimum, with its priors.
+        options: as it was adjusted with, but for the lenses.
+        freedom: which lenses were free.
+
+    Raises:
+        UnsolvableError: if the observations leave more open than a similarity.
+    """
+    if not freedom.lenses.any():
+        return np.zeros((problem.num_frames, 3, 3))
+    free = estimate_covariances(problem, options, **freedom.overrides()).centers
+    more = np.nan_to_num(free - estimate_covariances(problem, options).centers)
+    values, axes = np.linalg.eigh(0.5 * (more + more.transpose(0, 2, 1)))
+    return np.asarray((axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1))
+
+
+def covariances_of_open_lenses(
+    images: Images, problem: AdjustmentProblem, image_of: IntArray, is_open: BoolArray
+) -> FloatArray:
+    """Return what lenses that were left open add to the covariances of images, (i, 3, 3).
+
+    Args:
+        images: all posed.
+        problem: whose points they see.
+        image_of: (o,) image of each observation.
+        is_open: (l,) lenses whose focal length stays what was given, though that is in doubt.
+    """
+    found = np.zeros((images.num_images, 3, 3))
+    for k in np.flatnonzero(is_open[images.lens_of]).tolist():
+        view = images.rotations[k, 2]
+        seen = problem.points[problem.points_seen[image_of == k]]
+        if len(seen):
+            depth = float(np.median((seen - images.centers[k]) @ view))
+            sigma = images.lenses[images.lens_of[k]].focal_sigma * depth
+            found[k] = sigma**2 * np.outer(view, view)
+    return found
