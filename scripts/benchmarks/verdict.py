@@ -93,10 +93,10 @@ def look(model: pycolmap.Reconstruction, scene: Scene) -> tuple[ModelVerdict, se
     """Return the verdict on a model as it stands, and the members of groups that it names as such."""
     facts = sfm_shapefit.check(model, scene.database, second_opinion=map_of(scene.database)).facts
     told = facts.evidence
-    groups = (
-        [told.second.wrong] if told.second and len(told.second.wrong) > 1 else [s.images for s in told.seams]
-    )
-    return facts.verdict, {name for group in groups for name in group}
+    apart = {name for seam in told.seams for name in seam.images}
+    if told.second and len(told.second.wrong) > 1:
+        apart = apart.intersection(facts.verdict.cameras).union(told.second.wrong)
+    return facts.verdict, apart
 
 
 @cache

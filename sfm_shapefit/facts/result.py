@@ -249,7 +249,6 @@ class LocateResult(Displayed):
         shares = Shares(
             self.agreeing_observations,
             self.contradicting_observations,
-            self.agreeing_pairs,
             float(np.mean(self.kept)),
             float(np.mean(self.placed.is_posed)),
         )

@@ -29,9 +29,6 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
         yield f"the solve is not certified to the tolerance: {placement.certified.status.value}"
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
-    level = placement.assessment.level_deg
-    if level > MOST_LEVEL_DEG:
-        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
     refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
         assert refined.disagreement is not None
@@ -130,6 +127,9 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
 def graph_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a bare graph, all of whose placed nodes are in the answer."""
     yield from quality_warnings(placement)
+    level = placement.assessment.level_deg
+    if level > MOST_LEVEL_DEG:
+        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
     floor = TrustOptions().min_trust
     low = np.flatnonzero(placement.assessment.trust < floor)
     if len(low):

@@ -116,5 +116,7 @@ class ModelEvidence:
     """By rows of the images."""
     seams: tuple[Seam, ...] = ()
     """By rows of the images."""
+    num_held: int | None = None
+    """Cameras in the largest rigid piece of the pairs that agree; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""

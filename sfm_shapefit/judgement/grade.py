@@ -2,7 +2,8 @@
 
 Do not use, if any of these holds:
 
-    the residuals of the pairs that agree have a level above 5 degrees
+    the pairs that agree hold less than half of the cameras in one rigid piece, however many contradict; of a
+    bare graph, the residuals of its directions have a level above 5 degrees
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of the cameras that were placed are in the output, or of all images
@@ -49,6 +50,7 @@ MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model i
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
 _LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
+_LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
 _MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
 _MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
 _LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
@@ -94,7 +96,6 @@ class Shares(NamedTuple):
 
     observations: float
     contradicting: float
-    pairs: float
     kept: float
     placed: float = np.nan
 
@@ -118,8 +119,8 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     apart = [camera for seam in evidence.seams for camera in seam.cameras.tolist()]
     second = evidence.second
     wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
-    if len(wrong) > 1:  # which side of a seam is wrong, and where it runs, is known better so
-        apart = wrong
+    if second is not None and len(wrong) > 1:  # which tells which side of a seam is wrong, and where it runs
+        apart = list(dict.fromkeys([*wrong, *np.setdiff1d(apart, second.confirmed).astype(int).tolist()]))
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
     lenses = [wrong.lens for wrong in evidence.lenses]
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
@@ -131,6 +132,8 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     if apart:
         clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
         (reasons if len(apart) > _MOST_APART * count else suspicions).append(clause)
+    if evidence.num_held is not None and evidence.num_held < _LEAST_HELD * count:
+        reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
     if len(named) > _MOST_NAMED * count:
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
     if lenses:
@@ -140,8 +143,10 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
 
 def judge_graph(placement: Judged) -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
-    share = 1.0 - len(placement.rejected_pairs) / max(len(placement.pairs), 1)
-    return judge_model(placement, Shares(np.nan, np.nan, share, 1.0))
+    level, against = placement.assessment.level_deg, NOTHING_AGAINST
+    if level > MOST_LEVEL_DEG:
+        against = Against((), (), (f"the directions are {level:.0f} degrees off the cameras",))
+    return judge_model(placement, Shares(np.nan, np.nan, 1.0), against=against)
 
 
 def judge_model(
@@ -160,7 +165,7 @@ def judge_model(
         suspicions: what else speaks against the model, a clause each.
         against: what evidence that the fit did not use says.
     """
-    bad = (*_reasons_against(placement, shares), *against.reasons)
+    bad = (*_reasons_against(shares), *against.reasons)
     trust, cameras = placement.assessment.trust, placement.cameras
     doubtful = trust < _LOW_TRUST
     doubtful[uncertain_cameras(placement)] = True
@@ -181,11 +186,8 @@ def judge_model(
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
 
 
-def _reasons_against(placement: Judged, shares: Shares) -> Iterator[str]:
+def _reasons_against(shares: Shares) -> Iterator[str]:
     """Yield why a model should not be used; a share that is not known is no reason."""
-    level = placement.assessment.level_deg
-    if level > MOST_LEVEL_DEG:
-        yield f"the directions are {level:.0f} degrees off the cameras"
     if shares.contradicting >= _MOST_CONTRADICTING:
         yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
     if shares.kept < _LEAST_KEPT:

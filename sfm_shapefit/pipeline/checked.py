@@ -4,9 +4,8 @@ Which pairs contradict the model `judgement.evidence` says. A camera is weak if 
 if its reprojection error is above 0.75 px and above twice what is usual, if its points cover less than 15 %
 of the picture, or if more than a third of its pairs contradict it, and more than twice the usual share.
 
-A model is not to be used if its pairs say nothing of where its cameras stand, or if those that agree hold
-less than half of them in one rigid piece; else its weak cameras are to be looked at. However many pairs
-contradict: half of all may be wrong, and the model right.
+A model is not to be used if its pairs say nothing of where its cameras stand, or for the evidence of
+`judgement.grade`; else its weak cameras are to be looked at.
 
 These limits are set by the bundled scenes (courtyard, photographed, ring8, facade9) and twelve models of
 COLMAP: fountain-P11, Herz-Jesus-P8 and P25, castle-P19 and P30, lego, liberty, a street of KITTI, a beach
@@ -35,7 +34,6 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
@@ -65,7 +63,6 @@ if TYPE_CHECKING:
 _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
 _LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _LEAST_COVERAGE = 0.15  # share of the picture with points; an image with less is weak
-_LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
 _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
 _FEWEST_PAIRS = 3  # pairs with a direction; the share of fewer that contradict says nothing
 _LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is weak
@@ -262,13 +259,10 @@ def _grade(
 
 def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
     """Yield why a model should not be used, a clause each."""
-    held = 0 if fits is None else fits.count_held()
     if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
         yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
     elif fits is None or not np.isfinite(fits.residuals_deg).any():
         yield "no two of its images have matches that say in which direction they stand from each other"
-    elif held < _LEAST_HELD * images.num_images:
-        yield f"the pairs that agree hold only {held} of its {counted(images.num_images, 'camera')}"
 
 
 def _tell(

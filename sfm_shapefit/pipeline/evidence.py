@@ -1,5 +1,7 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray
@@ -31,7 +33,7 @@ def gather_evidence(
         among: (i,) images that make the points; all if None.
     """
     _, lenses = question_lenses(points, images, pictures, threads, among)
-    return ModelEvidence(lenses=lenses, places=pairs.places, seams=pairs.seams)
+    return replace(pairs, lenses=lenses)
 
 
 def question_pairs(source: MatchSource, fits: PairFits, threads: int) -> ModelEvidence:
@@ -42,7 +44,8 @@ def question_pairs(source: MatchSource, fits: PairFits, threads: int) -> ModelEv
         fits: of all pairs, their directions measured at these rotations.
         threads: number of threads to use.
     """
-    return ModelEvidence(places=fits.other_places(), seams=_question_cuts(source, fits.cuts(), threads))
+    seams = _question_cuts(source, fits.cuts(), threads)
+    return ModelEvidence(places=fits.other_places(), seams=seams, num_held=fits.count_held())
 
 
 def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:

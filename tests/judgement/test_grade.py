@@ -73,10 +73,13 @@ def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_is_to_be_look
     assert bool(verdict.reasons) is (grade is not Grade.GOOD)
 
 
-def test_a_model_whose_directions_are_far_off_is_not_to_be_used(found):
-    assert with_assessment(found, level_deg=4.9).verdict.grade is Grade.GOOD
-    verdict = with_assessment(found, level_deg=5.1).verdict
-    assert verdict.statement == "do not use: the directions are 5 degrees off the cameras"
+def test_a_model_less_than_half_of_which_agreeing_pairs_hold_is_not_to_be_used(found):
+    """However many pairs contradict: half of all matches permuted leave a right model right."""
+    assert altered(found, evidence=ModelEvidence(num_held=4)).verdict.grade is Grade.GOOD
+    verdict = altered(found, evidence=ModelEvidence(num_held=3)).verdict
+    assert verdict.statement == "do not use: the pairs that agree hold only 3 of 8 cameras"
+    assert found.evidence.num_held == 8
+    assert with_assessment(found, level_deg=40.0).verdict.grade is Grade.GOOD
 
 
 def test_a_model_most_of_whose_cameras_are_not_trusted_is_not_to_be_used(found):
