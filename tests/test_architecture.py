@@ -44,7 +44,7 @@ MOST_LINES = {
     "judgement": 3270,
     "laplacian": 2060,
     "pairs": 1580,
-    "pipeline": 5670,
+    "pipeline": 5630,
     "placement": 2060,
     "refinement": 2110,
     "report": 1660,
