@@ -54,8 +54,6 @@ import pytest
 from sfm_shapefit.base.arrays import FloatArray
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from sfm_shapefit.synthetic import GraphProblem, RenderedScene, Scene, StreetProblem, WorkspaceOptions
 
 __all__ = ["assert_locations_near", "assert_reconstruction_near"]
@@ -67,8 +65,8 @@ _FAMILIES = ("ring", "trajectory", "lawn", "box", "corridor", "community", "expa
 
 
 def assert_reconstruction_near(
-    found: "pycolmap.Reconstruction | Path | str",
-    truth: "pycolmap.Reconstruction | Path | str",
+    found: Any,
+    truth: Any,
     *,
     max_error: float | None = None,
     max_median_error: float | None = None,
@@ -82,7 +80,7 @@ def assert_reconstruction_near(
     camera.
 
     Args:
-        found, truth: reconstructions or model folders.
+        found, truth: results, reconstructions or model folders.
         max_error: limit for any placed camera's center, in units of the truth.
         max_median_error: limit for the median placed camera's center, in units of the truth.
         max_rotation_error_deg: limit for any placed camera's rotation.
