@@ -27,7 +27,9 @@ def main() -> None:
     parser.add_argument("--dark", action="store_true", help="in dark colors")
     args = parser.parse_args()
     with chromium(args.width, args.height, dark=args.dark) as driver:
-        opened(driver, (args.out / "report.html").resolve())
+        page = args.out / "report.html"
+        page = page if page.exists() else args.out / "0/report.html"  # of `map`
+        opened(driver, page.resolve())
         # It names folders of this machine.
         driver.execute_script("document.getElementById('next').hidden = true")
         if args.camera:

@@ -22,7 +22,7 @@ SHOWN = range(0, 16, 2)
 def run(_args: argparse.Namespace) -> Figure:
     """Return the picture."""
     scene = make_rendered_scene(SCENE, RenderOptions(repeated_fraction=0.2))
-    picture, axes = plt.subplots(2, 4, figsize=(10.0, 3.9), dpi=100, layout="constrained")
+    picture, axes = plt.subplots(2, 4, figsize=(10.0, 3.9), dpi=64, layout="constrained")
     for axis, k in zip(axes.flat, SHOWN, strict=True):
         axis.imshow(draw_image(scene, k))
         axis.set_title(f"{k + 1:04d}.jpg", fontsize=8)

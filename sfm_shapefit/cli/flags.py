@@ -163,7 +163,7 @@ class GroupedCommand(TyperCommand):
                 title = getattr(parameter, "rich_help_panel", None) or "Options"
                 groups.setdefault(title, []).append(record)
         if first:
-            shown = [(by_name[name][0], _first_words(by_name[name][1])) for name in first]
+            shown = [(by_name[name][0], brief_help(by_name[name][1])) for name in first]
             groups["Options"] = [*shown, (_HELP_ALL, "Show all options."), by_name["help"]]
         return groups
 
@@ -197,7 +197,7 @@ class GroupedCommand(TyperCommand):
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
 
 
-def _first_words(text: str) -> str:
+def brief_help(text: str) -> str:
     """Return what an option is, without what its values mean, and its default."""
     words = re.split(r"[.:;] | \[default: ", text, maxsplit=1)[0].rstrip(".")
     return words + "".join(re.findall(r" \[default: [^]]*\]", text))
@@ -319,7 +319,8 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     except (TypeError, ValueError) as error:
         message = str(error)
         for name in flags:  # an option of the file keeps its spelling
-            message = re.sub(rf"\b{name}\b(?=[ =])", _flag_of(name), message)
+            message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
+            message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
         raise typer.BadParameter(message) from error
 
 

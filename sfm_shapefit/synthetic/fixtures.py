@@ -4,25 +4,7 @@ Name the plugin in the conftest.py at the root of your tests (or run pytest with
 
     pytest_plugins = ["sfm_shapefit.synthetic.fixtures"]
 
-Then ask for what you need, and compare with the truth:
-
-    from sfm_shapefit import locate, solve
-    from sfm_shapefit.synthetic import WorkspaceOptions
-    from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_reconstruction_near
-
-
-    def test_a_quarter_of_wrong_pairs_does_no_harm(scene_of, workspace_of):
-        scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
-        workspace = workspace_of(scene, WorkspaceOptions(model="rotations"))
-        found = locate(workspace / "sparse/0").reconstruction
-        assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05, min_placed=0.8)
-
-
-    def test_exact_directions_give_exact_locations(random_graph):
-        problem = random_graph(30, p=0.5, q=0.1)
-        assert_locations_near(solve(problem.view_graph).locations, problem.locations, max_error=1e-6)
-
-The fixtures:
+Then ask for what you need, as `examples/test_my_pipeline.py` does. The fixtures:
 
 | fixture | what it is |
 |---|---|

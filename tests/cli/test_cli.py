@@ -157,18 +157,16 @@ def test_the_program_ends_without_a_last_search_for_garbage():
     assert run_python("-c", script).stdout.endswith("\nTrue\n")
 
 
-def test_earlier_names_of_options_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
+def test_place_is_also_called_solve_and_keys_of_the_config_are_no_flags(tmp_path):
     config = tmp_path / "options.toml"
-    config.write_text('method = "conic"\nfactor_memory = 500\n')
+    config.write_text('solver = "conic"\nfactor_memory_mb = 500\n')
     flags = ("--config", config, "--json", "--no-report")
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
     options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
-    said = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--method=conic", code=2).stderr
-    assert "--method=conic is a key" not in said
-    assert "--method is a key of --config: solver = ..." in " ".join(said.split())
+    said = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--solver=conic", code=2).stderr
+    assert "--solver is a key of --config: solver = ..." in " ".join(said.split())
     text = run("place", "--help-all").stdout
-    assert "--method" not in text
     assert run("solve", "--help-all").stdout == text.replace(" place ", " solve ", 1)
 
 

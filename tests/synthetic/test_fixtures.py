@@ -1,6 +1,5 @@
 """The pytest plugin serves a pipeline's own tests: its example runs, and its comparisons can fail."""
 
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +10,20 @@ from sfm_shapefit.synthetic import RenderOptions, WorkspaceOptions, fixtures
 from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_reconstruction_near
 from tests.scenes import COURTYARD, FACADE, ROOT
 
-
-def example() -> tuple[str, str]:
-    """The two code blocks of the plugin's docstring: the conftest.py and the tests."""
-    blocks, lines = [], []
-    for line in [*fixtures.__doc__.splitlines(), "end"]:
-        if line.startswith("    ") or (lines and not line):
-            lines.append(line)
-        elif lines:
-            blocks.append(textwrap.dedent("\n".join(lines)))
-            lines = []
-    return blocks[0], blocks[1]
+CONFTEST = 'pytest_plugins = ["sfm_shapefit.synthetic.fixtures"]'
 
 
-def test_the_example_of_the_docstring_passes_in_a_pipelines_own_tests(pytester, monkeypatch):
+@pytest.mark.slow
+def test_the_example_passes_in_a_pipelines_own_tests(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    conftest, tests = example()
-    pytester.makeconftest(conftest)
-    pytester.makepyfile(tests)
-    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=2)
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile((ROOT / "examples/test_my_pipeline.py").read_text(encoding="utf-8"))
+    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
 
 
 def test_the_documented_fixtures_are_those_that_there_are(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    pytester.makeconftest(example()[0])
+    pytester.makeconftest(CONFTEST)
     listed = pytester.runpytest_subprocess("--fixtures", "-q").stdout.str()
     page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
     for row in (line for line in fixtures.__doc__.splitlines() if line.startswith("| `")):
