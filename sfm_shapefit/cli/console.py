@@ -1,9 +1,10 @@
 """What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
 
 The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
-5 a package is missing; 130 interrupted.
+5 a package is missing; 130 interrupted; 141 nobody reads any more.
 """
 
+import errno
 import os
 import re
 import signal
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130  # exit codes; see the header
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED, EXIT_PIPE = 3, 4, 5, 130, 141  # see the header
 NAMES_SHOWN = 8  # lines under one label of a table; the files have all
 
 _LIBRARIES_BYTES = 850_000_000  # bytes of address space; with less, loading the libraries fails (measured)
@@ -59,8 +60,12 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
     before = _identity(out)
     try:
         yield
+        sys.stdout.flush()  # now, not when nobody hears of it
     except typer.Exit:
         raise
+    except BrokenPipeError:  # whoever reads has seen enough
+        _forget_stdout()
+        raise typer.Exit(EXIT_PIPE) from None
     except (KeyboardInterrupt, Exception) as error:
         # Native code that a signal interrupts may turn the interrupt into an error of its own.
         if isinstance(error, KeyboardInterrupt) or _received:
@@ -75,12 +80,29 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
             _fail(str(error), EXIT_MISSING)
         if isinstance(error, ShapeFitError):
             _fail(str(error), EXIT_INPUT)
+        if isinstance(error, OSError):
+            _fail(_explain_failure(error), EXIT_INPUT)
         if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
             _fail(
                 "the memory that this process may use is not enough; allow more, or give a smaller model",
                 EXIT_INPUT,
             )
         raise
+
+
+def _explain_failure(error: OSError) -> str:
+    """Say what the system refused: a path, the working folder, or what is printed."""
+    if error.filename is not None:
+        return f"{os.fsdecode(error.filename)} cannot be used ({error.strerror}); choose another"
+    if error.errno == errno.ENOENT:
+        return "the working folder is gone; go to another, and start again"
+    _forget_stdout()
+    return f"what there is to print cannot be written ({error.strerror})"
+
+
+def _forget_stdout() -> None:
+    """Let what is still to be printed go nowhere."""
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  as long as the process lives
 
 
 def _identity(path: Path | None) -> tuple[int, int] | None:

@@ -81,8 +81,10 @@ class Run(Generic[S]):
 
     def _missing_pictures(self, names: Iterable[str]) -> str:
         """Warn if pictures were asked for, and the folder has none of the images."""
+        from sfm_shapefit.report.thumbnails import file_of
+
         folder = Path(self.flags.images)
-        if not self.flags.images or not self.flags.report or any((folder / name).is_file() for name in names):
+        if not self.flags.images or not self.flags.report or any(file_of(folder, name) for name in names):
             return ""
         return f"{folder} has none of the images, so the report has no pictures"
 

@@ -108,8 +108,10 @@ def _load(folder: Path) -> pycolmap.Reconstruction:
 
 def _first_line(error: BaseException) -> str:
     """Return the first line of an exception's text, or its type if it has none."""
-    text = str(error).strip()
-    return text.splitlines()[0].strip() if text else type(error).__name__
+    text = str(error).strip().partition("\n")[0]
+    if "Check failed" in text:  # its own assertions, which say nothing to users
+        return "its parts contradict one another"
+    return text or type(error).__name__
 
 
 def _refuse_inconsistent(label: str, reconstruction: pycolmap.Reconstruction, *, is_checked: bool) -> None:
