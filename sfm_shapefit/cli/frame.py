@@ -112,6 +112,8 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.files.lines import is_database
 
+    if source.exists() and target.exists() and source.samefile(target):
+        raise InputError(f"{target} is the input; choose another folder for OUT")
     if order == "MODEL OUT" and is_database(target):
         raise InputError(f"{target} is a database, which goes by --database; the order is {order}")
     ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))

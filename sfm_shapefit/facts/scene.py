@@ -76,8 +76,8 @@ def describe_loops(loops: Sequence[Loop]) -> str:
         return f"{said}, taken as the frames between say the same"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
     return (
-        f"{said}, {lost} refused as the frames between contradict {'it' if lost == 1 else 'them'}: above all "
-        f"from {_stretch(worst.first)} to {_stretch(worst.second)}"
+        f"{said}, of which {lost} {'is' if lost == 1 else 'are'} not used because the frames between "
+        f"contradict {'it' if lost == 1 else 'them'}: above all from {_stretch(worst.first)} to {_stretch(worst.second)}"
     )
 
 

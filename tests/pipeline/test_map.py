@@ -311,7 +311,7 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
     assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
-    assert "1 refused as the frames between contradict it" in str(found.told.rows)
+    assert "1 is not used because the frames between contradict it" in str(found.told.rows)
     assert '"refused"]' in (tmp_path / "out/0/report.html").read_text()
     assert describe_loops(found.models[0].located.facts.loops).endswith(f"{names[0]} to {names[15]}")
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
