@@ -47,7 +47,7 @@ class Telling(NamedTuple):
     """What is out of the ordinary: what is not placed and why, lenses, warnings."""
     details: Sequence[Row] = ()
     """What `--verbose` adds."""
-    elsewhere: str = "see cameras.csv"
+    elsewhere: str = "see locate.json"
     """Where lines stand that are too many to be shown."""
     step: NextStep = NextStep("", "")
     folder: str = "."

@@ -138,7 +138,7 @@ class MapResult(Written):
         rows += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
-        rows += [row("warning", warning) for warning in self.warnings]
+        rows += [Row("warning", self.warnings)]
         step = largest.next_step
         return Telling(lines, rows, details, elsewhere="see map.json", step=step, folder="0")
 

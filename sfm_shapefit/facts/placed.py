@@ -342,8 +342,8 @@ class Facts(Record):
         return []
 
     def warning_rows(self) -> list[Row]:
-        """Return a row for each warning."""
-        return [row("warning", warning) for warning in self.warnings]
+        """Return the warnings."""
+        return [Row("warning", self.warnings)]
 
     def expert_sentences(self) -> list[str]:
         """Return what only those who know the method ask for."""

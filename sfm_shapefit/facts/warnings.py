@@ -38,8 +38,8 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
         assert refined.disagreement is not None
         yield (
-            f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long "
-            f"chains and under heavy corruption; kept: {refined.start}"
+            f"lengths are poorly known: ShapeFit and LUD disagree by {refined.disagreement:.0%}, as on long "
+            f"chains and with many wrong pairs; kept: {refined.start}"
             + ("" if refined.is_refined else ", unrefined; objective=auto refines both and compares")
         )
     yield from _uncertainty_warnings(placement)
@@ -120,12 +120,14 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
     if doubts is None:
         return
     ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
-    for body in np.unique(doubts.bodies[ambiguous]).tolist():
-        members = np.flatnonzero(doubts.bodies == body)
+    if ambiguous:
+        members = np.flatnonzero(np.isin(doubts.bodies, doubts.bodies[ambiguous]))
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
+        angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
+        by = " to ".join(dict.fromkeys((angles[0], angles[-1])))
         yield (
-            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} "
-            f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
+            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} by {by} "
+            "degrees as for the rotation given"
         )
 
 

@@ -126,7 +126,7 @@ def _figure_tiles(facts: Facts) -> Iterator[dict[str, str]]:
             "the middle of a picture.",
         )
     sigma, share, of = figures.sigma, figures.sigma_of_extent, facts.sigma_of
-    if sigma is not None and share is not None:
+    if sigma is not None and share is not None and share <= 1.0:  # beyond, nothing is known of it
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."
         yield _tile(f"± {sigma:.2g} units", label, hint)

@@ -204,7 +204,8 @@ def _loose(facts: Facts) -> Iterator[Hint]:
     for group in facts.loose_groups[:_SHOWN]:
         names = ", ".join(shorten(name, 40) for name in group.cameras[:_SHOWN])
         more = f" and {len(group.cameras) - _SHOWN:,} more" if len(group.cameras) > _SHOWN else ""
-        yield Hint(text=f"{names}{more}: loose, {shorten(group.cause)}")
+        each = "each" if len(group.cameras) > 1 else "it"
+        yield Hint(text=f"{names}{more} may slide: {each} {shorten(group.cause.removeprefix('it '))}")
 
 
 def _unchecked(drawing: Drawing) -> Iterator[Hint]:
