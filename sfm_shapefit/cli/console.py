@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED, EXIT_PIPE = 3, 4, 5, 130, 141  # see the header
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING = 3, 4, 5  # exit codes; see the header
+EXIT_INTERRUPTED, EXIT_PIPE = 130, 141  # exit codes; 128 and the number of the signal
 NAMES_SHOWN = 8  # lines under one label of a table; the files have all
 
 _LIBRARIES_BYTES = 850_000_000  # bytes of address space; with less, loading the libraries fails (measured)
