@@ -7,17 +7,20 @@ Copy it beside your own tests, and call your pipeline where `global_mapping`, `l
 """
 
 from sfm_shapefit import global_mapping, locate, place
+from sfm_shapefit.synthetic import WorkspaceOptions
 from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_reconstruction_near
 
 
-def test_a_fifth_of_wrong_pairs_does_no_harm(corrupted_workspace):
-    found = locate(corrupted_workspace / "sparse/0", corrupted_workspace / "database.db")
+def test_a_fifth_of_wrong_pairs_does_no_harm(drawn_workspace):
+    rotations = WorkspaceOptions(model="rotations")
+    workspace = drawn_workspace("courtyard", rotations, corrupted_pair_fraction=0.2)
+    found = locate(workspace / "sparse/0", workspace / "database.db")
     assert found.verdict.grade == "good"
-    assert_reconstruction_near(found, corrupted_workspace / "truth", max_median_error=0.05)
+    assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05)
 
 
-def test_photographs_drawn_by_opencv_become_a_model(rendered_scene_of, workspace_of, tmp_path):
-    workspace = workspace_of(rendered_scene_of("facade", num_images=6))
+def test_photographs_drawn_by_opencv_become_a_model(rendered_workspace, tmp_path):
+    workspace = rendered_workspace("facade")
     models = global_mapping(workspace / "database.db", workspace / "images", tmp_path / "models")
     assert_reconstruction_near(models[0], workspace / "sparse/0", max_median_error=0.05)
 

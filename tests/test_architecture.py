@@ -37,7 +37,7 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 MOST_LINES = {
     "adjustment": 4410,
     "base": 1980,
-    "cli": 1670,
+    "cli": 1680,
     "facts": 3270,
     "files": 4520,
     "graph": 1260,
@@ -52,7 +52,7 @@ MOST_LINES = {
     "scene": 2010,
     "solver": 4360,
     "synthetic": 2650,
-    "synthetic/fixtures": 250,
+    "synthetic/fixtures": 150,
     "tracks": 1150,
 }
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
