@@ -71,7 +71,9 @@ class Run(Generic[S]):
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
         told, page = found.told, out / found.told.folder / "report.html"
         if self.flags.verbose:
-            stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in found.timings_s.items())
+            known = found.timings_s
+            rest = time.perf_counter() - self.started - sum(known.values())
+            stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
         pictures = row("warning", self._missing_pictures(found.image_names))
         print_answer(told._replace(rows=[*told.rows, pictures]), self._describe_time())

@@ -177,7 +177,7 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
             "undetermined",
             "which the matches do not determine: the scene is flat, or the camera hardly turns and shifts",
         ),
-        ("held", "which stays as it is: intrinsics=auto, and an adjustment, would refine it"),
+        ("held", "as it was held or nothing was adjusted: `sfm-shapefit map` finds it from the matches"),
     ):
         cameras = [str(row.camera) for row in guessed if row.decided_by == how]
         if cameras:
