@@ -217,6 +217,7 @@ class FactsOfModel(Facts):
         points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
         source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
         contradict = f"{against[0]:,} of {counted(against[1], 'pair')} contradict the result"
+        contradict = contradict if against[1] else "no pair says where cameras stand"
         return [
             f"{self.num_placed:,} of {counted(self.num_images, 'image')} {verb}, "
             f"{counted(self.num_points, 'point')}{points}",
@@ -383,7 +384,7 @@ class CheckedFacts(FactsOfModel):
             pairs: rows of the pairs that were looked at.
         """
         weak = [f"{row.name}: {row.reason}" for row in cameras if row.reason]
-        judged = [pair.verdict for pair in pairs if pair.verdict]
+        judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
         lines = self.told_lines("posed", (judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         return Telling(lines, [Row("weak", weak)], elsewhere="see --report", step=self.next_step)
 

@@ -60,6 +60,13 @@ def test_a_model_without_a_usable_direction_gets_a_verdict_and_a_page(tmp_path, 
 def test_the_database_of_another_scene_gets_a_verdict():
     said = run("check", RING / "sparse/0", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: do not use" in said
+    assert "courtyard/database.db; no pair says where cameras stand\n" in said
+
+
+def test_pairs_without_a_direction_do_not_contradict_a_model():
+    """Nine pairs of the photographs are false, and have none."""
+    said = run("check", ROOT / "data_synthetic/photographed/truth", code=0).stdout
+    assert "photographed/database.db; 0 of 48 pairs contradict the result\n" in said
 
 
 def test_names_that_are_too_long_are_refused_in_a_sentence(tmp_path):
