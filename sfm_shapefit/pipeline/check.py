@@ -1,11 +1,10 @@
 """`check MODEL`: the verdict on a COLMAP model as it stands, with a second opinion of our own."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
-from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.checked import CheckResult, OtherModel, check_source
@@ -14,12 +13,9 @@ from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.solver.options import SolverOptions
 
-if TYPE_CHECKING:
-    import pycolmap
-
 
 def check(
-    model: "pycolmap.Reconstruction | Path | str",
+    model: ModelSource,
     database: Path | str | None = None,
     *,
     second_opinion: bool | MapResult = True,
@@ -28,7 +24,7 @@ def check(
     """Judge a COLMAP model as it stands, whatever program made it; the model is not changed.
 
     Args:
-        model: a reconstruction or a model folder, as for `locate`.
+        model: a reconstruction, a result or a model folder, as for `locate`.
         database: as for `locate`; without one, the pairs are those that share points of the model, which
             agree with it more easily.
         second_opinion: whether `map_database` places the images of the database anew, to compare with; or

@@ -31,8 +31,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
@@ -69,7 +70,7 @@ _LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera t
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Displayed):
+class CheckResult(Reported):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
