@@ -3,7 +3,7 @@
 import re
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,10 +26,11 @@ from sfm_shapefit.cli.flags import OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
-    from sfm_shapefit.facts.map_result import MapResult
+    from sfm_shapefit.facts.map_result import JoinedModel, MapResult
     from sfm_shapefit.facts.result import GraphResult, LocateResult
     from sfm_shapefit.pipeline.clock import Progress
 
+    Result = LocateResult | MapResult | GraphResult | JoinedModel
 
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
@@ -56,7 +57,7 @@ class Run(Generic[S]):
         how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
         return how | {"protect": self.protect}
 
-    def show(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
+    def show(self, found: "Result", source: Path, out: Path) -> None:
         """Print the facts as JSON, or what is told of them, or nothing, once the output is complete.
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
@@ -67,7 +68,7 @@ class Run(Generic[S]):
         elif not self.flags.quiet:
             self.shown = lambda: self._tell(found, source, out)
 
-    def _tell(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
+    def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print a table, with details if they are wanted, then the verdict and what to do next."""
         told = found.told
         page = ", report.html" if self.flags.report and told.folder == "." else ""
@@ -94,7 +95,7 @@ class Run(Generic[S]):
         opened = [f"open {shlex.quote(str(out / 'report.html'))}"] if self.flags.report else []
         return [*opened, filled]
 
-    def _describe_time(self, timings_s: dict[str, float]) -> str:
+    def _describe_time(self, timings_s: Mapping[str, float]) -> str:
         """Say how long the command took, how much of it went into compiling, and, in detail, each stage."""
         total = f"{time.perf_counter() - self.started:.1f} s"
         compiling = 0.0 if self.compiling is None else self.compiling.seconds

@@ -15,7 +15,7 @@ from sfm_shapefit.base.display import draw_pages_by
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
-from sfm_shapefit.facts.placed import folder_of
+from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
@@ -36,7 +36,7 @@ class WriteOptions(Settings):
 
 
 def write_result(
-    found: LocateResult | GraphResult | MapResult,
+    found: LocateResult | GraphResult | MapResult | JoinedModel,
     out: Path | str,
     *,
     options: WriteOptions | None = None,
@@ -46,7 +46,7 @@ def write_result(
     """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
 
     Args:
-        found: what `locate`, `map_database` or `place_graph_file` returned.
+        found: what `locate`, `map_database`, `join` or `place_graph_file` returned.
         out: the folder to be made.
         options: settings, see `help(WriteOptions)`; defaults if None.
         further_files: the text of more files, by their path in the folder.
@@ -69,6 +69,8 @@ def write_result(
                 (folder / joined.folder).mkdir()
                 _write_joined(joined, folder / joined.folder, options)
             write_json(found.summary(), folder / MAP_MARKER)
+        elif isinstance(found, JoinedModel):
+            _write_joined(found, folder, options)
         else:
             _write_files(found, folder, options)
 
@@ -77,7 +79,10 @@ write_map_result = write_result
 """The same by another name."""
 
 
-def _inputs_of(found: LocateResult | GraphResult | MapResult) -> list[Path]:
+def _inputs_of(found: LocateResult | GraphResult | MapResult | JoinedModel) -> list[Path]:
+    if isinstance(found, JoinedModel):
+        read = found.facts.inputs
+        return [Path(path) for path in (read.model, read.database) if path and path != IN_MEMORY]
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     return [found.database if isinstance(found, MapResult) else found.path]

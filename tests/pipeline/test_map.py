@@ -455,7 +455,7 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     models = [model.located.reconstruction for model in found.models]
     assert whole.reconstruction.num_points3D() == sum(model.num_points3D() for model in models)
     same = [(min(models[0].point3D_ids()), min(models[1].point3D_ids()))]
-    merged, renamed, new = merge_models(*models, told.join.first_from_second, same)
+    merged, renamed, new = merge_models(*models, told.join.to_from_piece, same)
     assert merged.num_points3D() == whole.reconstruction.num_points3D() - 1
     assert renamed[same[0][0]] == new[same[0][1]]
     check_joined_folder(tmp_path / "out" / "joined_0", found)
