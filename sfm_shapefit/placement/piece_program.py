@@ -20,6 +20,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
@@ -89,7 +90,11 @@ def solve_pieces(
             lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
             weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
         graph = ViewGraph(len(nodes), renumbered.reshape(-1, 2), seen, weights)
-        locations = solve_groups(graph, groups, certified=False).locations
+        try:
+            locations = solve_groups(graph, groups, certified=False).locations
+        except UnsolvableError as error:
+            number = counted(len(usable), "pair")
+            raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error
     centers, scales = groups.split(groups.fit(locations)[0])
     scales = scales[units]
     if not scales.min() > 0.0:

@@ -486,3 +486,24 @@ def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rot
     write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
     # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
     assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, adjust="full")
+
+
+def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace):
+    whole = pycolmap.Reconstruction(workspace / "truth")
+    parts = [pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)]
+    for part, gone in zip(parts, (range(7, 13), range(1, 7)), strict=True):
+        for frame in gone:
+            part.deregister_frame(frame)
+        assert part.num_reg_frames() == 6
+    parts[1].transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d([0.0, 0.0, 0.6, 0.8]), [5.0, 1.0, 0.0]))
+    found = sfm_shapefit.join(parts, workspace / "database.db")
+    assert found.joins[0].join.to_from_piece.scale == 1.0
+    errors = sfm_shapefit.evaluate(found.reconstruction, whole)
+    assert len(errors.names) == 36
+    assert errors.position.max < 0.01 * errors.extent
+    assert found.reconstruction.num_reg_frames() == 12
+    alone = pycolmap.Reconstruction(RING / "sparse" / "0")
+    with pytest.raises(
+        InputError, match="model 1 has rigs of several cameras, and a scale by that, but model 0"
+    ):
+        sfm_shapefit.join([alone, whole])
