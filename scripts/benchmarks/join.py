@@ -229,7 +229,7 @@ BENCHMARK = Benchmark(
         "k": "pairs; between every two pieces",
         "right": f"pieces; accepted, and within {RIGHT:.0%} of the extent",
         "exact": f"pieces; of these, within {EXACT:.1%}",
-        "refused, found right": "pieces; refused, most for too few agreeing pairs, the place found all the same",
+        "refused, found right": "pieces; refused, most for too few agreeing pairs, though in their place",
         "refused, else": "pieces; refused, and no place was found, or a wrong one",
         "wrong": "pieces; accepted, and farther off; the limit counts those without a word of a rival",
         "error %": "of the extent; median of the right ones",

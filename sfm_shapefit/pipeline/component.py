@@ -54,7 +54,7 @@ def locate_components(
 
     Why a frame belongs to none is written to `reasons`, which starts with one for each.
     """
-    models = []
+    models: list[MappedModel] = []
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
             located = _locate_component(run, members, averaging, relative)
