@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, angle_between, compose
 from sfm_shapefit.base.settings import flat_values, merge_options
@@ -161,11 +161,13 @@ def judge_joins(
         priors: of the cameras of each piece, if there are any.
     """
     found = join_pieces(tied.cameras, tied.ties)
-    by_priors = _ByPriors(tied, priors)
+    usable = [] if tied.cameras.is_metric.any() else priors
+    placed = [_on_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
     for number in range(1, len(pieces)):
-        done = found.get(number)
-        if not (isinstance(done, PieceJoin) and not done.reason):
-            done = by_priors.join(number, done)
+        done = found[number]
+        if placed and (not isinstance(done, PieceJoin) or done.reason):
+            other = _join_by_priors(number, placed)
+            done = other if isinstance(other, PieceJoin) or done == UNTIED else done
         join = done if isinstance(done, PieceJoin) else None
         to = 0 if join is None else join.to
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
@@ -173,45 +175,32 @@ def judge_joins(
             model=number,
             to=to,
             found=join,
-            reason=str(done or UNTIED) if join is None else join.reason,
+            reason=str(done) if join is None else join.reason,
             labels=(pieces[number].label, pieces[to].label),
             rivals=tuple((tied.names[v], tied.names[w]) for v, w in pairs),
         )
 
 
-class _ByPriors:
-    """Pieces on the position priors of their cameras, those that were asked; each is fitted once."""
+def _on_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPriors | str:
+    """Return a piece on the position priors of its cameras, or why it is not placed by them."""
+    try:
+        return UNTIED if priors is None else place_by_priors(centers, priors)
+    except UnsolvableError as error:
+        return str(error)
 
-    def __init__(self, tied: TiedPieces, priors: Sequence[PositionPriors | None]) -> None:
-        self.tied, self.priors = tied, priors
-        self.placed: dict[int, PlacedByPriors | str] = {}
 
-    def join(self, number: int, refused: PieceJoin | str | None) -> PieceJoin | str | None:
-        """Return the join of a piece to an earlier one by priors, or else what pairs of images made of it."""
-        if not any(self.priors) or self.tied.cameras.is_metric.any():
-            return refused
-        reasons = []
-        for to in range(number):
-            try:
-                return join_by_priors((to, self._place(to)), (number, self._place(number)))
-            except UnsolvableError as error:
-                reasons.append(str(error))
-        told = isinstance(refused, PieceJoin) or (refused and refused != UNTIED)
-        return refused if told else next((reason for reason in reasons if reason != UNTIED), refused)
-
-    def _place(self, number: int) -> PlacedByPriors:
-        if number not in self.placed:
-            priors, reason = self.priors[number], UNTIED
-            try:
-                if priors is not None:
-                    self.placed[number] = place_by_priors(self.tied.cameras.centers_of(number), priors)
-            except UnsolvableError as error:
-                reason = str(error)
-            self.placed.setdefault(number, reason)
-        placed = self.placed[number]
-        if isinstance(placed, str):
-            raise UnsolvableError(placed)
-        return placed
+def _join_by_priors(number: int, placed: Sequence[PlacedByPriors | str]) -> PieceJoin | str:
+    """Return the join of a piece to the first of the earlier ones that priors allow, or why there is none."""
+    own, reasons = placed[number], list[str]()
+    for to, other in enumerate(placed[:number]):
+        if isinstance(own, str) or isinstance(other, str):
+            reasons.append(own if isinstance(own, str) else str(other))
+            continue
+        try:
+            return join_by_priors((to, other), (number, own))
+        except UnsolvableError as error:
+            reasons.append(str(error))
+    return next((reason for reason in reasons if reason != UNTIED), UNTIED)
 
 
 def merge_groups(

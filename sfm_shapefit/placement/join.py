@@ -158,12 +158,13 @@ class _Evidence(NamedTuple):
         own = here[self.cameras.piece_of]
         new, camera_of = np.cumsum(here) - 1, np.cumsum(own) - 1
         kept = np.asarray(here[self.pieces].all(axis=1) & (True if chosen is None else chosen))
-        votes = self.votes.subset(kept)
+        turns, *known = (column[kept] for column in self.votes[1:])
+        votes = Votes(new[self.pieces[kept]], turns, *known)
         return _Evidence(
             self.cameras.subset(own, new[self.cameras.piece_of[own]], here),
             self.ties.subset(kept).renumbered(camera_of),
             self.aside.subset(kept).renumbered(camera_of),
-            replace(votes, pieces=new[votes.pieces]),
+            votes,
             self.numbers[here],
             self.rows[kept],
         )

@@ -6,6 +6,7 @@ pieces have is a camera of each, and the two are a pair, too: they stand at one 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -125,8 +126,7 @@ class PieceTies:
         return replace(self, matches=matches, points=self.points[kept])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Votes:
+class Votes(NamedTuple):
     """The turns that single pairs suggest between the two pieces of theirs."""
 
     pieces: IntArray
@@ -137,15 +137,6 @@ class Votes:
     """(k,)"""
     soundness: FloatArray
     """(k,) how well one pose explains the matches of the pair."""
-
-    def subset(self, pairs: BoolArray) -> "Votes":
-        """Return the votes of some pairs."""
-        return Votes(
-            pieces=self.pieces[pairs],
-            turns=self.turns[pairs],
-            sigmas_deg=self.sigmas_deg[pairs],
-            soundness=self.soundness[pairs],
-        )
 
 
 def collect_votes(cameras: PieceCameras, ties: PieceTies) -> Votes:
@@ -165,7 +156,7 @@ def collect_votes(cameras: PieceCameras, ties: PieceTies) -> Votes:
     believed = found.weight_shares * np.log(np.maximum(found.num_matches, 1))
     soundness[rows] = np.where(found.are_sound(0.0), np.maximum(believed, _LEAST_SOUNDNESS), _LEAST_SOUNDNESS)
     turns = cameras.rotations[i].transpose(0, 2, 1) @ between.transpose(0, 2, 1) @ cameras.rotations[j]
-    return Votes(pieces=cameras.piece_of[[i, j]].T, turns=turns, sigmas_deg=sigmas, soundness=soundness)
+    return Votes(cameras.piece_of[[i, j]].T, turns, sigmas, soundness)
 
 
 def turn_pieces(votes: Votes, num_pieces: int) -> FloatArray:
