@@ -9,7 +9,7 @@
 Shares of matches do not tell right joins from wrong ones: the matches of a wrong pair agree with the place
 that its other matches made. Other pairs do, so that three are asked for, not all of one image, which may be
 taken for another wherever it is matched; an image that both pieces have counts as two, for it knows its turn
-and its place. Where pairs agree on two joins, nothing says which is
+and its place. Where as many as a quarter of the pairs that agree do so on another join, nothing says which is
 right, and these pairs count for neither; a piece may still be joined by its pairs with a third one.
 """
 
@@ -21,9 +21,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import Similarity, compose, invert
+from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.placement.piece_program import (
     Standing,
     misses_px,
@@ -43,7 +44,9 @@ from sfm_shapefit.placement.piece_ties import (
 FEWEST_PAIRS = 3
 """Agreeing pairs that a join needs; a wrong one has two by chance, and two leave nothing to check it by."""
 _SHARED = 2  # pairs; an image that both pieces have knows its turn and its place
-_FEWEST_RIVALS = 2  # pairs that agree on another join; then nothing says which one is right
+_MOST_TURNS = 4  # turns between two pieces that are tried; bounds the time where single votes scatter
+_RIVAL_SHARE = 0.25  # share of the agreeing pairs; from as many rivals on nothing says which join is right
+_FEWEST_RIVALS = 2  # pairs that agree on another join, and are named; one always agrees with itself
 AGREEING_PX = 4.0
 """Pixels by which a match may miss; pieces bend by as much, and wrong pairs miss by hundreds."""
 _LARGEST_SCALE_SIGMA = 0.03  # relative; above, joins come out wrong
@@ -189,6 +192,30 @@ class _Joint(NamedTuple):
         return support
 
 
+def _search(evidence: _Evidence, enough: int) -> _Joint:
+    """Place pieces; two, of which fewer pairs agree than are enough, by other turns that are voted for too.
+
+    Raises:
+        UnsolvableError: as `_place`, if the first turn leads to none.
+    """
+    best = _place(evidence)
+    rest = best.evidence
+    for _ in range(_MOST_TURNS - 1):
+        if rest.cameras.num_pieces > 2 or best.evidence.weigh(best.agrees) >= enough:
+            break
+        turn = best.standing.turns[0].T @ best.standing.turns[1]
+        off_deg = rotation_angles_deg(rest.votes.turns @ turn.T)
+        rest = rest.part(rest.numbers, ~(off_deg <= AGREEMENT_DEG))
+        try:
+            other = _place(rest)
+        except UnsolvableError:
+            break
+        agrees = _agreeing(best.evidence, other.standing)
+        if best.evidence.weigh(agrees) > best.evidence.weigh(best.agrees):
+            best = best._replace(standing=other.standing, covariances=other.covariances, agrees=agrees)
+    return best
+
+
 def _place(evidence: _Evidence) -> _Joint:
     """Place all pieces that are tied to the first, and see which pairs agree.
 
@@ -227,7 +254,7 @@ def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
     """Yield what comes of joining pieces to the first, by their numbers among all."""
     while True:
         try:
-            joint = _place(evidence)
+            joint = _search(evidence, FEWEST_PAIRS)
         except UnsolvableError as error:
             yield from ((k, str(error)) for k in evidence.numbers[1:].tolist() if evidence.touches(k))
             return
@@ -247,8 +274,10 @@ def _judge(joint: _Joint) -> Iterator[PieceJoin]:
     evidence = joint.evidence
     rivals = _find_rivals(joint)
     in_doubt = np.zeros(len(evidence.rows), dtype=np.bool_)
-    for first, second in {tuple(two) for two in evidence.pieces[rivals].tolist()}:
-        in_doubt |= (evidence.pieces == [first, second]).all(axis=1)
+    for two in np.unique(evidence.pieces[rivals], axis=0):
+        own = (evidence.pieces == two).all(axis=1)
+        if evidence.weigh(own & rivals) >= _RIVAL_SHARE * evidence.weigh(own & joint.agrees):
+            in_doubt |= own
     clean, whole = joint.support(~in_doubt), joint.support(np.ones_like(in_doubt))
     held = _reached(clean, 0)
     for k in range(1, evidence.cameras.num_pieces):
@@ -276,11 +305,11 @@ def _find_rivals(joint: _Joint) -> BoolArray:
     for two in np.unique(evidence.pieces[~joint.agrees], axis=0):
         part = evidence.part(evidence.numbers[two], ~joint.agrees)
         try:
-            rival = _place(part)
+            rival = _search(part, _FEWEST_RIVALS)
         except UnsolvableError:
             continue
-        if part.weigh(rival.agrees) >= _FEWEST_RIVALS:
-            found[np.isin(evidence.rows, part.rows[rival.agrees])] = True
+        if rival.evidence.weigh(rival.agrees) >= _FEWEST_RIVALS:
+            found[np.isin(evidence.rows, rival.evidence.rows[rival.agrees])] = True
     return found
 
 
