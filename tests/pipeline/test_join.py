@@ -1,6 +1,7 @@
 """`join`: models of one scene in one world, and one sentence for each that cannot be."""
 
 import json
+from contextlib import closing
 
 import numpy as np
 import pycolmap
@@ -8,7 +9,10 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from tests.facts.test_schema import problems
 from tests.models import only
 from tests.pipeline.made import DATABASE, FOLDER
@@ -21,24 +25,29 @@ IDS = sorted(WHOLE.reg_image_ids())
 MOVE = pycolmap.Sim3d(0.4, pycolmap.Rotation3d(turn([0.3, -0.2, 0.1], 70.0)), np.array([1.0, -2.0, 3.0]))
 
 
-def piece(ids, *, moved=False, renumbered=False):
-    """Some images of the ring, in a world of their own, or with the ids of another program."""
+def piece(ids, *, moved=False, renumbered=False, compact=False):
+    """Some images of the ring, in a world of their own, with the ids or the keypoints of another program."""
     part = only(WHOLE, ids)
     if moved:
         part.transform(MOVE)
-    if not renumbered:
+    if not (renumbered or compact):
         return part
     other = pycolmap.Reconstruction()
     (camera,) = part.cameras.values()
     other.add_camera_with_trivial_rig(camera)
-    new = {}
+    new, place = {}, {}
     for k, i in enumerate(sorted(part.reg_image_ids()), start=1):
-        xy = np.array([point.xy for point in part.image(i).points2D])
+        seen = [p for p, point in enumerate(part.image(i).points2D) if point.has_point3D() or not compact]
+        place |= {(i, p): row for row, p in enumerate(seen[::-1] if compact else seen)}
+        xy = np.array([part.image(i).points2D[p].xy for p in (seen[::-1] if compact else seen)])
         image = pycolmap.Image(name=part.image(i).name, keypoints=xy, camera_id=camera.camera_id, image_id=k)
         other.add_image_with_trivial_frame(image, part.image(i).cam_from_world())
         new[i] = k
     for point in part.points3D.values():
-        elements = [pycolmap.TrackElement(new[e.image_id], e.point2D_idx) for e in point.track.elements]
+        elements = [
+            pycolmap.TrackElement(new[e.image_id], place[e.image_id, e.point2D_idx])
+            for e in point.track.elements
+        ]
         other.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
     return other
 
@@ -96,6 +105,24 @@ def test_models_that_share_images_are_joined_without_a_database_and_whatever_the
     names = [image.name for image in found.reconstruction.images.values()]
     assert sorted(names) == sorted(image.name for image in WHOLE.images.values())
     assert found.reconstruction.num_points3D() <= 1.02 * WHOLE.num_points3D()
+
+
+def test_keypoints_of_another_program_are_found_in_the_database_by_their_pixels():
+    second = piece(IDS[4:], moved=True, compact=True)
+    firsts = [model.find_image_with_name("0006.jpg").points2D[0].xy for model in (second, WHOLE)]
+    assert not np.allclose(*firsts)  # in another order
+    known = []
+    for other in (second, piece(IDS[4:], moved=True)):
+        pieces = [ModelPiece(label="", model=read_model(model)) for model in (piece(IDS[:4]), other)]
+        with closing(
+            open_database(DATABASE, sorted(image.name for image in WHOLE.images.values()))
+        ) as matches:
+            tied = tie_pieces(pieces, matches, frozenset())
+        known.append(np.isfinite(tied.ties.points).all(axis=2).sum(axis=0).tolist())
+    assert known[0] == known[1]
+    assert min(known[0]) > 100
+    found = sfm_shapefit.join([piece(IDS[:4]), second], DATABASE)
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
 
 
 def test_three_models_are_joined_at_once():
