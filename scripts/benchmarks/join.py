@@ -39,17 +39,24 @@ _CLUSTERED = "lego100"
 """Cut by places, since its names have no order; and its truth is better than its model."""
 
 
+def flags(parser: argparse.ArgumentParser) -> None:
+    """Declare where pieces are kept."""
+    parser.add_argument(
+        "--folder", type=Path, help="where pieces are kept for another run (a temporary folder)"
+    )
+
+
 def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return each scene cut into each number of pieces."""
     if args.quick:
         small = RING | {"num_images": 24, "num_points": 600}
-        return {"ring 24": partial(measure, "ring 24", small, 2, (10,), args.repeats)}
+        return {"ring 24": partial(measure, "ring 24", small, 2, (10,), args)}
     found: dict[str, Case] = {}
     for count in PIECES:
         for name in SCENES:
-            case = partial(measure, name, args.data / name, count, PAIRS, args.repeats)
+            case = partial(measure, name, args.data / name, count, PAIRS, args)
             found[f"{name}, {count}"] = if_there(args.data / name, case)
-        found[f"ring 300, {count}"] = partial(measure, "ring 300", RING, count, PAIRS, args.repeats)
+        found[f"ring 300, {count}"] = partial(measure, "ring 300", RING, count, PAIRS, args)
     return found
 
 
@@ -76,21 +83,24 @@ class Cut(NamedTuple):
         return float(np.median(apart)) / self.extent
 
 
-def measure(name: str, scene: Any, count: int, pairs: Sequence[int], seeds: int) -> list[Row]:
+def measure(name: str, scene: Any, count: int, pairs: Sequence[int], args: argparse.Namespace) -> list[Row]:
     """Cut a scene, and join its pieces by so many of their pairs, with each kind of planted ones."""
     with tempfile.TemporaryDirectory() as folder:
         if isinstance(scene, dict):
             write_scene(Path(folder) / "scene", scene)
             scene = Path(folder) / "scene"
         model = scene / ("gt" if name == _CLUSTERED else "sparse/0")
-        whole = cut(model, scene / "database.db", count, by_place=name == _CLUSTERED)
+        kept = (args.folder or Path(folder)) / f"{name}-{count}"
+        whole = cut(model, scene / "database.db", kept, count, by_place=name == _CLUSTERED)
     return [
-        judge(name, count, k, kind, list(trials(whole, k, kind, seeds))) for kind in PLANTED for k in pairs
+        judge(name, count, k, kind, list(trials(whole, k, kind, args.repeats)))
+        for kind in PLANTED
+        for k in pairs
     ]
 
 
-def cut(model: Path, database: Path, count: int, *, by_place: bool) -> Cut:
-    """Locate the images of each piece alone, and move each to a world of its own."""
+def cut(model: Path, database: Path, kept: Path, count: int, *, by_place: bool) -> Cut:
+    """Locate the images of each piece alone, if they are not kept, and move each to a world of its own."""
     import pycolmap
     from scipy.spatial.transform import Rotation
 
@@ -108,10 +118,13 @@ def cut(model: Path, database: Path, count: int, *, by_place: bool) -> Cut:
         labels = kmeans2(images.centers, count, seed=1, minit="++")[1]
     pieces = []
     for label in range(count):
-        part = pycolmap.Reconstruction(model)
-        for image_id in images.ids[labels != label].tolist():
-            part.deregister_frame(part.image(image_id).frame_id)
-        found = sfm_shapefit.locate(part, database, adjust="full", min_trust=0.0).reconstruction
+        if not (kept / str(label)).exists():
+            part = pycolmap.Reconstruction(model)
+            for image_id in images.ids[labels != label].tolist():
+                part.deregister_frame(part.image(image_id).frame_id)
+            found = sfm_shapefit.locate(part, database, adjust="full", min_trust=0.0)
+            sfm_shapefit.write_result(found, kept / str(label), report=False)
+        found = pycolmap.Reconstruction(kept / str(label))
         world = Similarity(
             scale=float(np.exp(0.7 * rng.standard_normal())),
             rotation=Rotation.random(random_state=rng).as_matrix(),
@@ -225,6 +238,7 @@ BENCHMARK = Benchmark(
     name="join",
     title="Pieces joined",
     cases=cases,
+    flags=flags,
     quick={"repeats": 1},
     repeats=5,
     columns={
