@@ -111,7 +111,7 @@ class RigidGroups:
         spreads = centered.along_units(centered.offsets)
         sizes = np.bincount(self.group_of)[:, None]
         s = centered.along_units(locations) / np.where(spreads > 0.0, spreads, np.inf)
-        left = self._sum(locations) - self._sum(s[self.units][:, None] * self.offsets)
+        left = self._sum(locations) - s[self.unit_of][:, None] * self._sum(self.offsets)
         x = np.append((left / sizes).ravel(), s)
         apart = np.linalg.norm(self.expand(x) - locations, axis=1)
         return x, float(apart.max(initial=0.0))

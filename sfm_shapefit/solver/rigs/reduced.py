@@ -11,6 +11,8 @@ what remains for s is the Schur complement eta - h^T K^-1 h. Translations are ta
 group.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
@@ -42,10 +44,10 @@ class RigidReduction(Reduction):
         """
         self.groups = groups
         self._ends = np.ascontiguousarray(groups.group_of[edges])
-        own = groups.units[:, None] == np.arange(groups.num_units)
-        columns = groups.offsets[:, :, None] * own[:, None, :]
-        self._offsets = columns[edges[:, 0]] - columns[edges[:, 1]]
-        self._metric = bool(self._offsets.any())
+        units = range(groups.num_units)
+        columns = [np.where(groups.units[:, None] == c, groups.offsets, 0.0) for c in units]
+        self._offsets = [own[edges[:, 0]] - own[edges[:, 1]] for own in columns]
+        self._metric = any(own.any() for own in self._offsets)
         dimension = groups.offsets.shape[1]
         plan = analyze(groups.num_groups, self._ends)
         needed = plan.num_bytes(dimension, np.float64, threads)
@@ -71,18 +73,18 @@ class RigidReduction(Reduction):
 
         UnsolvableError if it is not positive definite to working precision.
         """
-        d = self._offsets.shape[1]
+        d = self._offsets[0].shape[1]
         blocks = weights if weights.ndim > 1 else weights[:, None, None] * np.eye(d)
         self.factor.refactor(blocks)
         self.smallest_pivot = self.factor.smallest_pivot
-        bent = np.einsum("eab,ebs->eas", blocks, self._offsets)
-        self._row = np.stack([self._at_groups(column) for column in np.moveaxis(bent, 2, 0)], axis=2)
-        eta = np.einsum("eas,eak->sk", bent, self._offsets)
+        bent = [np.einsum("eab,eb->ea", blocks, own) for own in self._offsets]
+        self._rows = [self._at_groups(values) for values in bent]
+        eta = _products(bent, self._offsets)
         if not self._metric and self.groups.num_units == 1:
-            self._column, self._schur = np.zeros_like(self._row), np.eye(1)
+            self._columns, self._schur = np.zeros((*self._rows[0].shape, 1)), np.full((1, 1), np.inf)
             return
-        self._column = self.factor.solve(self._row)
-        self._schur = eta - np.tensordot(self._row, self._column, ((0, 1), (0, 1)))
+        self._columns = self.factor.solve(np.stack(self._rows, axis=2))
+        self._schur = eta - _products(self._rows, np.moveaxis(self._columns, 2, 0))
         sizes = np.sqrt(np.diagonal(eta))
         least = float(np.linalg.eigvalsh(self._schur / np.outer(sizes, sizes))[0]) if sizes.all() else 0.0
         if not least > _LEAST_SCHUR:
@@ -93,9 +95,9 @@ class RigidReduction(Reduction):
         """Return the x (B d + S,) with (A^T D^T S D A) x = right; s stays 0 without offsets."""
         at_groups, at_units = self.groups.split(right)
         z = self.factor.solve(at_groups)
-        rest = at_units - np.tensordot(z, self._row, ((0, 1), (0, 1)))
-        s = np.linalg.solve(self._schur, rest) if self._metric else np.zeros(1)
-        return np.append((z - self._column @ s).ravel(), s)
+        rest = at_units - _products(self._rows, [z])[:, 0]
+        s = rest / self._schur[0] if len(rest) == 1 else np.linalg.solve(self._schur, rest)
+        return np.append((z - self._columns @ s).ravel(), s)
 
     def solve_two_reduced(self, first: FloatArray, second: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return x for two right-hand sides."""
@@ -109,3 +111,9 @@ class RigidReduction(Reduction):
         """Return the sum of the signed values (m, d) at each group, (B, d)."""
         leaving, entering = (sum_by(end, values, self.groups.num_groups) for end in self._ends.T)
         return np.asarray(leaving - entering)
+
+
+def _products(first: Iterable[FloatArray], second: Iterable[FloatArray]) -> FloatArray:
+    """Return the inner products of arrays with others, a row for each of the first."""
+    others = list(second)
+    return np.array([[np.vdot(one, other) for other in others] for one in first])
