@@ -198,21 +198,21 @@ def _search(evidence: _Evidence, enough: int) -> _Joint:
     Raises:
         UnsolvableError: as `_place`, if the first turn leads to none.
     """
-    best = _place(evidence)
+    best = latest = _place(evidence)
     rest = best.evidence
     for _ in range(_MOST_TURNS - 1):
         if rest.cameras.num_pieces > 2 or best.evidence.weigh(best.agrees) >= enough:
             break
-        turn = best.standing.turns[0].T @ best.standing.turns[1]
+        turn = latest.standing.turns[0].T @ latest.standing.turns[1]
         off_deg = rotation_angles_deg(rest.votes.turns @ turn.T)
         rest = rest.part(rest.numbers, ~(off_deg <= AGREEMENT_DEG))
         try:
-            other = _place(rest)
+            latest = _place(rest)
         except UnsolvableError:
             break
-        agrees = _agreeing(best.evidence, other.standing)
+        agrees = _agreeing(best.evidence, latest.standing)
         if best.evidence.weigh(agrees) > best.evidence.weigh(best.agrees):
-            best = best._replace(standing=other.standing, covariances=other.covariances, agrees=agrees)
+            best = best._replace(standing=latest.standing, covariances=latest.covariances, agrees=agrees)
     return best
 
 
