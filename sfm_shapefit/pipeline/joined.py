@@ -85,6 +85,10 @@ def tell_group(
         clock: what it takes is added to its seconds.
     """
     first, located = next(iter(group.world_from)), told.located
+    labels = {
+        k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
+    }
+    folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: that of the first model")
     if first in located:
         gauge, rescale = _choose_scale(group, located[first].gauge, told.distances)
@@ -98,8 +102,8 @@ def tell_group(
         inputs=told.inputs.facts,
         options=dict(told.options),
         verdict=_judge(seen.verdict, group, located),
-        models=[str(number) for number in group.world_from],
-        joins=[join.facts(f"joined_{first}") for join in told.joins],
+        models=[labels[number].removeprefix("model ") for number in group.world_from],
+        joins=[one.facts(folder if one.join and one.model in labels else None) for one in told.joins],
         num_images=len(cameras),
         num_placed=group.reconstruction.num_reg_images(),
         figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
