@@ -130,13 +130,13 @@ class _Rays(NamedTuple):
         return np.asarray(np.bincount(self.pairs)[self.pairs] ** -0.5)
 
 
-def _rays_of(cameras: PieceCameras, ties: PieceTies, most: int = _MOST_RAYS) -> _Rays:
+def _rays_of(cameras: PieceCameras, ties: PieceTies) -> _Rays:
     """Return some rays of every pair, both ways."""
     found = []
     pair_of = ties.pair_of
     for way, rays in enumerate((ties.matches.rays_i, ties.matches.rays_j)):
         there = np.isfinite(ties.points[:, 1 - way]).all(axis=1)
-        rows = _thinned(np.flatnonzero(there), pair_of, most)
+        rows = _thinned(np.flatnonzero(there), pair_of)
         pairs = pair_of[rows]
         eyes, others = ties.matches.pairs[pairs, way], ties.matches.pairs[pairs, 1 - way]
         looks = np.einsum("rk,rkl->rl", rays[rows], cameras.rotations[eyes])
@@ -153,11 +153,11 @@ def _rays_of(cameras: PieceCameras, ties: PieceTies, most: int = _MOST_RAYS) -> 
     return _Rays(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 
-def _thinned(rows: IntArray, pair_of: IntArray, most: int) -> IntArray:
-    """Return the rows with at most so many of each pair, taken evenly."""
+def _thinned(rows: IntArray, pair_of: IntArray) -> IntArray:
+    """Return the rows with a bounded number of each pair, taken evenly."""
     pairs = pair_of[rows]
     starts = np.searchsorted(pairs, pairs)
-    steps = -(-np.bincount(pairs, minlength=1)[pairs] // most)
+    steps = -(-np.bincount(pairs, minlength=1)[pairs] // _MOST_RAYS)
     return np.asarray(rows[(np.arange(len(rows)) - starts) % steps == 0])
 
 
@@ -206,13 +206,13 @@ def _stand(standing: Standing, places: FloatArray) -> FloatArray:
     return np.asarray(standing.scales[:, None] * turned + standing.middles)
 
 
-def residuals_of(cameras: PieceCameras, ties: PieceTies, most: int = 2 * _MOST_RAYS) -> Residuals:
+def residuals_of(cameras: PieceCameras, ties: PieceTies) -> Residuals:
     """Return the residuals of some matches of a pair: of rays to points or, where none is, of two rays."""
     middles = cameras.middles()
-    rays = _rays_of(cameras, ties, most)
+    rays = _rays_of(cameras, ties)
     has_point = np.asarray(np.isfinite(ties.points).all(axis=2))
     bare = ~has_point.any(axis=1) & ~ties.is_shared[ties.pair_of]
-    rows = _thinned(np.flatnonzero(bare), ties.pair_of, most)
+    rows = _thinned(np.flatnonzero(bare), ties.pair_of)
     pairs = ties.pair_of[rows]
     i, j = ties.matches.pairs[pairs].T
     looks = [
