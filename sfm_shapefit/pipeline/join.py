@@ -6,6 +6,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.geometry import Similarity, angle_between, compose
+from sfm_shapefit.base.geometry import Similarity, angle_between, compose, median_spread
 from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
@@ -168,7 +169,7 @@ def judge_joins(
         if placed and (not isinstance(done, PieceJoin) or done.reason):
             other = _join_by_priors(number, placed)
             done = other if isinstance(other, PieceJoin) or done == UNTIED else done
-        join = done if isinstance(done, PieceJoin) else None
+        join = _at_known_scale(pieces, done) if isinstance(done, PieceJoin) else None
         to = 0 if join is None else join.to
         pairs = [] if join is None else tied.ties.matches.pairs[join.rivals].tolist()
         yield Joined(
@@ -179,6 +180,21 @@ def judge_joins(
             labels=(pieces[number].label, pieces[to].label),
             rivals=tuple((tied.names[v], tied.names[w]) for v, w in pairs),
         )
+
+
+def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
+    """Return a join with the errors of the scales that rigs tell; refused where only one has such a scale."""
+    two = pieces[join.to], pieces[join.piece]
+    if not any(one.model.images.has_rigs for one in two):
+        return join
+    if not all(one.model.images.has_rigs for one in two):
+        return replace(join, reason="only one of them has rigs of several cameras, and a scale by that")
+    if not all(one.is_metric for one in two):
+        return replace(join, reason="their rigs do not tell the scale of both")
+    sigma = float(np.linalg.norm([one.scale_sigma or 0.0 for one in two]))
+    # Errors of the size of the second model move its cameras about their middle.
+    center_sigma = float(np.hypot(join.center_sigma, sigma * median_spread(two[1].model.images.centers)))
+    return replace(join, scale_sigma=sigma, center_sigma=center_sigma)
 
 
 def _on_priors(centers: FloatArray, priors: PositionPriors | None) -> PlacedByPriors | str:

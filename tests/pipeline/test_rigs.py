@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,12 +14,15 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.join import judge_joins
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.points import number_points
@@ -465,7 +469,7 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     assert [len(model.names) for model in found.models] == [16, 16]
     (told,) = found.joins
     assert told.join is not None, told.statement
-    assert told.join.first_from_second.scale == 1.0
+    assert told.join.to_from_piece.scale == 1.0
     sigmas = [model.located.gauge.scale_sigma for model in found.models]
     assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
     (joined,) = found.joined
@@ -502,6 +506,10 @@ def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace
     assert len(errors.names) == 36
     assert errors.position.max < 0.01 * errors.extent
     assert found.reconstruction.num_reg_frames() == 12
+    pieces = [ModelPiece(label=f"model {k}", model=read_model(part)) for k, part in enumerate(parts)]
+    with closing(open_database(workspace / "database.db", read_model(whole).images.names)) as matches:
+        (told,) = judge_joins(pieces, tie_pieces(pieces, matches, frozenset()))
+    assert told.statement == "model 1 is not joined to model 0: their rigs do not tell the scale of both"
     alone = pycolmap.Reconstruction(RING / "sparse" / "0")
     with pytest.raises(
         InputError, match="model 1 has rigs of several cameras, and a scale by that, but model 0"
