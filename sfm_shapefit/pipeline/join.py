@@ -183,7 +183,7 @@ def judge_joins(
 
 
 def _at_known_scale(pieces: Sequence[ModelPiece], join: PieceJoin) -> PieceJoin:
-    """Return a join with the errors of the scales that rigs tell; refused where only one has such a scale."""
+    """Return a join with the errors of scales that rigs have; refused where only one model has rigs."""
     two = pieces[join.to], pieces[join.piece]
     if not any(one.model.images.has_rigs for one in two):
         return join
