@@ -4,13 +4,12 @@
 
 hloc writes, per image, `features.h5[name]["keypoints"]`, and, per pair, `matches.h5[pair]["matches0"]`: for
 each keypoint of the first image the index of its match in the second, or -1. These go into a COLMAP database,
-where COLMAP verifies them; `map_database` averages rotations and places the cameras, and pycolmap adjusts the
-largest model. OUT then holds database.db, models/0, models/1, ... with a report.html each, and the adjusted
-sparse/0.
+where COLMAP verifies them; `global_mapping`, called as pycolmap's mappers are, averages rotations, places the
+cameras and adjusts them. OUT then holds database.db and models/0, models/1, ... with a report.html each.
 
 If hloc has made a database.db already, as its reconstruction does, none of this is needed:
 
-    sfm-shapefit map database.db OUT --adjust full
+    sfm-shapefit map database.db OUT
 
 Needs h5py.
 """
@@ -75,26 +74,22 @@ def main(
     matches: Path,
     out: Path,
     focal_length_px: float | None = None,
-) -> sfm_shapefit.MapResult:
-    """Place the cameras of all images that stand in the list of pairs."""
+) -> dict[int, pycolmap.Reconstruction]:
+    """Place the cameras of all images of the list of pairs; return the models by their numbers."""
     out.mkdir(parents=True)
     database = out / "database.db"
     pairs = [tuple(line.split()) for line in pairs_file.read_text().splitlines() if line.strip()]
-    write_database(database, images, pairs, features, matches)
+    ids = write_database(database, images, pairs, features, matches)
     if focal_length_px is not None:
         set_focal_length(database, focal_length_px)
     pycolmap.verify_matches(database, pairs_file)
 
-    found = sfm_shapefit.map_database(database)
-    sfm_shapefit.write_result(found, out / "models")
-    adjusted = pycolmap.Reconstruction(found.models[0].located.reconstruction)
-    pycolmap.bundle_adjustment(adjusted)  # refines focal length and distortion too
-    (out / "sparse" / "0").mkdir(parents=True)
-    adjusted.write(out / "sparse" / "0")
-    for warning in found.warnings:
-        print(f"warning: {warning}")
-    print(f"{found.num_placed} of {found.num_images} cameras; see {out / 'models/0/report.html'}")
-    return found
+    # In hloc's own reconstruction.py the same line stands in place of pycolmap.incremental_mapping(...).
+    models = sfm_shapefit.global_mapping(database, images, out / "models")
+    for number, model in models.items():
+        print(f"model {number}: {model.num_reg_images()} of {len(ids)} cameras")
+    print(f"see {out / 'models/0/report.html'}")
+    return models
 
 
 if __name__ == "__main__":

@@ -4,12 +4,12 @@
 
     python examples/pycolmap_pipeline.py IMAGES OUT [FOCAL_LENGTH_PX]
 
-OUT then holds database.db, located/ (the seeded model with report.html and tables) and sparse/0, adjusted.
-Matching and bundle adjustment are pycolmap's, and may be exchanged for yours (`sfm_shapefit.map_database` is
-all of it after matching, in one call). To try it on drawn images:
+OUT then holds database.db, located/ (the model with report.html and tables) and sparse/0, adjusted.
+Matching and bundle adjustment are pycolmap's, and may be exchanged for yours (`sfm_shapefit.global_mapping`
+is all of it after matching, in one call). To try it on drawn images:
 
     sfm-shapefit synth drawn --shape facade --num-images 8 --images
-    python examples/pycolmap_pipeline.py drawn/images result 500
+    python examples/pycolmap_pipeline.py drawn/images result 1000
 """
 
 import sys
@@ -34,41 +34,17 @@ def match(images: Path, database: Path, focal_length_px: float | None) -> None:
     )
 
 
-def average_rotations(database: Path) -> pycolmap.Reconstruction:
-    """Return a model whose rotations are averaged over the verified pairs; its centers mean nothing."""
-    relative = sfm_shapefit.relative_rotations(database)
-    sound = relative.are_sound()
-    averaged = sfm_shapefit.average_rotations(
-        relative.pairs[sound],
-        relative.rotations[sound],
-        relative.information[sound],
-        num_images=len(relative.names),
-        weights=(relative.num_matches * relative.weight_shares)[sound],
-    )
-    print(averaged.statement)
-    with pycolmap.Database.open(database) as opened:
-        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=15))
-    model = pycolmap.Reconstruction()
-    model.load(cache)
-    for name, is_in, rotation in zip(relative.names, averaged.registered, averaged.rotations, strict=True):
-        image = model.find_image_with_name(name)
-        if is_in and image is not None:
-            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), [0.0, 0.0, 0.0])
-            model.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-            model.register_frame(image.frame_id)
-    return model
-
-
 def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycolmap.Reconstruction:
     """Run the pipeline and return the adjusted model."""
     out.mkdir(parents=True)
     database = out / "database.db"
     match(images, database, focal_length_px)
-    rotations = average_rotations(database)
 
     # Averaged rotations are a few tenths of a degree off; the adjustment after placing finds that out itself.
+    rotations = sfm_shapefit.average_database(database)
     found = sfm_shapefit.locate(rotations, database)
-    sfm_shapefit.write_result(found, out / "located")
+    found.write(out / "located")
+    print(f"verdict: {found.verdict.statement}")
     for warning in found.warnings:
         print(f"warning: {warning}")
 

@@ -24,7 +24,13 @@ ROOT = Path(__file__).parents[1]
 ASSETS = Path(__file__).parent / "site_assets"
 EXTRAS = ["fenced-code-blocks", "tables", "header-ids", "cuddled-lists"]
 GROUPS = {
-    "Start": ("README.md", "docs/commands.md", "docs/options.md", "docs/troubleshooting.md"),
+    "Start": (
+        "README.md",
+        "docs/tutorial.md",
+        "docs/commands.md",
+        "docs/options.md",
+        "docs/troubleshooting.md",
+    ),
     "Understand": ("docs/report.md", "docs/glossary.md", "docs/method.md", "docs/formats.md", "docs/json.md"),
     "Python": ("docs/python.md", "docs/synthetic.md"),
 }

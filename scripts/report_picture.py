@@ -1,4 +1,4 @@
-"""Take the picture of docs/report.md: `python scripts/report_picture.py OUT docs/report.png`.
+"""Take a picture of a report: `python scripts/report_picture.py OUT docs/report.png`.
 
 OUT is what `locate`, `place` or `map` wrote; the page in it is opened in a headless Chromium.
 """
@@ -12,18 +12,30 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.browser import chromium, opened
 
 SIZE = (1440, 900)
+CLICK = (
+    "[...document.querySelectorAll('#cameras tbody tr')].find(row => row.textContent.includes(%r)).click()"
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="folder with a report.html")
     parser.add_argument("picture", type=Path, help="PNG to write")
+    parser.add_argument("--camera", help="name of a camera that is clicked on first")
+    parser.add_argument("--width", type=int, default=SIZE[0], help="pixels")
+    parser.add_argument("--height", type=int, default=SIZE[1], help="pixels")
+    parser.add_argument("--dark", action="store_true", help="in dark colors")
     args = parser.parse_args()
-    with chromium(*SIZE) as driver:
-        opened(driver, (args.out / "report.html").resolve())
-        driver.execute_script(
-            "document.getElementById('next').hidden = true"
-        )  # it names folders of this machine
+    with chromium(args.width, args.height, dark=args.dark) as driver:
+        page = args.out / "report.html"
+        page = page if page.exists() else args.out / "0/report.html"  # of `map`
+        opened(driver, page.resolve())
+        # It names folders of this machine.
+        driver.execute_script("document.getElementById('next').hidden = true")
+        if args.camera:
+            driver.execute_script(CLICK % args.camera)
+            driver.execute_async_script("setTimeout(arguments[0], 3000)")  # it flies there
+        driver.execute_script("scrollTo(0, 0)")
         driver.save_screenshot(str(args.picture))
 
 

@@ -1,13 +1,15 @@
 """Places the cameras of a COLMAP model from known rotations: certified, explained, deterministic.
 
-    found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
-    write_result(found, "out")
-    mapped = map_database("database.db")                    # the same from the matches alone
+    models = global_mapping("database.db", "images", "sparse")    # as pycolmap.global_mapping
+    mapped = map_database("database.db")                    # the same, with the evidence for each model
+    mapped.write("sparse")                                  # models, tables, and a report.html each
+    found  = locate("sparse/0")                             # known rotations: the cameras placed
+    found.report("page.html")
     pairs  = relative_rotations("database.db")              # of every two images, and how well each is known
     judged = check("sparse/0")                              # whether any COLMAP model can be used
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     joined = join(["sparse/0", "sparse/1"], "database.db")  # models that stand apart, in one world
-    errors = evaluate(found.reconstruction, "truth")
+    errors = evaluate(found, "truth")
 
     graph  = ViewGraph(num_nodes, edges, directions)        # directions of t_i - t_j
     placed = place(graph)                                   # what `sfm-shapefit place` does with it
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.adjust import AdjustedModel, bundle_adjust
     from sfm_shapefit.pipeline.check import CheckResult, check
     from sfm_shapefit.pipeline.convert import convert
+    from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
     from sfm_shapefit.pipeline.evaluate import evaluate
     from sfm_shapefit.pipeline.inspect import inspect
     from sfm_shapefit.pipeline.join import join
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.map import map_database
     from sfm_shapefit.pipeline.place import place
     from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-    from sfm_shapefit.pipeline.write import WriteOptions, write_map_result, write_result
+    from sfm_shapefit.pipeline.write import WriteOptions, write_result
     from sfm_shapefit.placement.options import GaugeOptions
     from sfm_shapefit.placement.place import Placement
     from sfm_shapefit.refinement.options import PlacementOptions
@@ -68,13 +71,14 @@ _HOMES = {
     "pipeline.adjust": ("AdjustedModel", "bundle_adjust"),
     "pipeline.check": ("CheckResult", "check"),
     "pipeline.convert": ("convert",),
+    "pipeline.drop_in": ("average_database", "global_mapping"),
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),
     "pipeline.join": ("join",),
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
     "pipeline.relative_rotations": ("relative_rotations",),
-    "pipeline.write": ("WriteOptions", "write_map_result", "write_result"),
+    "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "facts.options": ("InspectOptions", "JoinOptions", "LocateOptions", "MapOptions", "SourceOptions"),
     "judgement.options": ("TrustOptions",),
@@ -129,12 +133,14 @@ __all__ = [
     "UnsolvableError",
     "ViewGraph",
     "WriteOptions",
+    "average_database",
     "average_rotations",
     "bundle_adjust",
     "certify",
     "check",
     "convert",
     "evaluate",
+    "global_mapping",
     "hear_pycolmap",
     "inspect",
     "join",
@@ -143,7 +149,6 @@ __all__ = [
     "place",
     "relative_rotations",
     "solve",
-    "write_map_result",
     "write_result",
 ]
 

@@ -41,6 +41,7 @@ def test_the_pycolmap_pipeline_places_the_cameras_of_drawn_images(drawn, tmp_pat
     # COLMAP's verification is random; the untold distortion may leave a rotation more than a degree off.
     assert re.search(r"^[78] cameras, \d{3,} points", said, flags=re.MULTILINE)
     assert_near_truth(tmp_path / "out/sparse/0", folder, least=7)
+    assert_near_truth(tmp_path / "out/located", folder, least=7)
     assert (tmp_path / "out/located/report.html").stat().st_size > 0
 
 
@@ -73,14 +74,14 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
     (tmp_path / "pairs.txt").write_text("".join(lines))
     paths = [tmp_path / name for name in ("pairs.txt", "features.h5", "matches.h5", "out")]
     said = run_example("hloc_outputs.py", folder / "images", *paths, scene.options.focal_length_px)
-    assert "8 of 8 cameras" in said
+    assert "model 0: 8 of 8 cameras" in said
     keypoints = []
     for path in (folder, tmp_path / "out"):
         with pycolmap.Database.open(path / "database.db") as database:
             image_id = database.read_image_with_name("0001.jpg").image_id
             keypoints.append(database.read_keypoints(image_id)[:, :2])
     np.testing.assert_allclose(*keypoints, atol=1e-3)
-    assert_near_truth(tmp_path / "out/sparse/0", folder)
+    assert_near_truth(tmp_path / "out/models/0", folder)
 
 
 def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):

@@ -40,7 +40,7 @@ CHANGES = {
             "pipeline/known.py",
         },
     ),
-    "a warning": Change(1, r"ShapeFit and LUD disagree about lengths", {"facts/warnings.py"}),
+    "a warning": Change(1, r"lengths are poorly known", {"facts/warnings.py"}),
     "a GPU solver": Change(
         2,
         r"\bLiteral\b.*\"conic\"|\bsolve_conic\(graph, tol, limit\)",

@@ -378,7 +378,7 @@ def refuse_without_points(num_points: int) -> None:
     if num_points == 0:
         raise UnsolvableError(
             "no 3D point can be triangulated at these camera positions, so there is nothing to adjust; "
-            "run with --adjust none"
+            "run with adjust=none"
         )
 
 

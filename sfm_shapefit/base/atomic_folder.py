@@ -35,7 +35,7 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 
     Args:
         out: the folder to be made; missing parents are fine.
-        overwrite: accept an existing folder if it is empty or an earlier output (it has a marker).
+        overwrite: accept an earlier output too (it has a marker); an empty folder is accepted anyway.
         protect: files and folders, such as the input, that `out` may neither be nor contain.
     """
     folder = Path(out)
@@ -226,16 +226,18 @@ def _refuse_protected(folder: Path, protect: Sequence[Path | str]) -> None:
 
 
 def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
-    """Refuse whatever exists at `folder`, except a folder that may be overwritten."""
+    """Refuse whatever exists at `folder`, except one that is empty or may be overwritten."""
     if not folder.is_dir():
         raise InputError(f"{folder} is a file; give the name of a new folder")
-    if not overwrite:
-        raise InputError(f"{folder} exists already; choose another folder, or replace it with --overwrite")
     try:
         is_empty = not any(folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder} cannot be read ({error.strerror}); choose another folder") from error
-    if not is_empty and not any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
+    if is_empty:  # users of COLMAP make it first
+        return
+    if not overwrite:
+        raise InputError(f"{folder} exists already; choose another folder, or replace it (overwrite=True)")
+    if not any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
         raise InputError(
             f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; "
             "choose another folder"

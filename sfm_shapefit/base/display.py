@@ -1,20 +1,19 @@
 """How results show themselves: one line in a console, a table or their report in a notebook, plain for JSON.
 
-The report is drawn by a layer above this one, which says here how.
+Folders and reports are written by a layer above this one, which says here how.
 """
 
 import html
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
 _MOST_TEXT = 300  # characters; a longer value of a table is counted instead
 _MOST_BYTES = 8_000_000
 """Bytes of the page of a notebook, at most; a notebook that holds a larger one opens slowly."""
 _COLORS = {"good": "#2e7d32", "look": "#b26a00", "do not use": "#c62828"}
 _FRAME_HEIGHT_PX = 720  # pixels; as high as a notebook shows at once
-
-_drawers: list[Callable[[Any], str]] = []
 
 
 class Row(NamedTuple):
@@ -42,16 +41,14 @@ class NextStep(NamedTuple):
 class Telling(NamedTuple):
     """What is told of a result in a terminal."""
 
-    counted: str
-    """What was looked at, as "8 images"."""
-    figures: Sequence[Row]
-    """What everybody should see: how much is placed, how well, what is not and why, warnings."""
+    lines: Sequence[str]
+    """The answer: how much is placed, where matches came from, how well it is known; a line each."""
+    rows: Sequence[Row] = ()
+    """What is out of the ordinary: what is not placed and why, lenses, warnings."""
     details: Sequence[Row] = ()
-    """What `--verbose` adds, before the figures."""
-    elsewhere: str = "see cameras.csv"
+    """What `--verbose` adds."""
+    elsewhere: str = "see locate.json"
     """Where lines stand that are too many to be shown."""
-    written: str = ""
-    """What stands in OUT beside the report."""
     step: NextStep = NextStep("", "")
     folder: str = "."
     """The folder in OUT that the next step is about, which has the report."""
@@ -79,21 +76,78 @@ class Displayed:
         return f"<table><caption>{html.escape(repr(self))}</caption>{_table_rows(rows)}</table>"
 
 
-def draw_pages_by(draw: Callable[[Any], str]) -> None:
-    """Let a function draw the page that a result shows in a notebook."""
-    _drawers[:] = [draw]
+class Writers(NamedTuple):
+    """What writes results."""
+
+    draw: Callable[[Any], str]
+    """Returns the page that a result shows in a notebook."""
+    page: Callable[..., None]
+    """Writes a page of a result."""
+    folder: Callable[..., None]
+    """Writes the folder of a result."""
 
 
-def report_in_notebook(found: Any, rows: Iterable[Row]) -> str:
+_writers: list[Writers] = []
+
+
+def write_by(writers: Writers) -> None:
+    """Let functions write results."""
+    _writers[:] = [writers]
+
+
+class Reported(Displayed):
+    """A result that has a report."""
+
+    __slots__ = ()
+
+    def report(self, page: Path | str, *, images: Path | str = "", overwrite: bool = False) -> None:
+        """Write a page that explains the result and works offline.
+
+        Args:
+            page: the file to be made.
+            images: folder of the images, of which the page is to have small pictures.
+            overwrite: replace an existing file.
+
+        Raises:
+            InputError: if the file exists or cannot be written, or the folder has none of the images.
+        """
+        _writers[0].page(self, page, images=images, overwrite=overwrite)
+
+
+class Written(Reported):
+    """A result that can be written as the folder that the command would make."""
+
+    __slots__ = ()
+    _PUBLIC: ClassVar[tuple[str, ...]] = ()
+    """Attributes that completion offers; the others are what the stages of a run left, and may change."""
+
+    def __dir__(self) -> Iterable[str]:
+        return sorted({*self._PUBLIC, "facts", "report", "summary", "verdict", "write"})
+
+    def write(self, out: Path | str, **options: Any) -> None:
+        """Write the result into a new or empty folder, which is filled in one step.
+
+        Args:
+            out: the folder: the model, tables, locate.json and report.html.
+            **options: of `WriteOptions` by name: `found.write("out", overwrite=True)`.
+
+        Raises:
+            InputError: if the folder holds something or cannot be written.
+        """
+        _writers[0].folder(self, out, **options)
+
+
+def report_in_notebook(found: Any) -> str:
     """Return the verdict on a result, what is told of it, and the page of its report.
 
     The page runs in a frame that can reach nothing. It is left out where it is too large, or nobody draws it.
     """
     color, statement = _COLORS[found.verdict.grade.value], html.escape(found.verdict.statement)
+    rows = [Row("result", found.told.lines), *found.told.rows]
     told = ((label, "\n".join(lines)) for label, lines in rows if lines)
     table = _table_rows(told, " style='text-align:left;white-space:pre-line'")
     shown = f"<b style='color:{color}'>{statement}</b><table>{table}</table>"
-    page = _drawers[0](found) if _drawers else ""
+    page = _writers[0].draw(found) if _writers else ""
     if page and len(page) <= _MOST_BYTES:
         shown += (
             f"<iframe sandbox='allow-scripts' style='width:100%;height:{_FRAME_HEIGHT_PX}px;border:0' "

@@ -26,9 +26,9 @@ S = TypeVar("S", bound="Settings")
 _HELP_WIDTH = 88  # columns; the text of the help as it stands indented on a terminal
 
 
-def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
-    """Return a field with its default and its sentence; `also` is an earlier name that flags still take."""
-    return field(default=default, metadata={"help": help, "also": also})
+def option(default: Any, help: str) -> Any:  # noqa: A002  as click and argparse call it
+    """Return a field with its default and its sentence."""
+    return field(default=default, metadata={"help": help})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +101,6 @@ class Option(NamedTuple):
     name: str
     default: Any
     help: str
-    also: str
     kind: Any
 
 
@@ -124,7 +123,7 @@ def setting_groups(settings: type[S], defaults: S | None = None) -> Iterator[Opt
             inside.append(value)
         else:
             said = item.metadata
-            own.append(Option(item.name, value, said["help"], said["also"], kinds[item.name]))
+            own.append(Option(item.name, value, said["help"], kinds[item.name]))
     if own:
         yield OptionGroup((settings.__doc__ or settings.__name__).split("\n")[0].rstrip("."), tuple(own))
     for value in inside:

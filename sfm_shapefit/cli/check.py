@@ -2,18 +2,16 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from sfm_shapefit.base.display import row
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
-    catch_termination,
+    print_answer,
     print_ending,
     print_json,
-    print_table,
     report_errors,
     show_progress,
 )
@@ -28,9 +26,6 @@ from sfm_shapefit.cli.flags import (
     one_path,
 )
 from sfm_shapefit.cli.root import app
-
-if TYPE_CHECKING:
-    from sfm_shapefit.pipeline.check import CheckResult
 
 
 @app.command(
@@ -65,43 +60,23 @@ def check_command(
     with report_errors():
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
-        if report is not None and not report.absolute().parent.is_dir():
-            raise InputError(f"the folder of {report} does not exist; make it, or name another page")
-        if report is not None and report.exists() and not overwrite:
-            raise InputError(
-                f"{report} exists already; choose another with --report, or replace it with --overwrite"
-            )
 
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
+        from sfm_shapefit.pipeline.write import refuse_page
 
-        catch_termination()
+        if report is not None:  # now, not when all is computed
+            refuse_page(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, progress=progress)
         if report is not None:
-            _write_page(found, report, images)
+            found.report(report, images=images or "", overwrite=overwrite)
         if as_json:
             print_json(found.summary())
         elif not quiet:
-            told = found.facts.told(found.cameras)
-            rows = [*told.figures, row("written", str(report or ""))]
-            opened = [f"open {shlex.quote(str(report))}"] if report is not None else []
-            print_table(f"{told.counted} of {source}", rows, told.elsewhere)
-            print_ending(found.verdict, [*opened, told.step.command])
+            told = found.facts.told(found.cameras, found.pairs)
+            print_answer(told)
+            written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
+            print_ending(found.verdict, written, told.step.command)
         if strict and found.verdict.is_bad:
             raise typer.Exit(EXIT_UNSOLVABLE)
-
-
-def _write_page(found: "CheckResult", page: Path, images: Path | None) -> None:
-    """Write the page of a model, with small pictures of its images if they are at hand."""
-    from sfm_shapefit.report.page import write_report
-    from sfm_shapefit.report.sentences import shorten
-    from sfm_shapefit.report.thumbnails import thumbnails_of
-
-    pictures = thumbnails_of(found.drawing, images or "")
-    if pictures is not None and not pictures:
-        raise InputError(f"{images} has none of the images, such as {shorten(found.cameras[0].name)}")
-    try:
-        write_report(found.drawing, found.facts, page, pictures)
-    except OSError as error:
-        raise InputError(f"{page} cannot be written ({error.strerror}); choose another place") from error

@@ -1,10 +1,12 @@
 """What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
 
 The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
-5 a package is missing; 130 interrupted.
+5 a package is missing; 130 interrupted; 141 nobody reads any more.
 """
 
+import errno
 import os
+import re
 import signal
 import sys
 import time
@@ -15,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from sfm_shapefit.base.display import Row
+from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
@@ -23,7 +25,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130  # exit codes; see the header
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING = 3, 4, 5  # exit codes; see the header
+EXIT_INTERRUPTED, EXIT_PIPE = 130, 141  # exit codes; 128 and the number of the signal
 NAMES_SHOWN = 8  # lines under one label of a table; the files have all
 
 _LIBRARIES_BYTES = 850_000_000  # bytes of address space; with less, loading the libraries fails (measured)
@@ -40,6 +43,9 @@ _GRADE_STYLES = {"good": "bold green", "look": "bold yellow", "do not use": "bol
 _SAID_EVERY_S = 2.0  # seconds between lines of progress where there is no terminal; logs stay short
 _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code has returned by then
 
+flag_names: set[str] = set()
+"""Names of the options that are flags of the command at work."""
+
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
 
@@ -55,8 +61,12 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
     before = _identity(out)
     try:
         yield
+        sys.stdout.flush()  # now, not when nobody hears of it
     except typer.Exit:
         raise
+    except BrokenPipeError:  # whoever reads has seen enough
+        _forget_stdout()
+        raise typer.Exit(EXIT_PIPE) from None
     except (KeyboardInterrupt, Exception) as error:
         # Native code that a signal interrupts may turn the interrupt into an error of its own.
         if isinstance(error, KeyboardInterrupt) or _received:
@@ -71,12 +81,29 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
             _fail(str(error), EXIT_MISSING)
         if isinstance(error, ShapeFitError):
             _fail(str(error), EXIT_INPUT)
+        if isinstance(error, OSError):
+            _fail(_explain_failure(error), EXIT_INPUT)
         if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
             _fail(
                 "the memory that this process may use is not enough; allow more, or give a smaller model",
                 EXIT_INPUT,
             )
         raise
+
+
+def _explain_failure(error: OSError) -> str:
+    """Say what the system refused: a path, the working folder, or what is printed."""
+    if error.filename is not None:
+        return f"{os.fsdecode(error.filename)} cannot be used ({error.strerror}); choose another"
+    if error.errno == errno.ENOENT:
+        return "the working folder is gone; go to another, and start again"
+    _forget_stdout()
+    return f"what there is to print cannot be written ({error.strerror})"
+
+
+def _forget_stdout() -> None:
+    """Let what is still to be printed go nowhere."""
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  as long as the process lives
 
 
 def _identity(path: Path | None) -> tuple[int, int] | None:
@@ -89,7 +116,7 @@ def _identity(path: Path | None) -> tuple[int, int] | None:
 
 
 def catch_termination() -> None:
-    """Turn SIGTERM into an interrupt; again once pycolmap is loaded, which brings a handler of its own.
+    """Turn SIGTERM into an interrupt.
 
     A signal that whoever started this process wants ignored, as nohup does, stays ignored.
     """
@@ -137,7 +164,20 @@ def _fail(message: str, code: int) -> None:
 
 
 def _say(message: str) -> None:
-    print(f"sfm-shapefit: {make_printable(message)}", file=sys.stderr)  # noqa: T201
+    print(f"sfm-shapefit: {make_printable(in_flags(message))}", file=sys.stderr)  # noqa: T201
+
+
+def in_flags(text: str) -> str:
+    """Return a message with its options as they are typed: min_trust=0 as --min-trust 0."""
+
+    def typed(option: re.Match[str]) -> str:
+        name, value = option.groups()
+        if name not in flag_names:
+            return option[0]
+        flag = f"--{name.replace('_', '-')}"
+        return flag if value == "True" else f"{flag} {value}"
+
+    return re.sub(r"\b([a-z_]+)=([\w.]*\w)", typed, text)
 
 
 def make_printable(text: str) -> str:
@@ -232,31 +272,41 @@ def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
         style = _WARNING_STYLE if label == "warning" else ""
         more = len(lines) - NAMES_SHOWN
         shown = [*lines[:NAMES_SHOWN], f"and {more} more, {elsewhere}"] if elsewhere and more > 0 else lines
-        text = "\n".join(_encodable(line) for line in "\n".join(shown).split("\n"))
+        text = "\n".join(_encodable(in_flags(line)) for line in "\n".join(shown).split("\n"))
         if lines:
             table.add_row(Text(label, style), Text(text, style))
     Console().print(table)
 
 
-def print_ending(verdict: "ModelVerdict", steps: Iterable[str]) -> None:
-    """Print on stdout how good a model is, and what to do next; each step is a line that can be copied."""
-    from rich.console import Console
-    from rich.text import Text
+def print_answer(told: Telling, time_taken: str = "") -> None:
+    """Print on stdout what is told of a result, a line each, without rows of a table.
 
-    line = Text("verdict: ").append(_encodable(verdict.statement), _GRADE_STYLES[verdict.grade.value])
-    Console().print(line, soft_wrap=True)
-    print_steps(steps)
+    Args:
+        told: the lines, and what is out of the ordinary.
+        time_taken: put at the end of the first line.
+    """
+    first, *others = told.lines
+    print_lines([first + (f"        {time_taken}" if time_taken else ""), *others])
+    for label, lines in told.rows:
+        more = len(lines) - NAMES_SHOWN
+        shown = [*lines[:NAMES_SHOWN], f"and {more} more, {told.elsewhere}"] if more > 0 else lines
+        print_lines([f"{label}: {line}" for line in shown], _WARNING_STYLE if label == "warning" else "")
 
 
-def print_steps(steps: Iterable[str]) -> None:
-    """Print on stdout what to do next, each step a line that can be copied."""
+def print_ending(verdict: "ModelVerdict", written: str, step: str) -> None:
+    """Print on stdout how good a model is, what was written, and the next command, which can be copied."""
+    print_lines([f"verdict: {verdict.statement}"], _GRADE_STYLES[verdict.grade.value])
+    print_lines([line for line in (written, f"next: {step}") if line])
+
+
+def print_lines(lines: Iterable[str], style: str = "") -> None:
+    """Print lines on stdout, of any length and with control characters replaced."""
     from rich.console import Console
     from rich.text import Text
 
     console = Console()
-    for number, step in enumerate(steps):
-        start = "next:    " if number == 0 else "         "
-        console.print(Text(start + _encodable(step)), soft_wrap=True)
+    for line in lines:
+        console.print(Text(_encodable(in_flags(line)), style), soft_wrap=True)
 
 
 def print_json(summary: dict[str, Any]) -> None:

@@ -56,6 +56,9 @@ def evaluate_command(
         Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
     as_json: Json = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Also AUC of relative poses, and recall.")
+    ] = False,
 ) -> None:
     """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment."""
     source = one_path(model, input_path, "MODEL")
@@ -79,15 +82,18 @@ def evaluate_command(
             print_json(errors.summary())
         else:
             title = f"{source} against {truth}"
-            print_table(title, _told(errors), "see --json")
+            print_table(title, _told(errors, verbose=verbose or bool(threshold)), "see --json")
 
 
-def _told(errors: "Evaluation | PositionEvaluation") -> list[Row]:
+def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[Row]:
     """Return the errors against a model or known positions."""
     from sfm_shapefit.scene.evaluation import Evaluation
 
     common = f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"
-    rows = _evaluation_rows(errors) if isinstance(errors, Evaluation) else _position_rows(errors.facts)
+    if isinstance(errors, Evaluation):
+        rows = [*_evaluation_rows(errors), *(_recall_rows(errors) if verbose else ())]
+    else:
+        rows = _position_rows(errors.facts)
     return [row("cameras", common), *rows]
 
 
@@ -109,17 +115,22 @@ def _evaluation_rows(errors: "Evaluation") -> list[Row]:
         f"{one.name}: {rounded(one.position_error, smallest)}, {rounded(one.rotation_error_deg)} deg"
         for one in errors.worst(_WORST_SHOWN)
     ]
-    aucs = [f"{100.0 * auc.auc:.1f} at {auc.threshold_deg:g} deg" for auc in errors.relative_pose_aucs]
-    extent = f"(the reference's cameras extend over {errors.extent:.4g})"
     return [
         Row("missing", errors.missing),
-        Row("position error", [_describe(errors.position, smallest), extent]),
+        row("position error", f"{_describe(errors.position, smallest)}, of an extent of {errors.extent:.4g}"),
         row("rotation error", f"{_describe(errors.rotation_deg)} deg"),
-        row("relative pose AUC", ", ".join(aucs)),
         *_trajectory_rows(errors, smallest),
-        row("within", "\n".join(map(_describe_recall, errors.recalls))),
         Row("worst cameras", worst),
         *(row("warning", warning) for warning in errors.warnings),
+    ]
+
+
+def _recall_rows(errors: "Evaluation") -> list[Row]:
+    """Return AUC of relative poses, and how many cameras are within thresholds."""
+    aucs = [f"{100.0 * auc.auc:.1f} at {auc.threshold_deg:g} deg" for auc in errors.relative_pose_aucs]
+    return [
+        row("relative pose AUC", ", ".join(aucs)),
+        row("within", "\n".join(map(_describe_recall, errors.recalls))),
     ]
 
 

@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
+from sfm_shapefit.cli.console import flag_names
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
@@ -97,16 +98,6 @@ _WORDS_OR_NUMBERS = {"rotations"}
 
 _JOINT = "\0"  # between the values of one flag; no argument of a program can hold it
 
-_EARLIER_NAMES: dict[str, str] = {}
-"""Earlier names of flags, still accepted but in no help, and the present ones."""
-
-
-_GONE = {
-    "refine_with_priors": "priors that have standard deviations pull the cameras by themselves now",
-}
-"""Advice for options that no longer exist, by their names."""
-
-
 _FIRST_SCREEN = {
     "locate": (
         *("database", "priors", "control_points", "known_distance", "fix", "without", "rotations"),
@@ -172,44 +163,38 @@ class GroupedCommand(TyperCommand):
                 title = getattr(parameter, "rich_help_panel", None) or "Options"
                 groups.setdefault(title, []).append(record)
         if first:
-            shown = [(by_name[name][0], _first_words(by_name[name][1])) for name in first]
+            shown = [(by_name[name][0], brief_help(by_name[name][1])) for name in first]
             groups["Options"] = [*shown, (_HELP_ALL, "Show all options."), by_name["help"]]
         return groups
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse flags by their present names, where an earlier one is given, and several values as one."""
+        """Parse flags, the several values of one as one."""
         if _HELP_ALL in args and not ctx.resilient_parsing:
             ctx.meta[_ALL_OPTIONS] = True
             args = ["--help"]
         known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
-        renamed = []
-        for arg in args:
-            flag, equals, value = arg.partition("=")
-            present = _EARLIER_NAMES.get(flag, flag)
-            renamed.append(present + equals + value if flag not in known and present in known else arg)
+        flag_names.update(name.removeprefix("--").replace("-", "_") for name in known)
         if not ctx.resilient_parsing:
-            self._refuse_unknown(ctx, renamed, known)
+            self._refuse_unknown(ctx, args, known)
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
-        extra = super().parse_args(ctx, _gather_values(renamed))
+        extra = super().parse_args(ctx, _gather_values(args))
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)
         return extra
 
     def _refuse_unknown(self, ctx: Any, args: Sequence[str], known: set[str]) -> None:
-        """Refuse flags that are keys of --config now, or are no more; others are the parser's business."""
+        """Refuse flags that are keys of --config; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
         groups = () if settings is None else setting_groups(settings)
-        keys = {name: item.name for one in groups for item in one.options for name in (item.also, item.name)}
+        keys = {item.name for one in groups for item in one.options}
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]
             name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
             if not flag.startswith("--") or flag in known:
                 continue
-            if name in _GONE:
-                ctx.fail(f"{flag} is gone: {_GONE[name]}")
             if name in keys:
-                ctx.fail(f"{flag} is a key of --config now: {keys[name]} = ...")
+                ctx.fail(f"{flag} is a key of --config: {name} = ...")
 
 
 def _bare(name: str) -> str:
@@ -217,7 +202,7 @@ def _bare(name: str) -> str:
     return name.removesuffix("]...").strip("[]")
 
 
-def _first_words(text: str) -> str:
+def brief_help(text: str) -> str:
     """Return what an option is, without what its values mean, and its default."""
     words = re.split(r"[.:;] | \[default: ", text, maxsplit=1)[0].rstrip(".")
     return words + "".join(re.findall(r" \[default: [^]]*\]", text))
@@ -262,8 +247,6 @@ def flags_of(settings: type[Settings], *names: str) -> list[inspect.Parameter]:
             if names and item.name not in names:
                 continue
             flag = _flag_of(item.name)
-            if item.also:
-                _EARLIER_NAMES[_flag_of(item.also)] = flag
             is_switch = settings is OutputFlags and item.default is False
             has_opposite = item.kind is bool and not is_switch
             spelled = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
@@ -339,7 +322,11 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     try:
         return settings(**values)
     except (TypeError, ValueError) as error:
-        raise typer.BadParameter(str(error)) from error
+        message = str(error)
+        for name in flags:  # an option of the file keeps its spelling
+            message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
+            message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
+        raise typer.BadParameter(message) from error
 
 
 def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
@@ -354,12 +341,9 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
-    earlier = {item.also: item.name for one in setting_groups(settings) for item in one.options if item.also}
-    values = {earlier.get(name, name): value for name, value in read.items()}
-    for name in values.keys() - {*homes, *homes.values()}:
-        reason = f"is gone: {_GONE[name]}" if name in _GONE else f"is no option; {hint(name, sorted(homes))}"
-        raise typer.BadParameter(f"{path}: {name!r} {reason}")
-    return values
+    for name in read.keys() - {*homes, *homes.values()}:
+        raise typer.BadParameter(f"{path}: {name!r} is no option; {hint(name, sorted(homes))}")
+    return read
 
 
 def one_path(positional: Path | None, flag: Path | None, name: str) -> Path:

@@ -3,7 +3,7 @@
 import re
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ from sfm_shapefit.base.display import row
 from sfm_shapefit.base.settings import S, flat_values
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
-    catch_termination,
+    print_answer,
     print_ending,
     print_json,
     print_table,
@@ -69,40 +69,40 @@ class Run(Generic[S]):
             self.shown = lambda: self._tell(found, source, out)
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
-        """Print a table, with details if they are wanted, then the verdict and what to do next."""
-        told = found.told
-        page = ", report.html" if self.flags.report and told.folder == "." else ""
-        rows = [
-            *(told.details if self.flags.verbose else ()),
-            *told.figures,
-            row("warning", self._missing_pictures(found.image_names)),
-            row("time", self._describe_time(found.timings_s)),
-            row("written to", f"{out}: {told.written}{page}"),
-        ]
-        print_table(f"{told.counted} of {source}", rows, told.elsewhere)
-        print_ending(found.verdict, self._next_steps(told.step.command, out / told.folder))
+        """Print the details if they are wanted, the answer, the verdict, and what to do next."""
+        told, page = found.told, out / found.told.folder / "report.html"
+        if self.flags.verbose:
+            known = dict(found.timings_s)
+            rest = time.perf_counter() - self.started - sum(known.values())
+            stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
+            print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
+        pictures = row("warning", self._missing_pictures(found.image_names))
+        print_answer(told._replace(rows=[*told.rows, pictures]), self._describe_time())
+        opened = f"; open {shlex.quote(str(page))}" if self.flags.report else ""
+        step = self._with_folder(told.step.command, out / told.folder)
+        print_ending(found.verdict, f"written to {out}/{opened}", step)
 
     def _missing_pictures(self, names: Iterable[str]) -> str:
         """Warn if pictures were asked for, and the folder has none of the images."""
+        from sfm_shapefit.report.thumbnails import file_of
+
         folder = Path(self.flags.images)
-        if not self.flags.images or not self.flags.report or any((folder / name).is_file() for name in names):
+        if not self.flags.images or not self.flags.report or any(file_of(folder, name) for name in names):
             return ""
         return f"{folder} has none of the images, so the report has no pictures"
 
-    def _next_steps(self, command: str, out: Path) -> list[str]:
-        """Return what to do next, a line each: look at the report, then the command that the report names."""
-        filled = re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
-        opened = [f"open {shlex.quote(str(out / 'report.html'))}"] if self.flags.report else []
-        return [*opened, filled]
+    @staticmethod
+    def _with_folder(command: str, out: Path) -> str:
+        """Return a command with the folder of the result filled in."""
+        return re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
 
-    def _describe_time(self, timings_s: Mapping[str, float]) -> str:
-        """Say how long the command took, how much of it went into compiling, and, in detail, each stage."""
+    def _describe_time(self) -> str:
+        """Say how long the command took, and how much of it went into compiling."""
         total = f"{time.perf_counter() - self.started:.1f} s"
         compiling = 0.0 if self.compiling is None else self.compiling.seconds
         if compiling >= _NOTICED_S:
             total += f", of which {compiling:.0f} s compiling kernels, once"
-        stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
-        return f"{total} ({stages})" if self.flags.verbose else total
+        return total
 
 
 def refuse_swapped(source: Path, target: Path, order: str) -> None:
@@ -115,6 +115,8 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.files.lines import is_database
 
+    if source.exists() and target.exists() and source.samefile(target):
+        raise InputError(f"{target} is the input; choose another folder for OUT")
     if order == "MODEL OUT" and is_database(target):
         raise InputError(f"{target} is a database, which goes by --database; the order is {order}")
     ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
@@ -161,7 +163,6 @@ def command_run(
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap
 
-            catch_termination()
             with (
                 measure_compilation() as run.compiling,
                 show_progress(not flags.quiet, flags.verbose) as run.progress,

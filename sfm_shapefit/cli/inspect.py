@@ -9,9 +9,8 @@ import typer
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.cli.console import (
-    catch_termination,
     print_json,
-    print_steps,
+    print_lines,
     print_table,
     report_errors,
     show_progress,
@@ -57,7 +56,6 @@ def inspect_command(
 
         from sfm_shapefit.pipeline.inspect import inspect as inspect_model
 
-        catch_termination()
         with show_progress(not as_json) as progress:
             found = inspect_model(source, database, options=options, progress=progress)
         if as_json:
@@ -65,9 +63,9 @@ def inspect_command(
         else:
             what = "node" if source.is_file() else "image"
             told = found.told
-            print_table(f"{counted(found.num_images, what)} of {source}", told.figures, told.elsewhere)
+            print_table(f"{counted(found.num_images, what)} of {source}", told.rows, told.elsewhere)
             if not found.diagnosis.obstacle:
                 command = "place" if what == "node" else "locate"
-                print_steps([f"sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
+                print_lines([f"next: sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)

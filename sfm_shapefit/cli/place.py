@@ -65,6 +65,8 @@ def place_command(
     """Place the nodes of a bare view GRAPH of directions, or of relative poses; write tables to OUT."""
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
+    if any((source / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+        raise typer.BadParameter(f"{source} is a COLMAP model, which sfm-shapefit locate takes")
     with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
         from sfm_shapefit.facts.exports import export_files
         from sfm_shapefit.pipeline.place import place_graph_file

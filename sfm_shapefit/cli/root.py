@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -87,6 +88,8 @@ def load_commands(words: Sequence[str] = ()) -> None:
 
 def main() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
+    if sys.stdout is None:  # closed by whoever started this process
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     catch_termination()
     repeat_lost_interrupts()
     gc.set_threshold(*_OBJECTS_BETWEEN_SEARCHES)

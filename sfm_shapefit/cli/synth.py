@@ -44,7 +44,9 @@ def synth_command(
         if not images and render != RenderOptions():
             raise InputError("the options of drawing need --images; add it, or leave them out")
         rows = _write_drawn(scene, render, target, workspace) if images else _write(scene, target, workspace)
-        print_table(f"{scene.shape}, seed {scene.seed}", [*rows, row("written to", str(target))])
+        exact = "truth" if (target / "truth").exists() else "sparse/0"
+        rows += [row("exact model", exact), row("written to", str(target))]
+        print_table(f"{scene.shape}, seed {scene.seed}", rows)
 
 
 def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[Row]:

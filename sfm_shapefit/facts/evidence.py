@@ -31,7 +31,7 @@ class ContradictedLens(Record):
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (
             f"the focal length of camera {self.camera} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
-            "px, by the points that the others make; its images stand wrong by that: --intrinsics focal lets "
+            "px, by the points that the others make; its images stand wrong by that: intrinsics=focal lets "
             "it change, or calibrate that camera"
         )
 

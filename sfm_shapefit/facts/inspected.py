@@ -62,4 +62,4 @@ class Inspection(Record, Displayed, repr=False):
             row("finish", plan.finish if plan else ""),
             row("will take", self.expected.statement if self.expected else ""),
         ]
-        return Telling("", rows, elsewhere="see --json")
+        return Telling((), rows, elsewhere="see --json")

@@ -53,6 +53,17 @@ class CameraIntrinsics(Record):
         return f"{head} became {self.focal_px:,.1f}{doubt} px ({self.change:+.1%}) {by}{self._distortion()}"
 
     @property
+    def cells(self) -> list[str]:
+        """The same as the report has it in a row; lengths in pixels."""
+        doubt = "" if self.focal_sigma_px is None else f" ± {self.focal_sigma_px:,.1f}"
+        found, change = f"{self.focal_px:,.1f}{doubt}", f"{self.change:+.1%}"
+        if self.decided_by == "held" or self.change == 0.0:
+            found, change = "kept", ""
+        distortion = self._distortion().removeprefix(", distortion ")
+        given = f"{self.given_focal_px:,.1f} ({self.origin})"
+        return [str(self.camera), self.model, str(self.num_images), given, found, change, distortion]
+
+    @property
     def change(self) -> float:
         """Growth of the focal length as a share of the given one."""
         return self.focal_px / self.given_focal_px - 1.0
@@ -166,7 +177,7 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
             "undetermined",
             "which the matches do not determine: the scene is flat, or the camera hardly turns and shifts",
         ),
-        ("held", "which stays as it is: --intrinsics auto, and an adjustment, would refine it"),
+        ("held", "as it was held or nothing was adjusted: `sfm-shapefit map` finds it from the matches"),
     ):
         cameras = [str(row.camera) for row in guessed if row.decided_by == how]
         if cameras:

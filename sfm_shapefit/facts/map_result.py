@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfm_shapefit.base.display import Displayed, Row, Telling, row
+from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.joins import Joined
@@ -35,11 +35,17 @@ class MappedModel:
     """The rotations it started from, of the images in `names`."""
     names: tuple[str, ...]
 
+    @property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """Cameras and points."""
+        return self.located.reconstruction
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JoinedModel(Displayed):
+class JoinedModel(Written):
     """Models in one world, and the evidence for them together."""
 
+    _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "timings_s")
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
@@ -75,19 +81,22 @@ class JoinedModel(Displayed):
     @property
     def told(self) -> Telling:
         """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
-        told = self.facts.told(self.cameras)
+        told = self.facts.told(self.cameras, self.pairs)
         joins = [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
-        written = "the joined model, locate.json, cameras.csv, pairs.csv"
-        return told._replace(figures=[*joins, *told.figures], elsewhere="see cameras.csv", written=written)
+        return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
 
     def _headline(self) -> str:
         return f"{self.facts.num_placed} images of {counted(len(self.models), 'model')}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class MapResult(Displayed):
+class MapResult(Written):
     """The models of a database, and how they came about."""
 
+    _PUBLIC = (
+        *("models", "reconstruction", "num_images", "num_placed", "left_out", "joins", "joined", "warnings"),
+        *("database", "options", "timings_s"),
+    )
     database: Path
     options: MapOptions
     models: tuple[MappedModel, ...]
@@ -111,6 +120,11 @@ class MapResult(Displayed):
     def num_placed(self) -> int:
         """Number of cameras in all models."""
         return sum(int(model.located.kept.sum()) for model in self.models)
+
+    @property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """The largest model."""
+        return self.models[0].located.reconstruction
 
     @property
     def verdict(self) -> ModelVerdict:
@@ -140,27 +154,21 @@ class MapResult(Displayed):
     @property
     def told(self) -> Telling:
         """What the terminal says: of each model, of joins, and of what was left out."""
-        largest, figures = self.models[0].located.facts, list[Row]()
+        largest, several = self.models[0].located.facts, len(self.models) > 1
+        lines, rows = list[str](), list[Row]()
         details = [row("pairs", f"{counted(self.num_pairs, 'pair')} with a relative rotation")]
         for number, model in enumerate(self.models):
-            title = row(f"model {number}", model.located.verdict.statement if len(self.models) > 1 else "")
+            title = f"model {number}: {model.located.verdict.statement}" if several else ""
             told = model.located.facts.told((), model.located.placement.refined.statement())
-            figures += [title, *told.figures]
-            details += [title, row("rotations", model.averaging.statement), *told.details]
-        figures += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
-        figures += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
-        figures += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
-        figures += [row("warning", warning) for warning in self.warnings]
-        folders = ", ".join([*map(str, range(len(self.models))), *(one.folder for one in self.joined)])
-        return Telling(
-            counted(self.num_images, "image"),
-            figures,
-            details,
-            elsewhere="see map.json",
-            written=f"{'models' if len(self.models) > 1 else 'a model'} in {folders}, map.json",
-            step=largest.next_step,
-            folder="0",
-        )
+            lines += [title, *told.lines] if several else told.lines
+            rows += told.rows
+            details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
+        rows += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
+        rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
+        rows += [Row("warning", self.warnings)]
+        step = largest.next_step
+        return Telling(lines, rows, details, elsewhere="see map.json", step=step, folder="0")
 
     @property
     def image_names(self) -> tuple[str, ...]:

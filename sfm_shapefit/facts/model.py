@@ -7,6 +7,7 @@ what people are to see of it is one more line in `scene_rows` (terminal, report 
 import math
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -38,8 +39,9 @@ from sfm_shapefit.facts.scene import (
     describe_line,
     describe_loops,
 )
-from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.placement.place import Placement
 
@@ -119,6 +121,13 @@ class RotationRefinement(Record):
     median_change_deg: Annotated[float, "Median angle by which those turned."]
     max_change_deg: Annotated[float, "Largest angle by which a camera turned."]
 
+    @property
+    def statement(self) -> str:
+        """The same in words."""
+        if not self.num_updated:
+            return "rotations kept"
+        return f"rotations refined by {self.median_change_deg:.2g} deg (at most {self.max_change_deg:.2g})"
+
     @classmethod
     def of_turns(cls, turned_deg: FloatArray | None) -> Self | None:
         """Return what is told of turns (n,), exactly 0 where a rotation is kept; None of None."""
@@ -196,12 +205,25 @@ class FactsOfModel(Facts):
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
-    @property
-    def points_statement(self) -> str:
-        """How many points there are, and how far they are off their keypoints."""
-        if not self.num_points:
-            return "none"
-        return f"{self.num_points}, mean error {self.mean_reprojection_error_px:.2f} px"
+    def told_lines(self, verb: str, against: tuple[int, int], more: str = "") -> list[str]:
+        """Return the answer in lines.
+
+        Args:
+            verb: what became of the images.
+            against: how many pairs contradict it, and of how many.
+            more: what else is told of the matches.
+        """
+        error_px = self.mean_reprojection_error_px
+        points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
+        source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
+        contradict = f"{against[0]:,} of {counted(against[1], 'pair')} contradict the result"
+        contradict = contradict if against[1] else "no pair says where cameras stand"
+        return [
+            f"{self.num_placed:,} of {counted(self.num_images, 'image')} {verb}, "
+            f"{counted(self.num_points, 'point')}{points}",
+            "; ".join(part for part in (f"matches: {source}", contradict, more) if part),
+            self.figures.uncertainty(self.sigma_of),
+        ]
 
 
 class ModelFacts(FactsOfModel, PlacedFacts):
@@ -251,9 +273,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        return next_of_model(
-            self.verdict.grade, self.inputs.path, is_adjusted=self.bundle_adjustment is not None
-        )
+        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=True)
 
     def scene_rows(self) -> list[Row]:
         """Return what is told of lenses, rigs, control points and the scene, where there is something."""
@@ -277,9 +297,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             left_out: images that are not in the output, with the reason.
             centers: where the centers come from, in words.
         """
-        figures = [
-            *self.key_rows(),
-            row("points", self.points_statement),
+        rows = [
             Row("not placed", left_out),
             *self.piece_rows(),
             *self.scene_rows(),
@@ -288,6 +306,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         nodes = f"{counted(self.num_points_as_nodes, 'track')} helped to place cameras"
         details = [
             row("directions", self.inputs.directions),
+            row("typical error of a pair", self.figures.pair_error),
             row("rigid groups", self.rigid_groups.statement if self.rigid_groups else ""),
             Row("pairs", self._pair_lines()),
             row("points as nodes", nodes),
@@ -297,13 +316,11 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             row("bundle adjustment", self.bundle_adjustment.statement if self.bundle_adjustment else ""),
             row("certificate", self.delivered.statement),
         ]
-        return Telling(
-            counted(self.num_images, "image"),
-            figures,
-            details,
-            written="seeded model, locate.json, cameras.csv, pairs.csv",
-            step=self.next_step,
-        )
+        turned = self.rotation_refinement
+        is_given = turned is not None and self.inputs.model != IN_MEMORY
+        rotations = turned.statement if turned and is_given else ""
+        lines = self.told_lines("placed", (self.pairs["outlier"], self.pairs["usable"]), rotations)
+        return Telling(lines, rows, details, step=self.next_step)
 
     def _pair_lines(self) -> list[str]:
         """Say what became of the pairs, in the words of `inspect`."""
@@ -318,15 +335,23 @@ def next_of_model(grade: Grade, source: str, *, is_adjusted: bool) -> NextStep:
     if grade is Grade.DO_NOT_USE:
         step = f"sfm-shapefit inspect {shlex.quote(source)}"
         return NextStep("Next: find out what is wrong with the input.", step)
-    if is_adjusted:
+    looked = ", once you have looked" if grade is Grade.LOOK else ""
+    if not is_adjusted:
+        held = "--BundleAdjustment.refine_focal_length 0 --BundleAdjustment.refine_extra_params 0"
         return NextStep(
-            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
-            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
+            f"Next: adjust it as a whole{looked}, with the intrinsics as they are.",
+            "mkdir -p {out_adjusted} && colmap bundle_adjuster --input_path {out} "
+            f"--output_path {{out_adjusted}} {held}",
         )
     return NextStep(
-        "Next: bundle adjustment" + (", once you have looked." if grade is Grade.LOOK else "."),
-        "mkdir -p {out_adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out_adjusted}",
+        f"Next: undistort the images for splatting or dense reconstruction{looked}.",
+        "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
     )
+
+
+def _from_here(path: str) -> str:
+    """Return a path as it is typed in the working folder."""
+    return path.removeprefix(f"{Path.cwd()}/")
 
 
 class CheckedFacts(FactsOfModel):
@@ -343,20 +368,25 @@ class CheckedFacts(FactsOfModel):
         path = shlex.quote(self.inputs.path)
         if self.verdict.grade is Grade.GOOD:
             return NextStep(
-                "Next: undistort the images for dense reconstruction.",
+                "Next: undistort the images for splatting or dense reconstruction.",
                 f"colmap image_undistorter --image_path IMAGES --input_path {path} --output_path dense",
             )
         text = "Next: place the cameras anew from their rotations and matches, and compare."
-        return NextStep(text, f"sfm-shapefit locate {path} located")
+        database = self.inputs.database
+        by = f" --database {shlex.quote(_from_here(database))}" if database else ""
+        return NextStep(text, f"sfm-shapefit locate {path} located{by}")
 
-    def told(self, cameras: Sequence[CameraRow]) -> Telling:
-        """Return what the terminal says; `cameras` are rows of all images, with what is weak about them."""
+    def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
+        """Return what the terminal says.
+
+        Args:
+            cameras: rows of all images, with what is weak about them.
+            pairs: rows of the pairs that were looked at.
+        """
         weak = [f"{row.name}: {row.reason}" for row in cameras if row.reason]
-        figures = [*self.key_rows()[:2], row("points", self.points_statement), Row("weak", weak)]
-        figures += [row("matches", self.inputs.directions)]
-        return Telling(
-            counted(self.num_images, "image"), figures, elsewhere="see --report", step=self.next_step
-        )
+        judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
+        lines = self.told_lines("posed", (judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
+        return Telling(lines, [Row("weak", weak)], elsewhere="see --report", step=self.next_step)
 
 
 class JoinedFacts(CheckedFacts):

@@ -44,7 +44,6 @@ class MemoryOptions(Settings):
         0,
         "Peak memory in MB to stay below, 0 for no limit; what is given up for it is said, and `inspect` "
         "forecasts it. If nothing is enough, the run is refused with the number needed.",
-        also="max_memory",
     )
 
     def __post_init__(self) -> None:

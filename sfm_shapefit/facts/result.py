@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.display import Displayed, Telling, report_in_notebook
+from sfm_shapefit.base.display import Telling, Written, report_in_notebook
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.control_points import ControlPoint
@@ -97,9 +97,13 @@ class Inputs:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class LocateResult(Displayed):
-    """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
+class LocateResult(Written):
+    """The placed model and the evidence for it: that of piece 0, the largest, and `further` ones."""
 
+    _PUBLIC = (
+        *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
+        *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
+    )
     reconstruction: "pycolmap.Reconstruction"
     """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
     inputs: Inputs
@@ -230,7 +234,7 @@ class LocateResult(Displayed):
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
-        return report_in_notebook(self, self.told.figures)
+        return report_in_notebook(self)
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -262,6 +266,11 @@ class LocateResult(Displayed):
         names = [self.images.names[camera] for camera in outside]
         against = weigh_evidence(self.evidence, self.placed)
         return judge_model(self.placement, shares, names, (*lenses, *repeats, *self.suspicions), against)
+
+    @property
+    def database(self) -> Path | None:
+        """The database whose matches were used, if any."""
+        return self.inputs.database
 
     @property
     def certified(self) -> SolverResult:
@@ -415,9 +424,10 @@ def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class GraphResult(Displayed):
+class GraphResult(Written):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
+    _PUBLIC = ("cameras", "pairs", "table", "options", "timings_s", "placement", "further", "certified")
     path: Path
     """The graph's file or folder."""
     statement: str
@@ -473,7 +483,7 @@ class GraphResult(Displayed):
 
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
-        return report_in_notebook(self, self.told.figures)
+        return report_in_notebook(self)
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

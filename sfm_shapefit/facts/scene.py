@@ -75,9 +75,13 @@ def describe_loops(loops: Sequence[Loop]) -> str:
     if not lost:
         return f"{said}, taken as the frames between say the same"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
+    (are, them), ends = (
+        ("is", "it") if lost == 1 else ("are", "them"),
+        map(_stretch, (worst.first, worst.second)),
+    )
     return (
-        f"{said}, {lost} refused as the frames between contradict {'it' if lost == 1 else 'them'}: above all "
-        f"from {_stretch(worst.first)} to {_stretch(worst.second)}"
+        f"{said}, of which {lost} {are} not used because the frames between contradict {them}: "
+        f"above all from {' to '.join(ends)}"
     )
 
 

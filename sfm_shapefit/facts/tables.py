@@ -153,9 +153,12 @@ def _write_csv(columns: Sequence[str], rows: Iterable[list[object]], path: Path)
     """Write a header and rows of cells; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
     try:
         with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(rows)
+            bare = csv.writer(stream, lineterminator="\n")
+            quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
+            bare.writerow(columns)
+            for row in rows:  # a carriage return ends a line for others, which `csv` forgets
+                has_return = any("\r" in cell for cell in row if isinstance(cell, str))
+                (quoted if has_return else bare).writerow(row)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
 

@@ -38,9 +38,9 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
         assert refined.disagreement is not None
         yield (
-            f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long "
-            f"chains and under heavy corruption; kept: {refined.start}"
-            + ("" if refined.is_refined else ", unrefined; --objective auto refines both and compares")
+            f"lengths are poorly known: ShapeFit and LUD disagree by {refined.disagreement:.0%}, as on long "
+            f"chains and with many wrong pairs; kept: {refined.start}"
+            + ("" if refined.is_refined else ", unrefined; objective=auto refines both and compares")
         )
     yield from _uncertainty_warnings(placement)
     if rejected > _ALARMING_SHARE:
@@ -90,11 +90,11 @@ def trust_warnings(placement: Judged, kept: BoolArray) -> Iterator[str]:
     if len(lost):
         worst = _least_trusted(placement, lost)
         if len(lost) == 1:
-            yield f"1 camera is left out because it is not trusted: {worst}; --min-trust 0 keeps it"
+            yield f"1 camera is left out because it is not trusted: {worst}; min_trust=0 keeps it"
         else:
             yield (
                 f"{len(lost)} cameras are left out because they are not trusted, above all {worst}; "
-                "--min-trust 0 keeps them"
+                "min_trust=0 keeps them"
             )
 
 
@@ -106,8 +106,8 @@ def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
             if len(names) == 1
             else (f"{len(names)} cameras are", "their poses are")
         )
-        what = "kept, as --min-trust 0 asks, though" if is_kept else "left out because"
-        remedy = "" if is_kept else "; --min-trust 0 keeps what is left out"
+        what = "kept, as min_trust=0 asks, though" if is_kept else "left out because"
+        remedy = "" if is_kept else "; min_trust=0 keeps what is left out"
         yield (
             f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
             f"{rest} wrong, or the scene repeats itself{remedy}"
@@ -120,19 +120,21 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
     if doubts is None:
         return
     ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
-    for body in np.unique(doubts.bodies[ambiguous]).tolist():
-        members = np.flatnonzero(doubts.bodies == body)
+    if ambiguous:
+        members = np.flatnonzero(np.isin(doubts.bodies, doubts.bodies[ambiguous]))
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
+        angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
+        by = " to ".join(dict.fromkeys((angles[0], angles[-1])))
         yield (
-            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} "
-            f"by {doubts.angles_deg[members[0]]:.0f} degrees as for the rotation given"
+            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} by {by} "
+            "degrees as for the rotation given"
         )
 
 
 def focal_warnings(lenses: Sequence[Lens], doubts: tuple[FocalDoubt, ...], tried: BoolArray) -> Iterator[str]:
     """Yield which cameras' matches prefer another focal length; of `tried` ones (l,) none was found."""
     for doubt in doubts:
-        advice = "--intrinsics focal lets it change"
+        advice = "intrinsics=focal lets it change"
         if tried[doubt.camera]:
             advice = "the adjustment could not tell, so calibrate that camera"
         lens = lenses[doubt.camera]

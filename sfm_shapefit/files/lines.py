@@ -14,6 +14,7 @@ from sfm_shapefit.base.errors import InputError
 
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
+_MOST_BYTES = 8_000_000_000  # bytes of a text; the graph of a million cameras has one
 UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
 
@@ -32,6 +33,11 @@ def refuse_irregular_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: Is a directory")
     if not stat.S_ISREG(mode):
         raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
+
+
+def _is_huge(path: Path) -> bool:
+    """Return whether a file is larger than any text that is read."""
+    return path.exists() and path.stat().st_size > _MOST_BYTES
 
 
 def is_database(path: Path) -> bool:
@@ -66,6 +72,8 @@ def text_of(file: Path) -> str:
     """
     refuse_irregular_file(file)
     refuse_database(file)
+    if _is_huge(file):
+        raise InputError(f"{file} has more than {_MOST_BYTES / 1e9:g} GB; is it the right file?")
     try:
         return file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -88,7 +96,7 @@ def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:
 
 def first_words(file: Path) -> list[str]:
     """Return the words of the first line that is not empty, or none if this is no ordinary text file."""
-    if not file.is_file():  # a pipe or a device would be read for ever
+    if not file.is_file() or _is_huge(file):  # a pipe or a device would be read for ever
         return []
     try:
         with file.open(encoding="utf-8-sig") as stream:

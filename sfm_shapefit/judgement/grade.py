@@ -56,7 +56,7 @@ _LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
 
-class Grade(enum.Enum):
+class Grade(enum.StrEnum):
     """What to do with a model."""
 
     GOOD = "good"

@@ -30,6 +30,8 @@ from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 if TYPE_CHECKING:
     import pycolmap
 
+    from sfm_shapefit.files.colmap.model import HoldsModel
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class AdjustedModel(Displayed):
@@ -53,7 +55,7 @@ class AdjustedModel(Displayed):
 
 
 def bundle_adjust(
-    reconstruction: "pycolmap.Reconstruction",
+    reconstruction: "pycolmap.Reconstruction | HoldsModel",
     options: AdjustmentOptions | None = None,
     *,
     rotation_sigma_deg: float | None = None,
@@ -71,7 +73,7 @@ def bundle_adjust(
     sensors. Lenses that are no case of OPENCV, such as fisheyes, are undistorted and stay what they are.
 
     Args:
-        reconstruction: the start; it is not changed.
+        reconstruction: the start, or a result that has it; it is not changed.
         options: settings, see `help(AdjustmentOptions)`; defaults if None.
         rotation_sigma_deg: standard deviation, about each axis, of the rotations that the model has; they
             pull by it. None: they do not.
@@ -83,7 +85,8 @@ def bundle_adjust(
         InputError: if no posed image observes a point, or a number is impossible.
     """
     options = merge_options(options, AdjustmentOptions, overrides)
-    images, points, tracks = read_bundle(reconstruction)
+    model = reconstruction.reconstruction if hasattr(reconstruction, "reconstruction") else reconstruction
+    images, points, tracks = read_bundle(model)
     has_ray = np.isfinite(tracks.on_plane).all(axis=1)
     seen = np.where(has_ray, points.points_seen(), -1)
     found = TriangulatedPoints(points=points.xyz, tracks=np.arange(points.num_points), points_seen=seen)
@@ -97,7 +100,7 @@ def bundle_adjust(
     solved = adjusted.problem
     moved = views.images_of(images, solved), replace(points, xyz=solved.points)
     return AdjustedModel(
-        reconstruction=move_model(reconstruction, *moved),
+        reconstruction=move_model(model, *moved),
         frame_ids=tuple(images.frames.ids.tolist()),
         adjusted=adjusted,
         covariances=estimate_covariances(solved, options) if covariances else None,

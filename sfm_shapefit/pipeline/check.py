@@ -33,15 +33,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
-from sfm_shapefit.base.display import Displayed
+from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
-from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
@@ -64,8 +65,6 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from sfm_shapefit.report.drawing import Drawing
 
 # The header says what set these limits.
@@ -79,7 +78,7 @@ _LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera t
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Displayed):
+class CheckResult(Reported):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
@@ -113,7 +112,7 @@ class CheckResult(Displayed):
 
 
 def check(
-    model: "pycolmap.Reconstruction | Path | str",
+    model: ModelSource,
     database: Path | str | None = None,
     *,
     progress: Progress | None = None,
@@ -121,7 +120,7 @@ def check(
     """Judge a COLMAP model as it stands, whatever program made it; the model is not changed.
 
     Args:
-        model: a reconstruction or a model folder, as for `locate`.
+        model: a reconstruction, a result or a model folder, as for `locate`.
         database: as for `locate`; without one, the pairs are those that share points of the model, which
             agree with it more easily.
         progress: called as stages advance.

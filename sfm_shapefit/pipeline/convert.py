@@ -14,8 +14,7 @@ from sfm_shapefit.base.atomic_folder import MARKER, atomic_folder
 from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
-    import pycolmap
-
+    from sfm_shapefit.files.colmap.model import ModelSource
     from sfm_shapefit.report.drawing import Drawing
 
 
@@ -42,7 +41,7 @@ FORMATS = {
 
 
 def convert(
-    source: "pycolmap.Reconstruction | Path | str",
+    source: "ModelSource",
     target: Path | str,
     *,
     target_format: str | None = None,
@@ -51,7 +50,8 @@ def convert(
     """Write the posed images of a model in another format.
 
     Args:
-        source: a COLMAP folder, which may be an output, a reconstruction, or OpenSfM's reconstruction.json.
+        source: a COLMAP folder, which may be an output, a reconstruction, a result, or OpenSfM's
+            reconstruction.json.
         target: the file, or for COLMAP's formats the folder, to be made.
         target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
@@ -63,7 +63,7 @@ def convert(
         InputError: if the source cannot be read, the format cannot hold it, or the target exists already.
     """
     # Here, so that the command line knows the formats without loading pycolmap.
-    from sfm_shapefit.files.colmap.model import read_model
+    from sfm_shapefit.files.colmap.model import model_of, read_model
     from sfm_shapefit.files.colmap.other_programs import posed_model_of, reconstruction_of
     from sfm_shapefit.files.colmap.seed import write_model
     from sfm_shapefit.files.opensfm import read_opensfm
@@ -72,6 +72,7 @@ def convert(
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
+    source = model_of(source)
     protect = [source] if isinstance(source, Path | str) else []
     if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
         source = reconstruction_of(read_opensfm(Path(source)), source)
@@ -99,7 +100,7 @@ def _format_of(path: Path) -> str:
     raise InputError(f"{path} has no known suffix; give the format: {', '.join(FORMATS)}")
 
 
-def _drawing_of(source: "pycolmap.Reconstruction | Path | str") -> "Drawing":
+def _drawing_of(source: "ModelSource") -> "Drawing":
     """Return what a mesh shows of a model: of an output with the trust of its cameras."""
     from sfm_shapefit.facts.tables import read_trust
     from sfm_shapefit.files.colmap.model import read_model
@@ -115,7 +116,7 @@ def _drawing_of(source: "pycolmap.Reconstruction | Path | str") -> "Drawing":
 def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:
     """Write a file whole or not at all."""
     if path.is_dir() or (path.exists() and not overwrite):
-        raise InputError(f"{path} exists already; choose another name, or replace it with --overwrite")
+        raise InputError(f"{path} exists already; choose another name, or replace it (overwrite=True)")
     partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
     try:
         partial.write_bytes(content)

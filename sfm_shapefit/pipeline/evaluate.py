@@ -3,13 +3,12 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
@@ -20,13 +19,10 @@ from sfm_shapefit.scene.evaluation import (
 )
 from sfm_shapefit.scene.given import Datum
 
-if TYPE_CHECKING:
-    import pycolmap
-
 
 def evaluate(
-    reconstruction: "pycolmap.Reconstruction | Path | str",
-    reference: "pycolmap.Reconstruction | Path | str",
+    reconstruction: ModelSource,
+    reference: ModelSource,
     *,
     thresholds: Sequence[float] = (),
     trajectory: bool = False,
@@ -34,7 +30,7 @@ def evaluate(
     """Return position and rotation errors of a model against a reference, after robust alignment.
 
     Args:
-        reconstruction, reference: reconstructions or model folders; cameras are matched by name.
+        reconstruction, reference: results, reconstructions or model folders; cameras are matched by name.
         thresholds: position errors, in the reference's units, at which recall and its AUC are wanted too.
         trajectory: whether ATE and RPE are wanted, of the common images in the order of their names.
 

@@ -4,22 +4,18 @@ from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
-from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.files.pair_list import read_pair_list
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import Matches, View
-
-if TYPE_CHECKING:
-    import pycolmap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -115,16 +111,17 @@ def read_left_out(inputs: Inputs, names: Collection[str], without: str) -> Input
     if not without:
         return inputs
     if inputs.database is None:
-        raise InputError("pairs can be left out of the matches of a database only; give one with --database")
+        raise InputError("pairs can be left out of the matches of a database only; give one (database=FILE)")
     return replace(inputs, left_out=read_pair_list(Path(without), names))
 
 
 def choose_inputs(
-    reconstruction: "pycolmap.Reconstruction | Path | str",
+    reconstruction: ModelSource,
     database: Path | str | None,
     source: Source = "auto",
 ) -> Inputs:
-    """Decide where directions come from, and say how."""
+    """Decide where directions come from, and say how; those of a result from the database that it is of."""
+    database = database or getattr(reconstruction, "database", None)
     folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None
     if source == "tracks":
         if database is not None:
@@ -136,7 +133,7 @@ def choose_inputs(
     path = Path(database) if database is not None else found
     if path is None:
         if source != "auto":
-            raise InputError(f"directions from {source} need a database; give one with --database")
+            raise InputError(f"directions from {source} need a database; give one (database=FILE)")
         statement = "the model's own tracks; no database.db was given or found beside the model"
         return Inputs(folder=folder, database=None, statement=statement)
     beside = " (found beside the model)" if database is None else ""

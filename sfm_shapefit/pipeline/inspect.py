@@ -1,13 +1,13 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.inspected import Inspection
 from sfm_shapefit.facts.options import InspectOptions
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
@@ -25,12 +25,9 @@ from sfm_shapefit.pipeline.memory import describe_work, forecast
 from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
 
-if TYPE_CHECKING:
-    import pycolmap
-
 
 def inspect(
-    source: "pycolmap.Reconstruction | Path | str",
+    source: ModelSource,
     database: Path | str | None = None,
     *,
     options: InspectOptions | None = None,
@@ -40,7 +37,8 @@ def inspect(
     """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
 
     Args:
-        source: a reconstruction or a model folder as for `locate`, or the text file of a bare graph.
+        source: a reconstruction, a result or a model folder as for `locate`, or the text file of a
+            bare graph.
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
         **overrides: single options by name.

@@ -80,7 +80,7 @@ def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, m
 def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:
     if str(asked) == PRIORS_OF_DATABASE:
         if file is None:
-            raise InputError("there is no database whose priors could be taken; give one with --database")
+            raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
         return database_priors(file, images)
     return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
 

@@ -6,14 +6,14 @@ Each stage is one function from values to a new value; the input is never change
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
@@ -30,12 +30,9 @@ from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
 from sfm_shapefit.pipeline.settle import settle
 
-if TYPE_CHECKING:
-    import pycolmap
-
 
 def locate(
-    reconstruction: "pycolmap.Reconstruction | Path | str",
+    reconstruction: ModelSource,
     database: Path | str | None = None,
     *,
     options: LocateOptions | None = None,
@@ -49,11 +46,11 @@ def locate(
         rotations = pycolmap.Reconstruction("sparse/0")
         found = sfm_shapefit.locate(rotations, "database.db")
         pycolmap.bundle_adjustment(found.reconstruction)        # a new model; the input is untouched
-        sfm_shapefit.write_result(found, "out")                 # the model, tables, and report.html
+        found.write("out")                                      # the model, tables, and report.html
 
     Args:
-        reconstruction: a pycolmap.Reconstruction or a model folder; nothing of it is changed, and its camera
-            centers never place a camera.
+        reconstruction: a pycolmap.Reconstruction, a result or a model folder; nothing of it is changed, and
+            its camera centers never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings, see `help(LocateOptions)`; defaults if None.

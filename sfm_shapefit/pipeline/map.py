@@ -9,7 +9,7 @@ Images that the averaging drops form components of their own.
 from concurrent.futures import Executor
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -24,6 +24,7 @@ from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.component import locate_components, refine_intrinsics
 from sfm_shapefit.pipeline.join_mapped import JoinedModels, join_mapped
 from sfm_shapefit.pipeline.map_run import MapRun, start_run
+from sfm_shapefit.rotations.sequences import Videos, Visit
 
 _MANY_DOUBTED = 0.25
 """Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
@@ -70,15 +71,7 @@ def map_database(
 def _map_opened(run: MapRun) -> MapResult:
     """Do what `map_database` does, once the matches are open."""
     options, path, clock = run.options, run.matches.file.path, run.clock
-    relative = run.measure()
-    if options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
-        known = refine_intrinsics(run, relative)
-        if differ_in_rays(known, run.images):
-            run = run._replace(images=known)
-            relative = run.measure()
-    videos = run.find_videos(relative)
-    run, relative, visits = run.judge_loops(videos, relative)
-    run = run.score_pairs(relative)
+    run, relative, videos, visits = measure_run(run)
     reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
     models = locate_components(run, relative, visits, reasons)
     if not models:
@@ -110,6 +103,29 @@ def _map_opened(run: MapRun) -> MapResult:
         ),
     )
     return tell_joins(result)
+
+
+class MeasuredPairs(NamedTuple):
+    """What the averaging works from."""
+
+    run: MapRun
+    """With scores of the pairs, and without refused ones."""
+    relative: RelativeRotations
+    videos: Videos
+    visits: tuple[Visit, ...]
+
+
+def measure_run(run: MapRun) -> MeasuredPairs:
+    """Return the relative rotations of all pairs that are believed."""
+    relative = run.measure()
+    if run.options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
+        known = refine_intrinsics(run, relative)
+        if differ_in_rays(known, run.images):
+            run = run._replace(images=known)
+            relative = run.measure()
+    videos = run.find_videos(relative)
+    run, relative, visits = run.judge_loops(videos, relative)
+    return MeasuredPairs(run.score_pairs(relative), relative, videos, visits)
 
 
 def database_in(path: Path) -> Path:

@@ -97,7 +97,7 @@ def place_graph_file(
         geometries = _relative_poses(path)
     if geometries is not None:
         if reverse:
-            raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
+            raise InputError(f"{path} holds relative poses, whose sense is known; leave out reverse=True")
         with clock("rotations"):
             graph, cam_from_world, statement = _orient(
                 geometries, rotations, max_rotation_error_deg, clock.threads

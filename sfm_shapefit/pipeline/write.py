@@ -8,10 +8,11 @@ that were joined stand in `joined_0` in one world too.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
-from sfm_shapefit.base.display import draw_pages_by
+from sfm_shapefit.base.display import Reported, Writers, write_by
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
@@ -20,6 +21,9 @@ from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
+
+if TYPE_CHECKING:
+    from sfm_shapefit.report.drawing import Drawing
 
 
 @explained
@@ -75,10 +79,6 @@ def write_result(
             _write_files(found, folder, options)
 
 
-write_map_result = write_result
-"""The same by another name."""
-
-
 def _inputs_of(found: LocateResult | GraphResult | MapResult | JoinedModel) -> list[Path]:
     if isinstance(found, JoinedModel):
         read = found.facts.inputs
@@ -109,7 +109,7 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
         write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
-        _report(found, folder, options)
+        _write_report(found, folder / "report.html", options.images)
 
 
 def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
@@ -119,25 +119,61 @@ def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> No
     write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
-        _report(found, folder, options)
+        _write_report(found, folder / "report.html", options.images)
 
 
-def draw_page(found: LocateResult | GraphResult) -> str:
+def write_page(
+    found: Reported, page: Path | str, *, images: Path | str = "", overwrite: bool = False
+) -> None:
+    """Write the report of a result to a file; see `Reported.report`."""
+    refuse_page(Path(page), overwrite=overwrite)
+    try:
+        has_pictures = _write_report(found, Path(page), images)
+    except OSError as error:
+        raise InputError(f"{page} cannot be written ({error.strerror}); choose another place") from error
+    if not has_pictures:
+        raise InputError(f"{images} has none of the images, so {page} has no pictures")
+
+
+def refuse_page(page: Path, *, overwrite: bool) -> None:
+    """Refuse a page that exists, or whose folder does not.
+
+    Raises:
+        InputError: if so.
+    """
+    if not page.absolute().parent.is_dir():
+        raise InputError(f"the folder of {page} does not exist; make it, or name another page")
+    if page.exists() and not overwrite:
+        raise InputError(f"{page} exists already; choose another name, or replace it (overwrite=True)")
+
+
+def _draw_page(found: Any) -> str:
     """Return the page of a result's report, as notebooks show it."""
     from sfm_shapefit.report.page import report_html
-    from sfm_shapefit.report.results import draw_result
 
-    return report_html(draw_result(found), found.facts)
-
-
-draw_pages_by(draw_page)
+    return report_html(_drawing_of(found), found.facts)
 
 
-def _report(found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions) -> None:
-    """Write report.html."""
-    from sfm_shapefit.report.page import write_report
+def _drawing_of(found: Any) -> "Drawing":
+    """Return what the page of a result shows."""
     from sfm_shapefit.report.results import draw_joined, draw_result
+
+    if isinstance(found, JoinedModel):
+        return draw_joined(found)
+    drawing: Drawing = draw_result(found) if hasattr(found, "placement") else found.drawing
+    return drawing
+
+
+def _write_report(found: Any, page: Path, images: Path | str) -> bool:
+    """Write a report, of several models that of the largest; False if pictures were asked for in vain."""
+    from sfm_shapefit.report.page import write_report
     from sfm_shapefit.report.thumbnails import thumbnails_of
 
-    drawing = draw_joined(found) if isinstance(found, JoinedModel) else draw_result(found)
-    write_report(drawing, found.facts, folder / "report.html", thumbnails_of(drawing, options.images))
+    shown = found.models[0].located if isinstance(found, MapResult) else found
+    drawing = _drawing_of(shown)
+    pictures = thumbnails_of(drawing, images)
+    write_report(drawing, shown.facts, page, pictures)
+    return pictures is None or bool(pictures)
+
+
+write_by(Writers(_draw_page, write_page, write_result))

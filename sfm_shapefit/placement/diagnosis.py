@@ -188,8 +188,7 @@ def _find_weak_cameras(
         if num_against[camera] > num_pairs[camera] and not confirmed[camera]:
             reasons.append(
                 f"the matches of {num_against[camera]} further pairs contradict the given rotations, more "
-                f"than its {num_pairs[camera]} usable ones: the scene repeats, or its rotation is wrong; "
-                "locate tells which"
+                f"than its {num_pairs[camera]} usable ones, as in scenes that repeat"
             )
         if num_ties[camera] > num_wrong[camera] and spread[camera] < NEARLY_PARALLEL:
             reasons.append("the directions that hold it are nearly parallel: it may slide along them")

@@ -1,6 +1,6 @@
 """What the page says first: whether the model is good, what to do next, and the figures that matter."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import PurePath
 
 import numpy as np
@@ -79,16 +79,26 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
             f"{placed_sentence(drawing)[:-1]}; {agree:,} pairs agree with them, {others}, and no "
             f"{drawing.noun} stands out."
         )
-    cameras = [shorten(name, 60) for name in facts.verdict.cameras]
-    if facts.verdict.grade is not Grade.LOOK or not cameras:
+    if facts.verdict.grade is not Grade.LOOK or not facts.verdict.cameras:
         return f"{reasons}." if reasons else ""
-    more = f" and {len(cameras) - _NAMED:,} more" if len(cameras) > _NAMED else ""
-    named = f"{', '.join(cameras[:_NAMED])}{more}"
-    verb = "is" if len(cameras) == 1 else "are"
-    if is_checked:
-        return f"{named} {verb} weak; the others show no weakness."
-    others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
-    return f"{named} may be wrong or {verb} left out; {others}."
+    placed = set(np.array(drawing.cameras.names)[drawing.cameras.placed].tolist())
+    doubted = [name for name in facts.verdict.cameras if name in placed]
+    left_out = [name for name in facts.verdict.cameras if name not in placed]
+    weak = "is weak" if len(doubted) == 1 else "are weak"
+    parts = [f"{_named(doubted)} {weak if is_checked else 'may be wrong'}"] if doubted else []
+    if left_out:
+        parts.append(f"{_named(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
+    if reasons:
+        parts.append(reasons[:1].lower() + reasons[1:])
+    elif len(doubted) < len(placed):
+        parts.append("the others show no weakness")
+    return f"{'; '.join(parts)}."
+
+
+def _named(names: Sequence[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+    return f"{', '.join(shorten(name, 60) for name in names[:_NAMED])}{more}"
 
 
 # --- the tiles -------------------------------------------------------------------------------------
@@ -116,7 +126,7 @@ def _figure_tiles(facts: Facts) -> Iterator[dict[str, str]]:
             "the middle of a picture.",
         )
     sigma, share, of = figures.sigma, figures.sigma_of_extent, facts.sigma_of
-    if sigma is not None and share is not None:
+    if sigma is not None and share is not None and share <= 1.0:  # beyond, nothing is known of it
         label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope_of(of)}"
         hint = f"Median standard deviation of a position: {sigma:.2g} {figures.sigma_unit} ({of})."
         yield _tile(f"± {sigma:.2g} units", label, hint)

@@ -51,7 +51,7 @@ _NOTED_SHARE = 0.05  # share of points that only two images see; less is not wor
 _MAX_HINGES = 20  # hinges named per piece; locate.json has all
 _STARTING_ITERATIONS = 2  # iterations left out of the chart; their objectives may be far out of scale
 _MAX_LOOPS = 50  # loops listed; locate.json has all
-_MAX_CONTROL_POINTS = 200  # control points listed; locate.json has all
+_MAX_CONTROL_POINTS = 200  # control points, and lenses, listed; locate.json has all
 _AXES = "xyz"
 _TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
 _NO_PAIR = 255  # byte of the matrix without a pair; no share comes near
@@ -134,6 +134,7 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
+        "intrinsics": _intrinsics(facts),
         "control": _control_points(facts),
         "loops": _loops(facts),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
@@ -277,6 +278,13 @@ def _loops(facts: Facts) -> list[list[str]]:
     loops = facts.loops if isinstance(facts, ModelFacts) else ()
     ordered = sorted(loops, key=lambda loop: (-loop.num_refused, -loop.num_matches))
     return [[shorten(cell) for cell in loop.cells] for loop in ordered[:_MAX_LOOPS]]
+
+
+def _intrinsics(facts: Facts) -> list[list[str]]:
+    """Return the cells of the cameras whose intrinsics were in doubt, the largest change first."""
+    lenses = facts.intrinsics if isinstance(facts, ModelFacts) else ()
+    ordered = sorted(lenses, key=lambda lens: -abs(lens.change))
+    return [[shorten(cell) for cell in lens.cells] for lens in ordered[:_MAX_CONTROL_POINTS]]
 
 
 def _control_points(facts: Facts) -> list[list[str]]:

@@ -69,9 +69,9 @@ def _columns(quality: ImageQuality, num_cameras: int) -> Iterator[CameraColumn]:
     """Yield what the table of cameras shows beside the usual."""
     columns = (
         ("Points", "3D points that it observes", quality.num_points),
-        ("Reproj. px", "Mean reprojection error, in pixels", quality.errors_px),
-        ("Tracks", "Median number of images that see its points", quality.track_lengths),
-        ("Cover %", "Share of the picture in which it sees points", 100 * quality.coverage),
+        ("Error (px)", "Mean reprojection error, in pixels", quality.errors_px),
+        ("Track length", "Median number of images that see its points", quality.track_lengths),
+        ("Coverage (%)", "Share of the picture in which it sees points", 100 * quality.coverage),
     )
     for title, hint, values in columns:
         unposed = np.full(num_cameras - len(values), np.nan)

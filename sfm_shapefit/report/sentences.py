@@ -21,6 +21,7 @@ _FAR_DEG = 1.0  # degrees, residual of a pair; repeated structure and wrong rota
 _LOW_TRUST = 0.75  # trust; a camera below is named, with the reason
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
+_HAVE_TABLES = {"intrinsics", "control points", "video"}
 _SHOWN = 3  # items of a kind among the first things to look at; the tables have all
 _MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 
@@ -49,14 +50,13 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
     stated = facts.scale if isinstance(facts, FactsOfModel) else _SOLVER_SCALE
     _, _, units = stated.partition(": ")  # after the option's value
     return [
-        placed_sentence(drawing),
         _pairs(drawing),
         *_certainty(drawing, facts),
         f"Units and axes: {shorten(units or stated, 2 * MAX_TEXT)}.",
         *(
             f"{label[:1].upper()}{label[1:]}: {shorten('; '.join(lines), 4 * MAX_TEXT)}."
             for label, lines in facts.scene_rows()
-            if lines
+            if lines and label not in _HAVE_TABLES
         ),
     ]
 
@@ -105,12 +105,11 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     if not known.any() or drawing.extent <= 0.0:
         return
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
-    median = float(np.median(sigmas[known]))
-    meaning = f" ({shorten(facts.sigma_of)})" if facts.sigma_of else ""
+    covers, _, relative = facts.sigma_of.removeprefix("adjusted: ").partition("; ")
+    meaning = f" Uncertainties cover {covers}, {relative}." if covers else ""
     yield (
-        f"The median standard deviation of a position is {median:.2g} units, "
-        f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
-        f"{drawing.cameras.sigmas[worst]:.2g}, of {shorten(drawing.cameras.names[worst])}{meaning}."
+        f"The least certain position is that of {shorten(drawing.cameras.names[worst])}: "
+        f"± {drawing.cameras.sigmas[worst]:.2g} of {drawing.extent:.4g} units.{shorten(meaning)}"
     )
 
 
@@ -205,7 +204,8 @@ def _loose(facts: Facts) -> Iterator[Hint]:
     for group in facts.loose_groups[:_SHOWN]:
         names = ", ".join(shorten(name, 40) for name in group.cameras[:_SHOWN])
         more = f" and {len(group.cameras) - _SHOWN:,} more" if len(group.cameras) > _SHOWN else ""
-        yield Hint(text=f"{names}{more}: loose, {shorten(group.cause)}")
+        each = "each" if len(group.cameras) > 1 else "it"
+        yield Hint(text=f"{names}{more} may slide: {each} {shorten(group.cause.removeprefix('it '))}")
 
 
 def _unchecked(drawing: Drawing) -> Iterator[Hint]:

@@ -42,7 +42,7 @@ def read_thumbnails(folder: Path, names: Sequence[str], order: IntArray) -> dict
         InputError: if the folder is none.
     """
     refuse_no_folder(folder)
-    files = {row: path for row in order.tolist() if (path := _file_of(folder, names[row])) is not None}
+    files = {row: path for row in order.tolist() if (path := file_of(folder, names[row])) is not None}
     budget = MAX_BYTES / _BASE64 / max(len(files), 1)
     width = float(np.clip(np.sqrt(budget / _BYTES_PER_PIXEL / 0.75), _NARROWEST_PX, _WIDEST_PX))
     found, total = {}, 0
@@ -67,7 +67,7 @@ def refuse_no_folder(folder: Path) -> None:
         raise InputError(f"{folder} is no folder; give the one that the names of the images start from")
 
 
-def _file_of(folder: Path, name: str) -> Path | None:
+def file_of(folder: Path, name: str) -> Path | None:
     """Return the file of an image, if there is one inside the folder."""
     try:
         path, root = (folder / name).resolve(), folder.resolve()

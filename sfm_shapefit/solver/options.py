@@ -84,7 +84,6 @@ class SolverOptions(Settings):
         'Which solver: "newton" is primal-dual Newton, "admm" splitting (with Newton steps at the end if the '
         'gap needs them) for large graphs, "conic" the generic conic program through cvxpy and Clarabel; '
         '"auto" picks by size and predicted fill, and says why.',
-        also="method",
     )
     tol: float = option(1e-8, "Certified gap, objective - dual_bound, at which a solve counts as converged.")
     max_iterations: int | None = option(
@@ -98,7 +97,6 @@ class SolverOptions(Settings):
         2000,
         "What one sparse factor may take. Larger ones are replaced by iterations in the solve, and left out "
         "elsewhere: on long chains in the refinement, and for standard deviations.",
-        also="factor_memory",
     )
     threads: int = option(
         0, f"Threads to use, at most {MAX_THREADS}; 0 means one per core. The answer does not depend on it."

@@ -14,7 +14,7 @@ photographed (`make_rendered_scene`), and bare graphs of directions (`random_gra
     problem = random_graph_problem(50, p=0.5, sigma=0.01, q=0.2)
     problem.view_graph, problem.locations, problem.corrupted
 
-`sfm_shapefit.synthetic.workspace` and `.rendered_workspace` write scenes as COLMAP workspaces, and
+`write_workspace` and `.rendered_workspace.write_rendered_workspace` write scenes as COLMAP workspaces, and
 `sfm_shapefit.synthetic.fixtures` is a pytest plugin with all of these as fixtures, and with comparisons.
 The same options give the same values on every run.
 
@@ -50,9 +50,10 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic.rigs import make_rig_drive
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
 # In this order, a name is found before anything is imported that costs more than its own module.
-_HOMES = ("options", "graphs", "streets", "scenes", "rigs", "rendering")
+_HOMES = ("options", "graphs", "streets", "scenes", "rigs", "rendering", "workspace")
 
 __all__ = [
     "CorruptionKind",
@@ -81,6 +82,7 @@ __all__ = [
     "street_problem",
     "surface_points",
     "trajectory_graph_problem",
+    "write_workspace",
 ]
 
 

@@ -181,6 +181,8 @@ def _after_signal(bench, code, stderr, accepted, *, overwrite=False):
         yield f"the message is {stderr!r}"
     if code == 130 and stderr and not overwrite and exists != (stderr == _COMPLETE):
         yield f"the message is {stderr!r}, and OUT {'exists' if exists else 'does not exist'}"
+    if code < 0 and stderr not in (_INTERRUPTED, _COMPLETE, ""):
+        yield f"a stack trace: {stderr[:300]!r}"
     if overwrite and not exists:
         yield "the earlier output is gone"
     yield from bench.problems(strays=code < 0)

@@ -1,6 +1,7 @@
 """The folder of an output appears whole or not at all, and nobody else's is touched."""
 
 import os
+import re
 import signal
 import stat
 import sys
@@ -147,12 +148,21 @@ def test_an_exception_leaves_nothing_behind_not_even_new_parents_and_keeps_an_ea
 def test_an_existing_folder_is_refused_and_kept_and_one_that_came_into_being_meanwhile_too(tmp_path):
     with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "out"):
         out = earlier_output(tmp_path / "out")
-    advice = "exists already; choose another folder, or replace it with --overwrite"
-    with pytest.raises(InputError, match=advice):
+    advice = "exists already; choose another folder, or replace it (overwrite=True)"
+    with pytest.raises(InputError, match=re.escape(advice)):
         check_output(out)
     with pytest.raises(InputError, match="exists already"), atomic_folder(out):
         pytest.fail("the block must not run")
     assert (out / "old.bin").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_empty_folder_is_filled_unasked(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    with atomic_folder(out) as folder:
+        (folder / "new.bin").write_bytes(b"new")
+    assert [path.name for path in out.iterdir()] == ["new.bin"]
     assert list(tmp_path.iterdir()) == [out]
 
 

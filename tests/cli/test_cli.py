@@ -18,6 +18,7 @@ from sfm_shapefit.base import atomic_folder as output
 from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
 from sfm_shapefit.facts.options import LocateOptions
+from sfm_shapefit.facts.placed import UNITS
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.locate import locate
@@ -44,14 +45,16 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
-    for words in ("8 of 8 images", "typical error of a pair", "typical uncertainty", "locate.json"):
-        assert words in result.stdout
-    assert "certified" not in result.stdout  # but with --verbose
-    *_, verdict, report, command = result.stdout.splitlines()
+    placed, matches, known, verdict, report, command = result.stdout.splitlines()
+    assert re.fullmatch(
+        r"8 of 8 images placed, \d+ points, mean reprojection error 0\.\d\d px +\d.* s.*", placed
+    )
+    assert matches.endswith("ring8/database.db; 0 of 16 pairs contradict the result; rotations kept")
+    assert re.fullmatch(r"positions known to ± \S+ % of the scene", known)
     assert verdict == "verdict: good"
-    assert report == f"next:    open {out / 'report.html'}"
-    adjust = f"colmap bundle_adjuster --input_path {out} --output_path {out}_adjusted"
-    assert command == f"         mkdir -p {out}_adjusted && {adjust}"
+    assert report == f"written to {out}/; open {out / 'report.html'}"
+    step = f"colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out}_dense"
+    assert command == f"next: {step}"
     assert result.stderr == ""
 
 
@@ -65,12 +68,16 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
     assert shown["typical error of a pair"] == "7 px, 0.25°"
     assert shown["typical uncertainty, 12% of the scene"] == "± 0.5 units"
-    rows = {label: text for label, (text,) in facts.key_rows()}
-    assert rows["typical error of a pair"] == "0.25 deg (7 px)"
-    assert rows["typical uncertainty"] == "0.5 of the input's units, 12% of the scene (standard deviation)"
-    assert rows["placed"] == "8 of 8 images"
+    told = facts.told((), "")
+    assert ["0.25 deg (7 px)"] in [row.lines for row in told.details]
+    assert told.lines[2] == "positions known to ± 12 % of the scene"
+    assert told.lines[0].startswith("8 of 8 images placed, ")
+    lost = replace(facts, figures=replace(facts.figures, sigma_of_extent=1.5))
+    assert lost.told((), "").lines[2] == "how well positions are known is not known"
+    metric = replace(facts, figures=replace(facts.figures, sigma_unit=UNITS["prior"]))
+    assert metric.told((), "").lines[2].endswith("12 % of the scene (0.5 of the priors' units)")
     assert figures.sigma == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
-    assert f"{figures.pair_error_deg:.2g} deg ({figures.pair_error_px:.2g} px)" in result.stdout
+    assert f"± {100 * figures.sigma_of_extent:.2g} % of the scene" in result.stdout
 
 
 def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):
@@ -150,18 +157,16 @@ def test_the_program_ends_without_a_last_search_for_garbage():
     assert run_python("-c", script).stdout.endswith("\nTrue\n")
 
 
-def test_earlier_names_of_options_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
+def test_place_is_also_called_solve_and_keys_of_the_config_are_no_flags(tmp_path):
     config = tmp_path / "options.toml"
-    config.write_text('method = "conic"\nfactor_memory = 500\n')
+    config.write_text('solver = "conic"\nfactor_memory_mb = 500\n')
     flags = ("--config", config, "--json", "--no-report")
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
     options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
-    said = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--method=conic", code=2).stderr
-    assert "--method=conic is a key" not in said
-    assert "--method is a key of --config now: solver = ..." in " ".join(said.split())
+    said = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--solver=conic", code=2).stderr
+    assert "--solver is a key of --config: solver = ..." in " ".join(said.split())
     text = run("place", "--help-all").stdout
-    assert "--method" not in text
     assert run("solve", "--help-all").stdout == text.replace(" place ", " solve ", 1)
 
 
@@ -228,7 +233,7 @@ def test_a_key_that_leaves_no_direction_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        *("scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'", "refine_with_priors = true"),
+        *("scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'"),
         *("[directions]\nmin_inlier = 3", "[gauge]\nscale = 'prior'", "rotations = 'free'\nadjust = 'none'"),
     ],
 )

@@ -14,6 +14,7 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import locate
+from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.kernel_cache import counted_as_compiling, measure_compilation
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
@@ -112,12 +113,12 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
     native = capfd.readouterr().err
     if not verbose:
         assert (done.stderr, native) == ("", "")
-        assert re.search(r"time +│ \d+\.\d s[ ,]", done.stdout)
+        assert re.search(r"^8 of 8 images placed, .* px {8}\d+\.\d s", done.stdout)
         assert "bundle adjustment" not in done.stdout
         return
     assert "these images are of the past" in native
     assert "sfm-shapefit: directions\n" in done.stderr
-    assert re.search(r"time +│ \d+\.\d s .*\(read \d+\.\d\d, directions", done.stdout)
+    assert re.search(r"seconds +│ read \d+\.\d\d, directions", done.stdout)
     assert "bundle adjustment" in done.stdout
 
 
@@ -164,15 +165,30 @@ def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is
                 patch.setenv(name, value)
             raw = io.BytesIO()
             patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
-            console.print_table("title", [("placed", ["8 of 8"]), ("warning", ["look out"])])
-            console.print_ending(verdict, ["open out/report.html"])
+            console.print_answer(Telling(["8 of 8"], [Row("warning", ["look out"])]), "3.0 s")
+            console.print_ending(verdict, "written to out/", "colmap")
             sys.stdout.flush()
             return raw.getvalue().decode()
 
     colored = shown()
-    assert re.search("\x1b\\[1;33mlook out\x1b\\[0m", colored)
-    assert "\x1b[1;33mlook at 1 camera (a.jpg)" in colored
+    assert "8 of 8        3.0 s\n" in colored
+    assert "\x1b[1;33mwarning: look out\x1b[0m" in colored
+    assert "\x1b[1;33mverdict: look at 1 camera (a.jpg)" in colored
+    assert colored.endswith("written to out/\nnext: colmap\n")
     assert "33m" not in shown(NO_COLOR="1")
+
+
+def test_options_are_spelled_as_the_command_takes_them(monkeypatch, tmp_path):
+    monkeypatch.setattr(console, "flag_names", {"min_trust", "overwrite", "rigs"})
+    assert console.in_flags("rigs=free, or min_trust=0.5; tol=1") == "--rigs free, or --min-trust 0.5; tol=1"
+    assert console.in_flags("replace it (overwrite=True)") == "replace it (--overwrite)"
+    typed = run("locate", RING / "sparse/0", tmp_path / "out", "--min-trust", "7", code=2)
+    assert "--min-trust must lie in [0, 1]" in typed.output
+    (tmp_path / "few.toml").write_text("min_trust = 7\n[directions]\nmin_inlers = 3\n")
+    config = tmp_path / "few.toml"
+    assert "did you mean min_inliers?" in run("locate", RING / "sparse/0", "out", "--config", config).output
+    config.write_text("min_trust = 7\n")
+    assert " min_trust must lie in" in run("locate", RING / "sparse/0", "out", "--config", config).output
 
 
 def test_a_path_that_is_longer_than_the_table_is_folded_not_cut(monkeypatch):
@@ -188,8 +204,6 @@ def test_a_run_says_how_much_of_its_time_went_into_compiling(monkeypatch):
         time.sleep(0.02)
     assert 0.02 <= spent.seconds < 1.0  # once, though one counted inside the other
     run_ = Run(options=None, flags=OutputFlags(), protect=[], compiling=spent)
-    assert "compiling" not in run_._describe_time({})
+    assert "compiling" not in run_._describe_time()
     spent.seconds = 97.2
-    assert re.fullmatch(
-        r"\d+\.\d s, of which 97 s compiling kernels, once", run_._describe_time({"read": 1.0})
-    )
+    assert re.fullmatch(r"\d+\.\d s, of which 97 s compiling kernels, once", run_._describe_time())

@@ -534,7 +534,7 @@ def test_adjusted_points_satisfy_the_same_filters():
 
 def test_that_no_point_can_be_adjusted_is_told():
     seed, matches = seeded(ring_model(noise_px=0.5)[0], np.zeros((NUM_IMAGES, 3)))
-    with pytest.raises(UnsolvableError, match="run with --adjust none"):
+    with pytest.raises(UnsolvableError, match="run with adjust=none"):
         bundle_adjusted(seed, matches)
 
 

@@ -109,11 +109,11 @@ def test_it_is_named_and_can_be_kept(monkeypatch):
     assert "hardly any of its matches makes a point" in row.reason
     assert found.verdict.grade is Grade.LOOK
     assert name in found.verdict.cameras
-    assert any(name in warning and "--min-trust 0" in warning for warning in found.warnings)
+    assert any(name in warning and "min_trust=0" in warning for warning in found.warnings)
     assert name in found.summary()["few_points"]
 
     kept = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db", min_trust=0.0)
     assert all(row.placed for row in kept.cameras)
     assert [row.name for row in kept.cameras if row.reason] == [name]
     assert name in kept.verdict.cameras
-    assert any(name in warning and "kept, as --min-trust 0 asks" in warning for warning in kept.warnings)
+    assert any(name in warning and "kept, as min_trust=0 asks" in warning for warning in kept.warnings)

@@ -55,7 +55,7 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     errors = sfm_shapefit.evaluate(model.located.reconstruction, COURTYARD / "truth")
     assert errors.position.max < 0.005 * errors.extent  # measured 0.0007; a quarter of the pairs is false
     assert errors.rotation_deg.max < 0.2
-    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    sfm_shapefit.write_result(found, tmp_path / "out")
     assert read_model(tmp_path / "out" / "0").images.num_images == 25
     assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
     facts = json.loads((tmp_path / "out" / "map.json").read_text())
@@ -75,7 +75,7 @@ def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
     names = [(pair.name1, pair.name2) for pair in located.pairs]
     shares[names.index((row.name1, row.name2))] = 1e-4
     model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, matched_shares=shares))
-    sfm_shapefit.write_map_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
+    sfm_shapefit.write_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
     listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
     assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}
 
@@ -212,11 +212,10 @@ def test_an_interrupt_in_any_stage_leaves_nothing_and_whoever_watches_may_cancel
     [
         (["--rotations", "held"], "No such option: --rotations"),
         (["--fix", "solved"], "No such option: --fix"),
-        (["--sequence", "none"], "--sequence is a key of --config now: sequence = ..."),
-        (["--no-refine"], "--no-refine is a key of --config now: refine = ..."),
-        (["--refine-with-priors"], "--refine-with-priors is gone: priors that have standard deviations pull"),
-        (["--rigs", "free", "--adjust", "none"], "rigs=free needs an adjustment"),
-        (["--min-points-per-image", "-1"], "min_points_per_image must be"),
+        (["--sequence", "none"], "--sequence is a key of --config: sequence = ..."),
+        (["--no-refine"], "--no-refine is a key of --config: refine = ..."),
+        (["--rigs", "free", "--adjust", "none"], "--rigs free needs an adjustment"),
+        (["--min-points-per-image", "-1"], "--min-points-per-image must be"),
     ],
 )
 def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, words):
@@ -266,7 +265,7 @@ class Counting(ThreadPoolExecutor):
 def assert_same_bits(shared, serial, folder):
     """Model and tables, as they are written."""
     for found, out in ((shared, folder / "shared"), (serial, folder / "serial")):
-        sfm_shapefit.write_map_result(found, out, report=False)
+        sfm_shapefit.write_result(found, out, report=False)
         for named in out.rglob("*.json"):  # which have timings
             named.unlink()
     written = sorted(path.name for path in (folder / "serial" / "0").iterdir())
@@ -310,9 +309,10 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
     names = found.models[0].names
     assert (loop.first, loop.second, loop.num_refused) == ((names[0],) * 2, (names[15],) * 2, 1)
     assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
-    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    sfm_shapefit.write_result(found, tmp_path / "out")
     assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
-    assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
+    assert "1 is not used because the frames between contradict it" in str(found.told.rows)
+    assert '"refused"]' in (tmp_path / "out/0/report.html").read_text()
     assert describe_loops(found.models[0].located.facts.loops).endswith(f"{names[0]} to {names[15]}")
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
     assert (blind.num_video_frames, blind.models[0].located.loops) == (0, ())
@@ -358,7 +358,7 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     assert list(found.left_out) == ["0008.jpg"]
     assert "no matches" in found.left_out["0008.jpg"]
     assert any("is in no model" in warning for warning in found.warnings)
-    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    sfm_shapefit.write_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
 
 
@@ -437,7 +437,7 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     assert [warning for warning in found.warnings if "0001.jpg and 0008.jpg is of no use" in warning] == (
         [f"the known distance of 0001.jpg and 0008.jpg is of no use: {APART}"] if wrong else []
     )
-    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    sfm_shapefit.write_result(found, tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     facts = json.loads((tmp_path / "out" / "1" / "locate.json").read_text())
     assert facts["join"]["statement"] == told.statement

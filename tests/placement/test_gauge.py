@@ -310,7 +310,7 @@ def test_priors_of_other_images_and_those_that_there_are_not_are_refused(ring, t
     of_database = ("--priors", "database")
     assert "no position prior" in run_refused("locate", RING_MODEL, tmp_path / "out", *of_database)
     tracks = BUNDLED / "facade9" / "sparse" / "0"
-    assert "give one with --database" in run_refused("locate", tracks, tmp_path / "out", *of_database)
+    assert "give one (--database FILE)" in run_refused("locate", tracks, tmp_path / "out", *of_database)
 
 
 NEW = (

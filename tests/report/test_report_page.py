@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow
@@ -131,8 +132,9 @@ def test_only_the_script_of_the_page_may_run_and_nothing_be_fetched(page):
 def test_the_words_say_what_is_placed_and_what_to_look_at():
     drawing, facts = make_drawing()
     text = " ".join(summary_sentences(drawing, facts))
-    assert text.startswith("24 of 25 cameras are placed; 1 is not in this model.")
-    assert "18 contradict them" in text
+    assert text.startswith("Of 120 pairs, 95 agree with the placed cameras and 18 contradict them; ")
+    assert "The least certain position is that of " in text
+    assert "Uncertainties cover noise, rotations, calibration, relative to the model's mean position." in text
     assert text.endswith("Units and axes: scale and origin of the input's centers.")
     assert "ShapeFit's optimum is certified to 3.0e-09" in " ".join(facts.expert_sentences())
     looks = first_looks(drawing, facts)
@@ -143,6 +145,44 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
     pair = next(look.pair for look in looks if look.pair is not None)
     against = drawing.pairs.classes == PairClass.CONTRADICTS
     assert drawing.pairs.support[pair] == drawing.pairs.support[against].max()
+
+
+def test_a_lens_in_doubt_is_a_row_of_the_table_and_no_sentence():
+    drawing, facts = make_drawing()
+    lens = CameraIntrinsics(
+        camera=3,
+        num_images=7,
+        model="SIMPLE_RADIAL",
+        origin="a guess",
+        decided_by="adjusted",
+        given_focal_px=1000.0,
+        focal_px=1100.0,
+        focal_sigma_px=2.0,
+        given_parameters=[1000.0, 0.0],
+        parameters=[1100.0, 0.05],
+    )
+    facts = replace(facts, intrinsics=(lens,))
+    (cells,) = page_data(drawing, facts)["intrinsics"]
+    assert cells == ["3", "SIMPLE_RADIAL", "7", "1,000.0 (a guess)", "1,100.0 ± 2.0", "+10.0%", "0.0500"]
+    assert not any("focal length" in sentence for sentence in summary_sentences(drawing, facts))
+    held = replace(lens, decided_by="held", focal_px=1000.0, parameters=[1000.0, 0.0])
+    assert held.cells[4:] == ["kept", "", ""]
+
+
+def test_the_banner_tells_cameras_that_are_left_out_from_those_that_may_be_wrong():
+    drawing, facts = make_drawing()
+    names = drawing.cameras.names
+    assert not drawing.cameras.placed[24]
+    for cameras, said in (
+        (names[:2], f"{names[0]}, {names[1]} may be wrong; the others show no weakness."),
+        (names[24:], f"{names[24]} is left out; the others show no weakness."),
+        ((names[0], names[24]), f"{names[0]} may be wrong; {names[24]} is left out; the others show"),
+        (names[:24], "and 21 more may be wrong."),
+    ):
+        verdict = ModelVerdict(grade=Grade.LOOK, cameras=cameras, reasons=())
+        sentence = banner(drawing, replace(facts, verdict=verdict))["sentence"]
+        assert said in sentence
+        assert ("the others" in said) == ("the others" in sentence)
 
 
 def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_anyway():
@@ -157,9 +197,9 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
 @pytest.mark.parametrize(
     ("grade", "adjusted", "headline", "command"),
     [
-        ("good", None, "Good: this model can be used", "bundle_adjuster"),
+        ("good", None, "Good: this model can be used", "image_undistorter"),
         ("good", ADJUSTED, "Good: this model can be used", "image_undistorter"),
-        ("look", None, "Look at 2 cameras first", "bundle_adjuster"),
+        ("look", None, "Look at 2 cameras first", "image_undistorter"),
         ("do not use", None, "Do not use this model", "inspect 'a folder/sparse/0'"),
     ],
 )

@@ -126,7 +126,7 @@ def test_the_gravity_of_pose_priors_is_read(tmp_path):
     path = tmp_path / "database.db"
     path.write_bytes((RING / "database.db").read_bytes())
     images = read_model(RING / "sparse" / "0").images
-    with pytest.raises(InputError, match="has no gravity of its images; give a table with --gravity"):
+    with pytest.raises(InputError, match=r"has no gravity of its images; give a table \(gravity=FILE\)"):
         read_from(path, database_gravity, images)
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():

@@ -1,6 +1,5 @@
 """The pytest plugin serves a pipeline's own tests: its example runs, and its comparisons can fail."""
 
-import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -11,30 +10,20 @@ from sfm_shapefit.synthetic import RenderOptions, WorkspaceOptions, fixtures
 from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_reconstruction_near
 from tests.scenes import COURTYARD, FACADE, ROOT
 
-
-def example() -> tuple[str, str]:
-    """The two code blocks of the plugin's docstring: the conftest.py and the tests."""
-    blocks, lines = [], []
-    for line in [*fixtures.__doc__.splitlines(), "end"]:
-        if line.startswith("    ") or (lines and not line):
-            lines.append(line)
-        elif lines:
-            blocks.append(textwrap.dedent("\n".join(lines)))
-            lines = []
-    return blocks[0], blocks[1]
+CONFTEST = 'pytest_plugins = ["sfm_shapefit.synthetic.fixtures"]'
 
 
-def test_the_example_of_the_docstring_passes_in_a_pipelines_own_tests(pytester, monkeypatch):
+@pytest.mark.slow
+def test_the_example_passes_in_a_pipelines_own_tests(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    conftest, tests = example()
-    pytester.makeconftest(conftest)
-    pytester.makepyfile(tests)
-    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=2)
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile((ROOT / "examples/test_my_pipeline.py").read_text(encoding="utf-8"))
+    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
 
 
 def test_the_documented_fixtures_are_those_that_there_are(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    pytester.makeconftest(example()[0])
+    pytester.makeconftest(CONFTEST)
     listed = pytester.runpytest_subprocess("--fixtures", "-q").stdout.str()
     page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
     for row in (line for line in fixtures.__doc__.splitlines() if line.startswith("| `")):
@@ -43,49 +32,26 @@ def test_the_documented_fixtures_are_those_that_there_are(pytester, monkeypatch)
             assert f"\n{name.strip()} [" in listed or f"\n{name.strip()} --" in listed, name
 
 
-def test_scenes_are_made_once_and_differ_by_shape_and_change(
-    ring_scene, facade_scene, courtyard_scene, drive_scene, scene_of
-):
-    assert scene_of("ring") is ring_scene
-    assert scene_of("ring", seed=1) is not ring_scene
-    shapes = [s.options.shape for s in (ring_scene, facade_scene, courtyard_scene, drive_scene)]
-    assert shapes == ["ring", "facade", "courtyard", "drive"]
-    share = scene_of("facade", corrupted_pair_fraction=0.5).pair_is_corrupted.mean()
-    assert share == pytest.approx(0.5, abs=0.02)
-
-
-def test_workspaces_are_folders_of_the_tests_own(
-    ring_workspace, corrupted_workspace, workspace_of, ring_scene
-):
-    assert (ring_workspace / "database.db").exists()
-    assert pycolmap.Reconstruction(ring_workspace / "sparse/0").num_reg_images() == ring_scene.num_images
-    assert (corrupted_workspace / "truth").is_dir()
-    further = workspace_of(ring_scene, WorkspaceOptions(database=False))
-    assert len({ring_workspace, corrupted_workspace, further}) == 3
-    assert not (further / "database.db").exists()
-
-
-def test_rendered_scenes_have_workspaces_too(rendered_scene_of, workspace_of):
+def test_projects_are_folders_of_the_tests_own(drawn_workspace, rendered_workspace):
+    ring = drawn_workspace("ring", num_images=8)
+    assert (ring / "database.db").exists()
+    assert pycolmap.Reconstruction(ring / "sparse/0").num_reg_images() == 8
+    yard = drawn_workspace(options=WorkspaceOptions(model="rotations"), seed=1)
+    assert sorted(path.name for path in yard.iterdir()) == ["database.db", "sparse", "truth"]
     small = {"num_images": 2, "image_width": 64, "image_height": 48, "focal_length_px": 60.0}
-    scene = rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small)
-    assert rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small) is scene
-    folder = workspace_of(scene, WorkspaceOptions(database=False))
-    assert sorted(path.name for path in folder.iterdir()) == ["images", "sparse"]
-    assert len(list((folder / "images").iterdir())) == 2
-    model = pycolmap.Reconstruction(folder / "sparse/0")
+    options = WorkspaceOptions(database=False)
+    photos = rendered_workspace("ring", options, RenderOptions(gray_noise=0.0), **small)
+    assert sorted(path.name for path in photos.iterdir()) == ["images", "sparse"]
+    assert len(list((photos / "images").iterdir())) == 2
+    model = pycolmap.Reconstruction(photos / "sparse/0")
     assert (model.num_reg_images(), model.num_points3D()) == (2, 0)
+    assert len({ring, yard, photos}) == 3
 
 
-def test_graphs_have_the_corruption_asked_for(random_graph, graph_of, street_graph):
+def test_graphs_have_the_corruption_asked_for(random_graph):
     problem = random_graph(20, p=0.8, q=0.3, seed=5)
-    graph = problem.view_graph
-    np.testing.assert_array_equal(graph.edges, problem.edges)
+    np.testing.assert_array_equal(problem.view_graph.edges, problem.edges)
     assert 0.1 < problem.corrupted.mean() < 0.5
-    for family in fixtures._FAMILIES:
-        assert len(graph_of(family, 60, q=0.1).locations) == 60
-    with pytest.raises(ValueError, match="family must be one of ring"):
-        graph_of("torus", 60)
-    assert street_graph(10).num_cameras == 10
 
 
 def moved(model: pycolmap.Reconstruction, meters: float) -> pycolmap.Reconstruction:

@@ -77,7 +77,7 @@ def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
         if 1.0 / _LARGEST <= float(np.linalg.norm(values)) <= _LARGEST:
             found[index_of_name[name]] = [*values.tolist(), _SIGMA_DEG]
     if not found:
-        raise InputError(f"{file.path} has no gravity of its images; give a table with --gravity")
+        raise InputError(f"{file.path} has no gravity of its images; give a table (gravity=FILE)")
     return _gravity(found)
 
 

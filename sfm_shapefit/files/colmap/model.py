@@ -13,6 +13,7 @@ Source of the conventions: https://colmap.github.io/format.html and `colmap/scen
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,23 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 
 # Sums of squares of larger coordinates overflow; these count as not finite.
 _LARGEST_COORDINATE = 1e100
+
+
+class HoldsModel(Protocol):
+    """A result that has a model."""
+
+    @property
+    def reconstruction(self) -> pycolmap.Reconstruction:
+        """The model."""
+
+
+ModelSource = pycolmap.Reconstruction | HoldsModel | Path | str
+"""A reconstruction, a result that has one, or a model folder."""
+
+
+def model_of(source: ModelSource) -> pycolmap.Reconstruction | Path | str:
+    """Return the reconstruction of a result; anything else as it is."""
+    return source.reconstruction if hasattr(source, "reconstruction") else source
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,19 +68,19 @@ class ColmapModel:
         return tuple(image.name for image in self.reconstruction.images.values())
 
 
-def read_model(source: Path | str | pycolmap.Reconstruction) -> ColmapModel:
+def read_model(source: ModelSource) -> ColmapModel:
     """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified.
+            3.12 on, rigs and frames; or a reconstruction, or a result that has one, which is not modified.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
             refuses them, if the pose of a sensor in its rig is not known, or if fewer than two images have a
             pose.
     """
-    is_checked = False
+    is_checked, source = False, model_of(source)
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
     else:
@@ -90,8 +108,10 @@ def _load(folder: Path) -> pycolmap.Reconstruction:
 
 def _first_line(error: BaseException) -> str:
     """Return the first line of an exception's text, or its type if it has none."""
-    text = str(error).strip()
-    return text.splitlines()[0].strip() if text else type(error).__name__
+    text = str(error).strip().partition("\n")[0]
+    if "Check failed" in text:  # its own assertions, which say nothing to users
+        return "its parts contradict one another"
+    return text or type(error).__name__
 
 
 def _refuse_inconsistent(label: str, reconstruction: pycolmap.Reconstruction, *, is_checked: bool) -> None:

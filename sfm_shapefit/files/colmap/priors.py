@@ -61,10 +61,10 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
         systems.add(system)
     if not found:
         raise MissingPriorsError(
-            f"{path} has no position prior of the model's images; give a table with --priors"
+            f"{path} has no position prior of the model's images; give a table (priors=FILE)"
         )
     if len(systems) > 1:
-        raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind with --priors")
+        raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind (priors=FILE)")
     return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
 
 

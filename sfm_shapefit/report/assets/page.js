@@ -92,13 +92,15 @@ const drawPieces = () => {
   $("pieces-note").textContent = data.notes.pieces;
 };
 const drawControl = () => {
+  $("intrinsics-card").hidden = !data.intrinsics.length;
+  fill("intrinsics", plainTable(["Camera", "Model", "Images", "Focal length given (px)", "Found (px)", "Change", "Distortion"], data.intrinsics));
   $("control-card").hidden = !data.control.length;
-  fill("control", plainTable(["Name", "Use", "Off by", "Along the axes", "Pixels", "Marks"], data.control));
+  fill("control", plainTable(["Name", "Use", "Off by (units)", "Along the axes (units)", "Off by (px)", "Marks"], data.control));
   $("control-note").textContent = data.notes.control;
 };
 const drawLoops = () => {
   $("loops-card").hidden = !data.loops.length;
-  fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the chain", "What became of it"], data.loops));
+  fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the frames between (°)", "What became of it"], data.loops));
   $("loops-note").textContent = data.notes.loops;
 };
 
@@ -150,7 +152,7 @@ const drawDetails = () => {
   $("details").classList.toggle("empty", !selected);
   $("stage").classList.toggle("chosen", Boolean(selected));
   if (!selected) {
-    fill("details", element("p", "Click a camera or a pair: in the scene, in a table or in a chart. Drag turns the scene, the wheel zooms, the right button shifts.", "muted"));
+    fill("details", element("p", "Click a camera or a pair: in the scene, in a table or in a chart. Drag turns the scene, " + (matchMedia("(pointer: coarse)").matches ? "two fingers zoom and shift." : "the wheel zooms, the right button shifts."), "muted"));
     return;
   }
   const [kind, k] = selected;

@@ -128,8 +128,8 @@ const drawTables = (onChoice) => {
     camera: makeTable("cameras", "camera", numCameras, [
       named(capital(data.noun), (k) => cameras.names[k], why),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
-      ...(isKnown(cameras.sigma) ? [numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
-      numeric("Error °", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
+      ...(isKnown(cameras.sigma) ? [numeric("± units", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
+      numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
         cell: (k) => element("td", cameras.degree[k] ? `${cameras.agreeing[k]}/${cameras.degree[k]}` : "none", "number"),
@@ -141,7 +141,7 @@ const drawTables = (onChoice) => {
       named(`${capital(data.noun)} 1`, (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),
       named(`${capital(data.noun)} 2`, (p) => cameras.names[pairs.second[p]], () => ""),
       { title: "Verdict", value: (p) => VERDICTS[pairs.verdict[p]], cell: verdictCell },
-      numeric("Off by °", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
+      numeric("Off by (°)", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
       ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 9)] : []),
     ], pairTitle, onChoice),
   };

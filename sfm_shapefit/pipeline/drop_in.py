@@ -1,0 +1,110 @@
+"""What other pipelines call: `global_mapping`, as pycolmap has it, and `average_database`."""
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.map import database_in, map_database, measure_run
+from sfm_shapefit.pipeline.map_run import start_run
+from sfm_shapefit.pipeline.write import write_result
+from sfm_shapefit.scene.points import number_points
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_TAKEN = {"num_threads": "threads", "min_num_matches": "min_matches", "min_model_size": "min_model_size"}
+"""Options of pycolmap that have a counterpart here, and its name."""
+
+
+def global_mapping(
+    database_path: Path | str,
+    image_path: Path | str,
+    output_path: Path | str,
+    options: "MapOptions | pycolmap.GlobalPipelineOptions | Mapping[str, Any] | None" = None,
+) -> "dict[int, pycolmap.Reconstruction]":
+    """Map a database as `pycolmap.global_mapping` and `pycolmap.incremental_mapping` do; one import changes.
+
+        models = sfm_shapefit.global_mapping("database.db", "images", "sparse")
+
+    Args:
+        database_path: the COLMAP database with verified matches; it is never changed.
+        image_path: folder of the images, of which the report has small pictures; "" for none.
+        output_path: folder for the models 0, 1, ..., each with its report.html; empty, new, or an earlier
+            output, which is replaced.
+        options: `MapOptions`, or a mapping of some of them; defaults if None. From pycolmap's options
+            `num_threads`, `min_num_matches` and `min_model_size` are taken; the others have no counterpart.
+
+    Returns:
+        The models by their numbers, the one with most cameras first; `map_database` returns them with the
+        evidence for each.
+
+    Raises:
+        InputError: if the database cannot be used, or the output would replace something else.
+        UnsolvableError: if no component of three images or more can be placed.
+    """
+    if isinstance(options, Mapping):
+        options = MapOptions(**options)
+    elif options is not None and not isinstance(options, MapOptions):
+        options = _options_of(options)
+    mapped = map_database(database_path, options)
+    write_result(mapped, output_path, overwrite=True, images=image_path)
+    return {number: model.reconstruction for number, model in enumerate(mapped.models)}
+
+
+def _options_of(theirs: "pycolmap.GlobalPipelineOptions") -> MapOptions:
+    """Return the options of pycolmap that have a counterpart, where they are not its defaults."""
+    usual = type(theirs)()
+    told = {
+        ours: getattr(theirs, name)
+        for name, ours in _TAKEN.items()
+        if getattr(theirs, name, None) != getattr(usual, name, None)
+    }
+    return MapOptions(**told)
+
+
+def average_database(
+    database: Path | str,
+    options: MapOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+    **overrides: Any,
+) -> "pycolmap.Reconstruction":
+    """Average the rotations of a database; what `map_database` does before it places any camera.
+
+        rotations = sfm_shapefit.average_database("database.db")
+        found = sfm_shapefit.locate(rotations, "database.db")
+
+    Args:
+        database: as for `map_database`; it is never changed.
+        options: settings, see `help(MapOptions)`; defaults if None.
+        progress: called as stages advance.
+        executor: shares out the pairs among its workers.
+        **overrides: single options by name: `average_database(database, gravity="gravity.txt")`.
+
+    Returns:
+        The images of the largest component, registered with their rotations, all at the origin; no points.
+
+    Raises:
+        InputError: if the database cannot be used.
+        UnsolvableError: if no three images have rotations that agree.
+    """
+    options = merge_options(options, MapOptions, overrides)
+    clock = Clock.of(progress, options.placement.solver, executor)
+    with closing(DatabaseFile(database_in(Path(database)))) as file:
+        measured = measure_run(start_run(file, options, clock, None))
+        run, reasons = measured.run, dict[int, str]()
+        components = list(run.average_images(measured.relative, reasons))
+        if not components:
+            raise UnsolvableError(next(iter(reasons.values()), "no two images have a relative rotation"))
+        _, members, averaging = max(components, key=lambda found: len(found[1]))
+        images = run.pose(members, averaging.rotations)
+        return build_seed(run.read.template(images), images, number_points([]))

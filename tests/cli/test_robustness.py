@@ -1,0 +1,171 @@
+"""What an adversary broke once: each ends in a sentence or a verdict, never in a traceback."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.tables import read_trust
+from sfm_shapefit.files.colmap import model as models
+from tests.program import run, run_python, run_refused
+from tests.scenes import COURTYARD, RING, ROOT
+
+LONG = 300 * "x"
+COMMAND = [sys.executable, "-m", "sfm_shapefit.cli"]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
+
+
+def posed(tmp_path, rotate, place):
+    """The ring with other rotations and centers."""
+    model = pycolmap.Reconstruction(RING / "sparse/0")
+    for k, image in enumerate(model.images.values()):
+        rotation = rotate(k, image.cam_from_world().rotation)
+        pose = pycolmap.Rigid3d(rotation, -rotation.matrix() @ place(image.projection_center()))
+        image.frame.set_cam_from_world(image.camera_id, pose)
+    folder = tmp_path / "posed"
+    folder.mkdir()
+    model.write(folder)
+    return folder
+
+
+def turn_at_random(k, _rotation):
+    quaternion = np.random.default_rng(k).normal(size=4)
+    return pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
+
+
+@pytest.mark.parametrize("with_database", [False, True])
+@pytest.mark.parametrize(
+    ("rotate", "place"),
+    [
+        (lambda _k, rotation: rotation, np.negative),
+        (turn_at_random, lambda center: center),
+        (lambda _k, rotation: rotation, np.zeros_like),
+    ],
+    ids=["mirrored", "random rotations", "all at one place"],
+)
+def test_a_model_without_a_usable_direction_gets_a_verdict_and_a_page(tmp_path, rotate, place, with_database):
+    folder, page = posed(tmp_path, rotate, place), tmp_path / "page.html"
+    database = ["--database", RING / "database.db"] if with_database else []
+    assert "verdict: do not use" in run("check", folder, "--report", page, *database, code=0).stdout
+    assert page.exists()
+
+
+def test_the_database_of_another_scene_gets_a_verdict():
+    said = run("check", RING / "sparse/0", "--database", COURTYARD / "database.db", code=0).stdout
+    assert "verdict: do not use" in said
+    assert "courtyard/database.db; no pair says where cameras stand\n" in said
+
+
+def test_pairs_without_a_direction_do_not_contradict_a_model():
+    """Nine pairs of the photographs are false, and have none."""
+    said = run("check", ROOT / "data_synthetic/photographed/truth", code=0).stdout
+    assert "photographed/database.db; 0 of 48 pairs contradict the result\n" in said
+
+
+def test_names_that_are_too_long_are_refused_in_a_sentence(tmp_path):
+    ring, out = RING / "sparse/0", tmp_path / LONG
+    for words in (
+        ("locate", ring, out),
+        ("map", RING / "database.db", out),
+        ("synth", out),
+        ("convert", ring, f"{out}.json"),
+        ("check", ring, "--report", f"{out}.html"),
+        ("evaluate", ring, ring, "--csv", f"{out}.csv"),
+        ("locate", out, tmp_path / "out"),
+    ):
+        assert "File name too long" in run_refused(*words)
+
+
+def test_an_image_with_a_name_that_is_too_long_has_no_picture(tmp_path):
+    model = pycolmap.Reconstruction(RING / "sparse/0")
+    model.images[1].name = f"{LONG}.jpg"
+    (tmp_path / "named").mkdir()
+    model.write(tmp_path / "named")
+    said = run("locate", tmp_path / "named", tmp_path / "out", "--images", tmp_path, code=0).stdout
+    assert "has none of the images" in said
+
+
+@pytest.mark.parametrize("command", [["inspect", "--json"], ["inspect"], ["check"]])
+def test_a_full_device_a_closed_stdout_and_a_reader_that_has_left_end_quietly(command):
+    words = [*COMMAND, command[0], str(RING / "sparse/0"), *command[1:]]
+    how = {"cwd": ROOT, "env": ENVIRONMENT, "stderr": subprocess.PIPE, "text": True}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(words, check=False, stdout=full, **how)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "No space left on device" in done.stderr
+    done = subprocess.run(["sh", "-c", 'exec "$@" >&-', "sh", *words], check=False, **how)
+    assert (done.returncode, done.stderr) == (0, "")
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, **how)
+    process.stdout.close()
+    assert process.communicate()[1] == ""
+    assert process.returncode == (141 if "--json" in words else 1)  # rich has a code of its own
+
+
+def test_a_working_folder_that_is_removed_meanwhile_is_told(tmp_path):
+    script = (
+        "import os, sys\nfrom sfm_shapefit.pipeline import locate as stages\n"
+        "from sfm_shapefit.cli import main\n"
+        "settle = stages.settle\n"
+        "def remove(*arguments):\n    os.rmdir(os.getcwd())\n    return settle(*arguments)\n"
+        "stages.settle = remove\nos.chdir(sys.argv.pop(1))\nmain()"
+    )
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    done = run_python("-c", script, gone, "locate", RING / "sparse/0", "out")
+    assert done.returncode == 3
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_a_carriage_return_in_a_name_is_quoted_and_read_again(tmp_path):
+    model, name = pycolmap.Reconstruction(RING / "sparse/0"), "one\rtwo.jpg"
+    model.images[1].name = name
+    (tmp_path / "named").mkdir()
+    model.write(tmp_path / "named")
+    run("locate", tmp_path / "named", tmp_path / "out", "-q", code=0)
+    with (tmp_path / "out/cameras.csv").open(newline="") as stream:
+        assert name in [row["name"] for row in csv.DictReader(stream)]
+    assert name in read_trust(tmp_path / "out/cameras.csv")
+    run("convert", tmp_path / "out", tmp_path / "scene.glb", code=0)
+
+
+def test_assertions_of_colmap_are_put_in_words_of_ours(monkeypatch):
+    def fails(*_arguments):
+        raise ValueError("[reconstruction.cc:12] Check failed: images_.count(id) (0 vs. 1)")
+
+    monkeypatch.setattr(models, "_posed_model", fails)
+    with pytest.raises(InputError, match="not a sound COLMAP model: its parts contradict one another"):
+        models.read_model(RING / "sparse/0")
+
+
+@pytest.mark.parametrize("command", ["inspect", "place"])
+def test_a_huge_file_is_refused_at_once(tmp_path, command):
+    with (tmp_path / "graph.txt").open("wb") as stream:
+        stream.truncate(40_000_000_000)
+    started = time.perf_counter()
+    out = [tmp_path / "out"] if command == "place" else []
+    assert "more than 8 GB" in run_refused(command, tmp_path / "graph.txt", *out)
+    assert time.perf_counter() - started < 5.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_while_pycolmap_is_imported_end_without_a_stack_trace(tmp_path, number):
+    """The moment is exact: pycolmap's own module sends the signal at its end."""
+    script = (
+        "import importlib.machinery, os, sys; from sfm_shapefit.cli import main\n"
+        "load = importlib.machinery.SourceFileLoader.exec_module\n"
+        "def signalled(self, module):\n"
+        "    load(self, module)\n"
+        f"    if module.__name__ == 'pycolmap': os.kill(os.getpid(), {int(number)})\n"
+        "importlib.machinery.SourceFileLoader.exec_module = signalled\nmain()"
+    )
+    done = run_python("-c", script, "locate", RING / "sparse/0", tmp_path / "out")
+    assert done.returncode == 130
+    assert done.stderr == "sfm-shapefit: interrupted; nothing was written\n"

@@ -1,0 +1,86 @@
+"""What other pipelines call has pycolmap's signature and answer, and results serve as models."""
+
+import inspect
+import re
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.synthetic.fixtures import assert_reconstruction_near
+from tests.scenes import COURTYARD, RING, ROOT
+
+PHOTOGRAPHED = ROOT / "data_synthetic/photographed"
+
+
+def test_global_mapping_is_called_and_answers_as_pycolmaps(tmp_path):
+    theirs = re.findall(r"(\w+): ", pycolmap.global_mapping.__doc__.partition(" -> ")[0])
+    assert list(inspect.signature(sfm_shapefit.global_mapping).parameters) == theirs
+    out = tmp_path / "models"
+    out.mkdir()  # as scripts do for pycolmap
+    models = sfm_shapefit.global_mapping(PHOTOGRAPHED / "database.db", "", out)
+    assert list(models) == [0]
+    assert isinstance(models[0], pycolmap.Reconstruction)
+    assert_reconstruction_near(models[0], PHOTOGRAPHED / "truth", max_median_error=0.02)
+    assert_reconstruction_near(out / "0", models[0], max_error=1e-12)
+    theirs = pycolmap.GlobalPipelineOptions()
+    theirs.num_threads, theirs.min_model_size = 1, 17
+    with pytest.raises(sfm_shapefit.UnsolvableError, match="needs 17"):
+        sfm_shapefit.global_mapping(RING / "database.db", "", out, theirs)
+    sfm_shapefit.global_mapping(RING / "database.db", "", out, {"adjust": "none"})  # replaces what it wrote
+    assert pycolmap.Reconstruction(out / "0").num_reg_images() == 8
+    with pytest.raises(TypeError, match="did you mean min_trust"):
+        sfm_shapefit.global_mapping(RING / "database.db", "", out, {"min_trsut": 0.5})
+
+
+def test_average_database_is_a_model_with_rotations_alone():
+    model = sfm_shapefit.average_database(COURTYARD / "database.db")
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    assert (model.num_reg_images(), model.num_points3D()) == (25, 0)
+    turns = []
+    for image in model.images.values():
+        assert np.linalg.norm(image.projection_center()) == 0.0
+        right = truth.find_image_with_name(image.name).cam_from_world().rotation
+        turns.append((image.cam_from_world().rotation.inverse() * right).matrix())
+    off_deg = [np.degrees(pycolmap.Rotation3d(turns[0].T @ turn).angle()) for turn in turns]
+    assert np.median(off_deg) < 1.0
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db")
+    assert_reconstruction_near(found, COURTYARD / "truth", max_median_error=0.02)
+
+
+def test_a_result_serves_wherever_a_model_does(tmp_path):
+    found = sfm_shapefit.locate(RING / "sparse/0")
+    assert found.verdict.grade == "good"
+    assert sfm_shapefit.evaluate(found, RING / "sparse/0").position.max < 1e-6
+    checked = sfm_shapefit.check(found)
+    assert checked.facts.inputs.database == str(found.database)  # not the tracks, which agree more easily
+    assert sfm_shapefit.inspect(found).num_images == 8
+    assert sfm_shapefit.convert(found, tmp_path / "poses.csv") == "csv"
+    assert len(sfm_shapefit.bundle_adjust(found).frame_ids) == 8
+    assert sfm_shapefit.locate(found).reconstruction.num_reg_images() == 8
+    mapped = sfm_shapefit.map_database(RING / "database.db")
+    assert sfm_shapefit.evaluate(mapped, found).position.max < 1e-4
+    assert sfm_shapefit.evaluate(mapped.models[0], found).position.max < 1e-4
+
+
+def test_results_write_themselves_and_show_at_most_twenty_attributes(tmp_path):
+    found = sfm_shapefit.locate(RING / "sparse/0")
+    mapped = sfm_shapefit.map_database(RING / "database.db")
+    checked = sfm_shapefit.check(RING / "sparse/0")
+    for result in (found, mapped):
+        assert len(dir(result)) <= 20
+        assert all(hasattr(result, name) for name in dir(result))
+        assert not any(name.startswith("_") for name in dir(result))
+    found.write(tmp_path / "out")
+    mapped.write(tmp_path / "models", report=False)
+    assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == 8
+    assert not (tmp_path / "models/0/report.html").exists()
+    for name, result in {"found": found, "mapped": mapped, "checked": checked}.items():
+        result.report(tmp_path / f"{name}.html")
+        assert "report" in (tmp_path / f"{name}.html").read_text(encoding="utf-8")
+        with pytest.raises(InputError, match="exists already"):
+            result.report(tmp_path / f"{name}.html")
+    with pytest.raises(InputError, match="none of the images"):
+        found.report(tmp_path / "pictures.html", images=tmp_path)
