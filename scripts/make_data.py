@@ -39,6 +39,7 @@ class BundledScene(NamedTuple):
 
 
 GRAPH, GPS, GCP, NAMES, GRAVITY = "graph40.txt", "gps.csv", "gcp_list.txt", "names.txt", "gravity.txt"
+ACROSS = "across.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -101,6 +102,7 @@ def main() -> None:
     (out / GCP).write_text(control_points_text(), encoding="utf-8")
     (out / NAMES).write_text(names_text(), encoding="utf-8")
     (out / GRAVITY).write_text(gravity_text(), encoding="utf-8")
+    (out / ACROSS).write_text(across_text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
@@ -167,6 +169,11 @@ def gravity_text() -> str:
 def names_text() -> str:
     """Return the names of four images of ring8, as a file for --fix."""
     return "".join(f"{image_name(k)}\n" for k in range(4))
+
+
+def across_text() -> str:
+    """Return the pairs between the halves of ring8, as a file for --without: two models are left."""
+    return "".join(f"{image_name(i)},{image_name(j)}\n" for i in range(4) for j in range(4, 8))
 
 
 def write_scene(name: str, folder: Path) -> None:

@@ -8,6 +8,7 @@
     pairs  = relative_rotations("database.db")              # of every two images, and how well each is known
     judged = check("sparse/0")                              # whether any COLMAP model can be used
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
+    joined = join(["sparse/0", "sparse/1"], "database.db")  # models that stand apart, in one world
     errors = evaluate(found, "truth")
 
     graph  = ViewGraph(num_nodes, edges, directions)        # directions of t_i - t_j
@@ -27,8 +28,14 @@ from typing import Any as _Any
 if TYPE_CHECKING:
     from sfm_shapefit.adjustment.options import AdjustmentOptions
     from sfm_shapefit.base.errors import InputError, ShapeFitError, UnsolvableError
-    from sfm_shapefit.facts.map_result import MapResult
-    from sfm_shapefit.facts.options import InspectOptions, LocateOptions, MapOptions, SourceOptions
+    from sfm_shapefit.facts.map_result import JoinedModel, MapResult
+    from sfm_shapefit.facts.options import (
+        InspectOptions,
+        JoinOptions,
+        LocateOptions,
+        MapOptions,
+        SourceOptions,
+    )
     from sfm_shapefit.facts.result import LocateResult
     from sfm_shapefit.files.colmap.quiet import hear_pycolmap
     from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -41,6 +48,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.pipeline.drop_in import average_database, global_mapping
     from sfm_shapefit.pipeline.evaluate import evaluate
     from sfm_shapefit.pipeline.inspect import inspect
+    from sfm_shapefit.pipeline.join import join
     from sfm_shapefit.pipeline.locate import locate
     from sfm_shapefit.pipeline.map import map_database
     from sfm_shapefit.pipeline.place import place
@@ -68,12 +76,13 @@ _HOMES = {
     "pipeline.drop_in": ("average_database", "global_mapping"),
     "pipeline.evaluate": ("evaluate",),
     "pipeline.inspect": ("inspect",),
+    "pipeline.join": ("join",),
     "pipeline.locate": ("locate",),
     "pipeline.map": ("map_database",),
     "pipeline.relative_rotations": ("relative_rotations",),
     "pipeline.write": ("WriteOptions", "write_result"),
     "base.errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "facts.options": ("InspectOptions", "LocateOptions", "MapOptions", "SourceOptions"),
+    "facts.options": ("InspectOptions", "JoinOptions", "LocateOptions", "MapOptions", "SourceOptions"),
     "judgement.options": ("TrustOptions",),
     "pairs.options": ("DirectionOptions",),
     "placement.options": ("GaugeOptions",),
@@ -83,7 +92,7 @@ _HOMES = {
     "pipeline.place": ("place",),
     "placement.place": ("Placement",),
     "refinement.options": ("PlacementOptions",),
-    "facts.map_result": ("MapResult",),
+    "facts.map_result": ("JoinedModel", "MapResult"),
     "facts.result": ("LocateResult",),
     "rotations.average": ("average_rotations",),
     "rotations.averaged": ("AveragedRotations",),
@@ -107,6 +116,8 @@ __all__ = [
     "GaugeOptions",
     "InputError",
     "InspectOptions",
+    "JoinOptions",
+    "JoinedModel",
     "LocateOptions",
     "LocateResult",
     "MapOptions",
@@ -134,6 +145,7 @@ __all__ = [
     "global_mapping",
     "hear_pycolmap",
     "inspect",
+    "join",
     "locate",
     "map_database",
     "place",

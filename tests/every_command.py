@@ -22,6 +22,8 @@ COMMANDS = """
     map data_synthetic/ring8/database.db {out}/mapped -q
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
+    map data_synthetic/ring8/database.db {out}/halves --without data_synthetic/across.txt -q
+    join {out}/halves/0 {out}/halves/1 {out}/whole --database data_synthetic/ring8/database.db -q
     check {out}/located --report {out}/check.html
     convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q

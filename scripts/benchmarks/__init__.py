@@ -13,6 +13,7 @@ INDEX = {
     "doubt": "Turned cameras and wrong focal lengths on real and bundled scenes: found, and no others.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
+    "join": "Models cut into pieces and joined by a few of the pairs between: right, refused, wrong.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",

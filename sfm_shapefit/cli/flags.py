@@ -138,7 +138,7 @@ class GroupedCommand(TyperCommand):
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words of the usage line: arguments are needed, though COLMAP's flags may give them."""
         pieces = super().collect_usage_pieces(ctx)
-        return [piece if piece == self.options_metavar else piece.strip("[]") for piece in pieces]
+        return [piece if piece == self.options_metavar else _bare(piece) for piece in pieces]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments first, then the options."""
@@ -158,7 +158,7 @@ class GroupedCommand(TyperCommand):
                 continue
             by_name[parameter.name or ""] = record
             if parameter.param_type_name == "argument":
-                groups["Arguments"].append((record[0].strip("[]"), record[1]))
+                groups["Arguments"].append((_bare(record[0]), record[1]))
             elif not first:
                 title = getattr(parameter, "rich_help_panel", None) or "Options"
                 groups.setdefault(title, []).append(record)
@@ -195,6 +195,11 @@ class GroupedCommand(TyperCommand):
                 continue
             if name in keys:
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
+
+
+def _bare(name: str) -> str:
+    """Return the name of an argument, or of a list of them, without what says that it may be left out."""
+    return name.removesuffix("]...").strip("[]")
 
 
 def brief_help(text: str) -> str:

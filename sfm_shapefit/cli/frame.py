@@ -26,10 +26,11 @@ from sfm_shapefit.cli.flags import OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.base.kernel_cache import CompileTime
-    from sfm_shapefit.facts.map_result import MapResult
+    from sfm_shapefit.facts.map_result import JoinedModel, MapResult
     from sfm_shapefit.facts.result import GraphResult, LocateResult
     from sfm_shapefit.pipeline.clock import Progress
 
+    Result = LocateResult | MapResult | GraphResult | JoinedModel
 
 _NOTICED_S = 1.0  # seconds; a user does not notice less compiling
 
@@ -56,7 +57,7 @@ class Run(Generic[S]):
         how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
         return how | {"protect": self.protect}
 
-    def show(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
+    def show(self, found: "Result", source: Path, out: Path) -> None:
         """Print the facts as JSON, or what is told of them, or nothing, once the output is complete.
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
@@ -67,11 +68,11 @@ class Run(Generic[S]):
         elif not self.flags.quiet:
             self.shown = lambda: self._tell(found, source, out)
 
-    def _tell(self, found: "LocateResult | MapResult | GraphResult", source: Path, out: Path) -> None:
+    def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
         told, page = found.told, out / found.told.folder / "report.html"
         if self.flags.verbose:
-            known = found.timings_s
+            known = dict(found.timings_s)
             rest = time.perf_counter() - self.started - sum(known.values())
             stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)

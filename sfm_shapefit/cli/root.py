@@ -20,7 +20,7 @@ from sfm_shapefit.cli.console import (
 )
 
 _GROUPS = {
-    "Place cameras": ("locate", "map", "place"),
+    "Place cameras": ("locate", "map", "place", "join"),
     "Look at models and results": ("check", "inspect", "evaluate"),
     "Make and convert": ("convert", "synth"),
     "Set up": ("warm-up",),

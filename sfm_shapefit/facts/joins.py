@@ -1,15 +1,16 @@
-"""What `map` says of models beside the largest: joined to another, how and how surely, or why not."""
+"""What is said of a model beside another: joined to it, how and how surely, or why not."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
 from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.placement.join import ModelJoin
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.placement.join import PieceJoin
 
 
 class JoinFacts(Record):
-    """A model of `map` beside the largest, and what came of joining it to a larger one."""
+    """A model beside another, and what came of joining it to that."""
 
     model: Annotated[str, "Its folder."]
     to: Annotated[str, "The folder of the model that it was to be joined to."]
@@ -20,48 +21,67 @@ class JoinFacts(Record):
     turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."]
     center_sigma: Annotated[
         float | None,
-        "Standard deviation of where its cameras come to lie, median, in units of the model that it is "
-        "joined to.",
+        "Standard deviation of where its cameras come to lie, in units of the model that it is joined to.",
     ]
-    similarity: Annotated[Alignment | None, "From its world to that of the model that it is joined to."]
+    similarity: Annotated[
+        Alignment | None,
+        "From its world to that of the model that it is joined to; of a refused join what most pairs want.",
+    ]
+    agreeing_pairs: Annotated[int, "Pairs of images between it and the models joined with it that agree."]
+    contradicting_pairs: Annotated[int, "Those that do not."]
+    rival_pairs: Annotated[list[tuple[str, str]], "Those among them that agree on another join, by names."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joined:
-    """A model beside the largest, and what came of joining it to a larger one."""
+    """A model beside another, and what came of joining it to that."""
 
     model: int
     """Its number."""
     to: int
     """The number of the model that it was joined to, or to be joined to."""
-    join: ModelJoin | None
-    """None if it was not joined."""
+    found: PieceJoin | None
+    """The join, refused or not; None if there was none to judge."""
     reason: str = ""
-    """Why it was not, a clause."""
+    """Why it was not joined, a clause."""
+    labels: tuple[str, str]
+    """What the two are called."""
+    rivals: tuple[tuple[str, str], ...] = ()
+    """Pairs of images that agree on another join."""
+
+    @property
+    def join(self) -> PieceJoin | None:
+        """The join, if it was accepted."""
+        return None if self.reason else self.found
 
     @property
     def statement(self) -> str:
         """Say it in one sentence."""
-        join = self.join
+        (own, other), join = self.labels, self.join
+        named = first_of([f"{a} and {b}" for a, b in self.rivals])
         if join is None:
-            return f"model {self.model} is not joined to model {self.to}: {self.reason}"
+            return f"{own} is not joined to {other}: {self.reason}" + (f" ({named})" if named else "")
+        rival = f"; {counted(len(self.rivals), 'pair')} would have it elsewhere ({named})" if named else ""
         return (
-            f"model {self.model} is joined to model {self.to} by {join.evidence}: scale known to "
+            f"{own} is joined to {other} by {join.evidence}: scale known to "
             f"{100.0 * join.scale_sigma:.2g} %, turn to {join.turn_sigma_deg:.2g} deg, its cameras to "
-            f"{join.center_sigma:.2g} units of model {self.to}"
+            f"{join.center_sigma:.2g} units of {other}{rival}"
         )
 
     def facts(self, folder: str | None) -> JoinFacts:
-        """Return what stands in map.json and in the model's locate.json."""
-        join = self.join
+        """Return what stands in the files of the result; `folder` is where both stand in one world."""
+        found = self.found
         return JoinFacts(
-            model=str(self.model),
-            to=str(self.to),
-            joined=join is not None,
+            model=self.labels[0].removeprefix("model "),
+            to=self.labels[1].removeprefix("model "),
+            joined=self.join is not None,
             folder=folder,
             statement=self.statement,
-            scale_sigma=None if join is None else join.scale_sigma,
-            turn_sigma_deg=None if join is None else join.turn_sigma_deg,
-            center_sigma=None if join is None else join.center_sigma,
-            similarity=None if join is None else join.first_from_second.facts,
+            scale_sigma=None if found is None else found.scale_sigma,
+            turn_sigma_deg=None if found is None else found.turn_sigma_deg,
+            center_sigma=None if found is None else found.center_sigma,
+            similarity=None if found is None else found.to_from_piece.facts,
+            agreeing_pairs=0 if found is None else len(found.agreeing),
+            contradicting_pairs=0 if found is None else len(found.contradicting),
+            rival_pairs=list(self.rivals),
         )

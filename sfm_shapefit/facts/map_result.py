@@ -6,7 +6,7 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 """
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,12 +42,15 @@ class MappedModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JoinedModel:
+class JoinedModel(Written):
     """Models in one world, and the evidence for them together."""
 
+    _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "timings_s")
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
+    joins: tuple[Joined, ...]
+    """What came of joining each model to another, those included that are not in this one."""
     cameras: Sequence[CameraRow]
     """One row per image of these models."""
     pairs: Sequence[PairRow]
@@ -59,6 +62,31 @@ class JoinedModel:
     def folder(self) -> str:
         """Where it stands in OUT."""
         return f"joined_{self.models[0]}"
+
+    @property
+    def verdict(self) -> ModelVerdict:
+        """Whether the joined model can be used, and why."""
+        return self.facts.verdict
+
+    @property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of its images."""
+        return tuple(row.name for row in self.cameras)
+
+    @property
+    def timings_s(self) -> Mapping[str, float]:
+        """Seconds of each stage."""
+        return self.facts.timings_s
+
+    @property
+    def told(self) -> Telling:
+        """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
+        told = self.facts.told(self.cameras, self.pairs)
+        joins = [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
+
+    def _headline(self) -> str:
+        return f"{self.facts.num_placed} images of {counted(len(self.models), 'model')}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -393,7 +393,7 @@ class CheckedFacts(FactsOfModel):
 
 
 class JoinedFacts(CheckedFacts):
-    """joined_0/locate.json, of models of `map` that were joined: looked at, not placed anew."""
+    """locate.json of joined models, those of `map` in joined_0: looked at, not placed anew."""
 
     models: Annotated[list[str], "The folders of the models in it."]
     joins: Annotated[list[JoinFacts], "How they were joined."]
@@ -406,7 +406,8 @@ class JoinedFacts(CheckedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=False)
+        is_adjusted = self.options.get("adjust") == "full" and "join" not in self.options
+        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=is_adjusted)
 
 
 class DatabaseInputs(Record):

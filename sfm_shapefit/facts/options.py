@@ -101,6 +101,19 @@ class LocateOptions(Composed):
 
 @explained
 @dataclass(frozen=True, kw_only=True, init=False)
+class JoinOptions(Composed):
+    """What becomes of models that are joined."""
+
+    adjust: Literal["none", "full"] = option(
+        "none",
+        'What follows the join: "none", each model keeps its shape; "full", poses and points of all are '
+        "bundle adjusted together.",
+    )
+    directions: DirectionOptions = group(DirectionOptions)
+
+
+@explained
+@dataclass(frozen=True, kw_only=True, init=False)
 class MapOptions(Composed):
     """What becomes of models that stand apart."""
 

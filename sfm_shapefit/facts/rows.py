@@ -18,6 +18,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.place import count_large
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_ELSEWHERE = "in a larger piece, to which this one is not rigidly tied"
 _OUTSIDE = "outside the pieces that are solved"
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 
@@ -56,6 +57,8 @@ def camera_rows(
         if camera in reasons
     }
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
+    if placement.piece:
+        reasons = dict.fromkeys(range(graph.num_nodes), _ELSEWHERE) | reasons
     rows = [
         CameraRow(
             name=graph.name_of(camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")

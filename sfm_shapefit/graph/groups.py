@@ -1,21 +1,22 @@
 """Rigid groups of cameras: rigs, whose frames are the unknowns, and cameras that must stay where they are.
 
-Camera k belongs to group b(k) and stands at a known offset from its group's center, in world axes and in one
-unit that all groups share:
+Camera k belongs to group b(k) and stands at a known offset from its group's center, in world axes and in a
+unit c(b) that its group shares with others, or has alone:
 
-    t_k = f_b(k) + s o_k
+    t_k = f_b(k) + s_c(b(k)) o_k
 
-Unknown are the centers f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
-linear in x = (f, s), and dividing by s gives the centers in the unit of the offsets.
+Unknown are the centers f_b of the groups and s_c, the lengths of the units in the scale of t. So t = A x is
+linear in x = (f, s), and dividing by s_c gives centers in the unit c.
 
-    rig            a frame is a group; o_k = R_frame^T (center of the sensor in the rig), metric
-    fixed cameras  all of them are one group; o_k = their given centers
+    rig            a frame is a group; o_k = R_frame^T (center of the sensor in the rig), metric, one unit
+    fixed cameras  all of them are one group; o_k = their given centers, in the unit of rigs
+    piece          a model with a unit of its own; o_k = its cameras and points, turned into the world
     other camera   a group of its own; o_k = 0
 
 Rotations are known throughout, so a group only moves, it does not turn.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +33,9 @@ class RigidGroups:
     group_of: IntArray
     """(n,) the group of each node, 0..B-1, none of them empty."""
     offsets: FloatArray
-    """(n, d) o_k, world axes; all groups in one unit."""
+    """(n, d) o_k, world axes."""
+    unit_of: IntArray | None = None
+    """(B,) c, the unit of each group, 0..S-1, of which some node has an offset; None: all share one."""
 
     def __post_init__(self) -> None:
         labels = np.array(self.group_of, dtype=np.int64)
@@ -50,6 +53,8 @@ class RigidGroups:
             raise InputError("groups must be numbered 0, 1, ... without gaps")
         object.__setattr__(self, "group_of", frozen(labels))
         object.__setattr__(self, "offsets", frozen(offsets))
+        units = np.zeros(len(present)) if self.unit_of is None else self.unit_of
+        object.__setattr__(self, "unit_of", frozen(np.asarray(units, dtype=np.int64)))
 
     @property
     def num_nodes(self) -> int:
@@ -62,18 +67,39 @@ class RigidGroups:
         return int(self.group_of.max(initial=-1) + 1)
 
     @property
+    def units(self) -> IntArray:
+        """Unit of each node, (n,)."""
+        assert self.unit_of is not None
+        return np.asarray(self.unit_of[self.group_of])
+
+    @property
+    def num_units(self) -> int:
+        """Number of units, S."""
+        return int(np.max(self.units, initial=0) + 1)
+
+    @property
     def num_unknowns(self) -> int:
-        """Length of x, B d + 1."""
-        return int(self.num_groups * self.offsets.shape[1] + 1)
+        """Length of x, B d + S."""
+        return int(self.num_groups * self.offsets.shape[1] + self.num_units)
+
+    def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return f (B, d) and s (S,) of an x = (f, s)."""
+        d = self.offsets.shape[1]
+        return x[: self.num_groups * d].reshape(-1, d), x[self.num_groups * d :]
 
     def expand(self, x: FloatArray) -> FloatArray:
         """Return A x, the locations (n, d) for x = (f, s)."""
-        centers = x[:-1].reshape(-1, self.offsets.shape[1])
-        return np.asarray(centers[self.group_of] + x[-1] * self.offsets)
+        centers, scales = self.split(x)
+        return np.asarray(centers[self.group_of] + scales[self.units][:, None] * self.offsets)
 
     def reduce(self, g: FloatArray) -> FloatArray:
-        """Return A^T g for g (n, d): its sum over each group, and its inner product with the offsets."""
-        return np.append(self._sum(g).ravel(), np.vdot(g, self.offsets))
+        """Return A^T g for g (n, d): its sums over groups, and its inner products with offsets by unit."""
+        return np.append(self._sum(g).ravel(), self.along_units(g))
+
+    def along_units(self, g: FloatArray) -> FloatArray:
+        """Return the inner products (S,) of g (n, d) with the offsets in each unit."""
+        own = (self.units == c for c in range(self.num_units))
+        return np.array([np.vdot(g[rows], self.offsets[rows]) for rows in own])
 
     def _sum(self, values: FloatArray) -> FloatArray:
         """Return the sum of values (n, d) over each group, (B, d)."""
@@ -82,10 +108,11 @@ class RigidGroups:
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
         """Return x with A x nearest to locations (n, d), and its largest distance; s is 0 without offsets."""
         centered = self.center()
-        spread = float(np.sum(centered.offsets**2))
+        spreads = centered.along_units(centered.offsets)
         sizes = np.bincount(self.group_of)[:, None]
-        s = float(np.vdot(centered.offsets, locations)) / spread if spread > 0.0 else 0.0
-        x = np.append(((self._sum(locations) - s * self._sum(self.offsets)) / sizes).ravel(), s)
+        s = centered.along_units(locations) / np.where(spreads > 0.0, spreads, np.inf)
+        left = self._sum(locations) - s[self.unit_of][:, None] * self._sum(self.offsets)
+        x = np.append((left / sizes).ravel(), s)
         apart = np.linalg.norm(self.expand(x) - locations, axis=1)
         return x, float(apart.max(initial=0.0))
 
@@ -96,19 +123,22 @@ class RigidGroups:
         sizes = np.linalg.norm(moved, axis=1)
         largest = float(np.abs(self.offsets).max(initial=0.0))
         moved[sizes <= _COINCIDENT * largest] = 0.0
-        return RigidGroups(group_of=self.group_of, offsets=moved)
+        return replace(self, offsets=moved)
 
     def normalize(self) -> "RigidGroups":
-        """Return the same groups centered, in a unit in which their offsets have root mean square 1."""
-        centered = self.center()
+        """Return the same groups centered, in units in which their offsets have root mean square 1."""
+        centered, units = self.center(), self.units
         moved = np.linalg.norm(centered.offsets, axis=1)
-        size = float(np.sqrt(np.mean(moved[moved > 0.0] ** 2))) if moved.any() else 1.0
-        return RigidGroups(group_of=self.group_of, offsets=centered.offsets / size)
+        sizes = np.ones(self.num_units)
+        for unit in np.unique(units[moved > 0.0]).tolist():
+            sizes[unit] = np.sqrt(np.mean(moved[(moved > 0.0) & (units == unit)] ** 2))
+        return replace(centered, offsets=centered.offsets / sizes[units][:, None])
 
     def restricted_to(self, nodes: IntArray) -> "RigidGroups":
-        """Return the groups of some nodes, renumbered in the same order."""
-        _, labels = np.unique(self.group_of[nodes], return_inverse=True)
-        return RigidGroups(group_of=labels.ravel(), offsets=self.offsets[nodes])
+        """Return the groups of some nodes, renumbered in the same order, and their units."""
+        _, first, labels = np.unique(self.group_of[nodes], return_index=True, return_inverse=True)
+        _, units = np.unique(self.units[nodes][first], return_inverse=True)
+        return RigidGroups(group_of=labels.ravel(), offsets=self.offsets[nodes], unit_of=units.ravel())
 
     def joins(self, edges: IntArray) -> BoolArray:
         """Return which edges (m, 2) join two groups; those inside one say nothing of any unknown."""

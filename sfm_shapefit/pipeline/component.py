@@ -56,7 +56,7 @@ def locate_components(
 
     Why a frame belongs to none is written to `reasons`, which starts with one for each.
     """
-    models = []
+    models: list[MappedModel] = []
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
             located = _locate_component(run, members, averaging, relative)
@@ -65,10 +65,25 @@ def locate_components(
             continue
         names = tuple(run.images.names[k] for k in members.tolist())
         located = replace(located, loops=tuple(_loops_of(visits, run.images.names, set(names))))
-        models.append(MappedModel(located=located, averaging=averaging, names=names))
+        component = MappedModel(located=located, averaging=averaging, names=names)
+        models += _rigid_models(component, run.options.averaging.min_model_size)
         for k in frames.tolist():
             del reasons[k]
     return sorted(models, key=lambda model: -int(model.located.kept.sum()))
+
+
+def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
+    """Yield the model of a component, and those of its further rigid pieces with so many cameras.
+
+    The pairs between them tell no scale, but a join may, and `locate` of one cannot.
+    """
+    large = [piece for piece in component.located.further if int(piece.kept.sum()) >= least]
+    rest = tuple(piece for piece in component.located.further if piece not in large)
+    yield replace(component, located=replace(component.located, further=rest))
+    for piece in large:
+        rows = np.sort(piece.placement.cameras)
+        names = tuple(component.names[k] for k in rows.tolist())
+        yield MappedModel(located=piece, averaging=component.averaging.subset(rows), names=names)
 
 
 def _locate_component(

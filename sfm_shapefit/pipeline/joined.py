@@ -12,32 +12,31 @@ The verdict is no better than that of any of the models.
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, compose
-from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.joins import Joined
-from sfm_shapefit.facts.map_result import JoinedModel, MappedModel
+from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.model import EarthDatum, JoinedFacts
 from sfm_shapefit.facts.placed import UNITS, KeyFigures
+from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.gauge_choice import gauge_of_distances
-from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
+from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
-from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.matches import Matches, PairNames
 
 if TYPE_CHECKING:
     import pycolmap
@@ -48,16 +47,20 @@ _SIGMA_OF = (
 )
 # What says how large a model is; another scale has no meaning beside that of a known distance.
 _ARBITRARY = ("unit", "input")
+_SAME = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
 
 
-class ToldOfJoins(NamedTuple):
-    """What the user told of images of several models."""
+class Told(NamedTuple):
+    """What is known of joined models beside the models."""
 
-    priors: PositionPriors | None = None
-    """Position priors of the images; None: those of the database, if it has any."""
+    joins: Sequence[Joined]
+    """What came of joining each model to another."""
+    options: Mapping[str, Any]
+    inputs: Inputs
+    """Where matches come from."""
     distances: Sequence[KnownDistance] = ()
-    left_out: PairNames = frozenset()
-    """Pairs of images whose matches say nothing."""
+    located: Mapping[int, LocateResult] = MappingProxyType({})
+    """The models by number, as far as they are ours, with what is known of their cameras."""
 
 
 class JoinedGroup(NamedTuple):
@@ -70,60 +73,52 @@ class JoinedGroup(NamedTuple):
 
 
 def tell_group(
-    group: JoinedGroup,
-    models: Sequence[MappedModel],
-    matches: Matches,
-    told: ToldOfJoins,
-    clock: Clock,
+    group: JoinedGroup, told: Told, source: MatchSource, options: DirectionOptions, clock: Clock
 ) -> JoinedModel:
     """Return joined models with what can be said of them.
 
     Args:
         group: the models.
-        models: all models of the run, by number.
-        matches: of all their images.
-        told: what is known of the images beside.
+        told: what is known beside.
+        source: of the matches of the models' images.
+        options: how directions are measured.
         clock: what it takes is added to its seconds.
     """
-    located, known = models[next(iter(group.world_from))].located, told.distances
-    gauge, rescale = _choose_scale(group, located.gauge, known)
-    group = _rescaled(group, rescale)
-    model, database = read_model(group.reconstruction), cast("Path", located.inputs.database)
-    inputs = replace(inputs_from(database), left_out=told.left_out)
-    own = Clock(clock.progress)
-    found = check_source(model, see_matches(matches, model.images, inputs), located.options.directions, own)
-    cameras = list(_camera_rows(found.cameras, group, models))
+    first, located = next(iter(group.world_from)), told.located
+    labels = {
+        k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
+    }
+    folder = f"joined_{first}" if located else "."
+    gauge = Gauge(scale="input", similarity=_SAME, statement="input: that of the first model")
+    if first in located:
+        gauge, rescale = _choose_scale(group, located[first].gauge, told.distances)
+        group = _rescaled(group, rescale)
+    model = read_model(group.reconstruction)
+    found = check_source(model, source.at(model.images), options, clock)
     seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
-    first = next(iter(group.world_from))
-    facts = JoinedFacts(
-        inputs=inputs.facts,
-        options=flat_values(located.options) | {"known_distance": tuple(known)},
-        verdict=_judge(seen.verdict, group, models),
-        evidence=seen.evidence,
-        models=[str(number) for number in group.world_from],
-        joins=[join.facts(f"joined_{first}") for join in group.joins],
+    cameras = list(_camera_rows(found.cameras, group, located))
+    facts = JoinedFacts.taken_from(
+        seen,
+        inputs=told.inputs.facts,
+        options=dict(told.options),
+        verdict=_judge(seen.verdict, group, located),
+        models=[labels[number].removeprefix("model ") for number in group.world_from],
+        joins=[one.facts(folder if one.join and one.model in labels else None) for one in told.joins],
         num_images=len(cameras),
         num_placed=group.reconstruction.num_reg_images(),
-        num_pairs=len(found.pairs),
-        num_points=group.reconstruction.num_points3D(),
         figures=KeyFigures.of_cameras(cameras, seen.figures.pair_error_deg, *measures),
-        sigma_of=_SIGMA_OF,
-        residual_level_deg=seen.residual_level_deg,
-        mean_reprojection_error_px=seen.mean_reprojection_error_px,
-        median_track_length=seen.median_track_length,
+        sigma_of=_SIGMA_OF if located else "",
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
-        known_distances=told_distances(known, group.reconstruction),
+        known_distances=told_distances(told.distances, group.reconstruction),
         datum=EarthDatum.of(gauge.datum),
-        pieces=[],
-        loose_groups=[],
-        timings_s=own.seconds,
+        timings_s=clock.seconds,
         warnings=[*seen.warnings, *filter(None, [gauge.warning])],
-        versions=seen.versions,
     )
     return JoinedModel(
         reconstruction=group.reconstruction,
         models=tuple(group.world_from),
+        joins=tuple(told.joins),
         cameras=cameras,
         pairs=found.pairs,
         facts=facts,
@@ -164,19 +159,21 @@ def _rescaled(group: JoinedGroup, similarity: Similarity | None) -> JoinedGroup:
 
 
 def _camera_rows(
-    checked: Sequence[CameraRow], group: JoinedGroup, models: Sequence[MappedModel]
+    checked: Sequence[CameraRow], group: JoinedGroup, located: Mapping[int, LocateResult]
 ) -> Iterator[CameraRow]:
     """Yield the rows of the cameras that stand in the joined model, then those of the other images."""
-    own = {row.name: (row, number) for number in group.world_from for row in models[number].located.cameras}
+    numbers = [number for number in group.world_from if number in located]
+    own = {row.name: (row, number) for number in reversed(numbers) for row in located[number].cameras}
     variances = _variances_of_joins(group)
     for seen in checked:
-        if not seen.placed:
+        if not seen.placed or seen.name not in own:
+            yield seen
             continue
         row, number = own[seen.name]
         sigma, correlation = _errors(row, group.world_from[number], variances[number])
         reasons = [reason for reason in (row.reason, seen.reason) if reason]
         yield replace(seen, reason="; ".join(reasons), trust=row.trust, sigma=sigma, correlation=correlation)
-    placed = {row.name for row in checked if row.placed}
+    placed = {row.name for row in checked}
     for name, (row, _) in own.items():
         if name not in placed:
             yield CameraRow(name=name, reason=row.reason, trust=row.trust)
@@ -185,7 +182,7 @@ def _camera_rows(
 def _variances_of_joins(group: JoinedGroup) -> dict[int, float]:
     """Return what the joins add to the variance of a center along an axis, by the number of its model."""
     found = dict.fromkeys(group.world_from, 0.0)
-    for done in group.joins:  # ascending, so that the larger model is there
+    for done in group.joins:  # ascending, so that the model that it is joined to is there
         assert done.join is not None
         sigma = group.world_from[done.to].scale * done.join.center_sigma
         found[done.model] = found[done.to] + sigma**2 / 3.0
@@ -205,9 +202,9 @@ def _errors(
     return tuple(sigmas.tolist()), tuple(correlations_of(covariance)[0].tolist())
 
 
-def _judge(seen: ModelVerdict, group: JoinedGroup, models: Sequence[MappedModel]) -> ModelVerdict:
+def _judge(seen: ModelVerdict, group: JoinedGroup, located: Mapping[int, LocateResult]) -> ModelVerdict:
     """Return the verdict: what was seen of the joined model, and those of its models."""
-    verdicts = {number: models[number].located.verdict for number in group.world_from}
+    verdicts = {number: located[number].verdict for number in group.world_from if number in located}
     grades = [verdict.grade for verdict in verdicts.values()]
     worst = max([seen.grade, *grades], key=list(Grade).index)
     named = (verdict.cameras for verdict in (*verdicts.values(), seen))

@@ -22,8 +22,7 @@ from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.component import locate_components, refine_intrinsics
-from sfm_shapefit.pipeline.joined import ToldOfJoins
-from sfm_shapefit.pipeline.joins import JoinedModels, join_models
+from sfm_shapefit.pipeline.join_mapped import JoinedModels, join_mapped
 from sfm_shapefit.pipeline.map_run import MapRun, start_run
 from sfm_shapefit.rotations.sequences import Videos, Visit
 
@@ -80,8 +79,7 @@ def _map_opened(run: MapRun) -> MapResult:
     found = JoinedModels((), ())
     if options.join == "safe":
         with clock("join"):
-            told = ToldOfJoins(run.known.priors, options.gauge.known_distance, run.without)
-            found = join_models(models, run.images, run.matches, told, clock)
+            found = join_mapped(models, run)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)

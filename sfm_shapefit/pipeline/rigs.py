@@ -23,8 +23,7 @@ from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import Near, Placement, place_pieces
-from sfm_shapefit.placement.tied_groups import is_scaled
+from sfm_shapefit.placement.place import Near, Placement, is_scaled, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.rigs.solve import refuse_admm

@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.record import write_json
 from sfm_shapefit.base.settings import Settings, explained, merge_options, option
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
-from sfm_shapefit.facts.placed import folder_of
+from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.rows import own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
@@ -40,7 +40,7 @@ class WriteOptions(Settings):
 
 
 def write_result(
-    found: LocateResult | GraphResult | MapResult,
+    found: LocateResult | GraphResult | MapResult | JoinedModel,
     out: Path | str,
     *,
     options: WriteOptions | None = None,
@@ -50,7 +50,7 @@ def write_result(
     """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
 
     Args:
-        found: what `locate`, `map_database` or `place_graph_file` returned.
+        found: what `locate`, `map_database`, `join` or `place_graph_file` returned.
         out: the folder to be made.
         options: settings, see `help(WriteOptions)`; defaults if None.
         further_files: the text of more files, by their path in the folder.
@@ -73,11 +73,16 @@ def write_result(
                 (folder / joined.folder).mkdir()
                 _write_joined(joined, folder / joined.folder, options)
             write_json(found.summary(), folder / MAP_MARKER)
+        elif isinstance(found, JoinedModel):
+            _write_joined(found, folder, options)
         else:
             _write_files(found, folder, options)
 
 
-def _inputs_of(found: LocateResult | GraphResult | MapResult) -> list[Path]:
+def _inputs_of(found: LocateResult | GraphResult | MapResult | JoinedModel) -> list[Path]:
+    if isinstance(found, JoinedModel):
+        read = found.facts.inputs
+        return [Path(path) for path in (read.model, read.database) if path and path != IN_MEMORY]
     if isinstance(found, LocateResult):
         return [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     return [found.database if isinstance(found, MapResult) else found.path]

@@ -1,419 +1,359 @@
-"""Two models joined: the similarity between their worlds, its uncertainty, and when it is refused.
+"""Pieces joined where evidence that the join did not use speaks for it; else refused, with the reason.
 
-Directions end at the border of a model, and so does its scale. Two models are still tied by matches between
-their images, too few to be pairs of one model, or by positions that are known of cameras of both. From either
-comes the similarity first_from_second, y = s R x + t, by a robust fit to more than it needs; its standard
-deviations are those of a jackknife, which leaves out one witness (a pair of images, a position) after the
-other, so that errors which the matches of a pair share count once:
+    votes       the turn between two pieces that most of their pairs agree on
+    program     scales and places of all pieces at once, over directions and rays to points
+    refinement  all seven unknowns of each, by the rays
+    judge       pairs that agree: most of their matches that were set aside fit within a few pixels
+    rivals      whether pairs that do not agree do so among themselves on another join
 
-    variance = (m - 1) / m sum_i (theta_i - theta)^2        (Efron, Stein 1981, "The jackknife")
-
-A join is refused where it is not over-determined; where pairs that contradict it agree among themselves on
-another one, as those of a thing that stands there twice do; or where scale, turn or place stay too uncertain.
-Two models whose scales are known, as those of rigs, are joined by a rigid motion.
+Shares of matches do not tell right joins from wrong ones: the matches of a wrong pair agree with the place
+that its other matches made. Other pairs do, so that three are asked for, not all of one image, which may be
+taken for another wherever it is matched; an image that both pieces have counts as two, for it knows its turn
+and its place. Where as many as a quarter of the pairs that agree do so on another join, nothing says which is
+right, and these pairs count for neither; a piece may still be joined by its pairs with a third one.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.geometry import (
-    Similarity,
-    compose,
-    fit_similarity,
-    fits_of_few_points,
-    invert,
-    mean_rotation_l1,
-    median_spread,
-    normalized,
-    rotation_angles_deg,
-)
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.placement.gauge import fit_to_priors, prior_gauge
-from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
+from sfm_shapefit.placement.piece_program import (
+    Standing,
+    misses_px,
+    refine_pieces,
+    residuals_of,
+    solve_pieces,
+)
+from sfm_shapefit.placement.piece_ties import (
+    PieceCameras,
+    PieceTies,
+    Votes,
+    collect_votes,
+    direct_ties,
+    turn_pieces,
+)
 
-FEWEST_WITNESSES = 3
-"""Pairs of images, or known positions in each model, that a join needs; two leave nothing to check it by."""
-_FEWEST_MATCHES = 24  # matches of a pair that can be a witness; fewer are chance
-_FEWEST_POINTS = 6  # points that both models have; from fewer no start is drawn
-_LEAST_RIVAL_SHARE = 0.25  # share of the best join's pairs; from here on another join is a rival
-_MOST_AGAINST = 3.0  # pairs that contradict the best join, per agreeing pair; beyond, it is refused
-# Turns that single pairs suggest agree up to the first; the second is how many groups of them are tried.
-_SAME_TURN_DEG = 5.0
-_MOST_TURNS = 8  # groups of turns that are tried; bounds the time where single pairs scatter
-_LARGEST_SCALE_SIGMA = 0.05  # relative standard deviation of the scale; above, the join is refused
-_LARGEST_TURN_SIGMA_DEG = 3.0  # degrees, standard deviation of the turn; above, the join is refused
-_LARGEST_CENTER_SIGMA = 0.1  # standard deviation of the place in spreads of the second model; likewise
-_NUM_SAMPLES = 256  # draws of few points; if half are good, none of these is with odds 1e-15
-_NUM_REFINED = 4  # draws; only the best are refined
-_REWEIGHTINGS = 20  # steps, a bound; weights settle in fewer
-_MOST_MATCHES = 1_000  # matches; more make the fit no better
-_MOST_FITS = 12  # groups by which witnesses are left out; each is a fit of its own
+FEWEST_PAIRS = 3
+"""Agreeing pairs that a join needs; a wrong one has two by chance, and two leave nothing to check it by."""
+_SHARED = 2  # pairs; an image that both pieces have knows its turn and its place
+_MOST_TURNS = 4  # turns between two pieces that are tried; bounds the time where single votes scatter
+_RIVAL_SHARE = 0.25  # share of the agreeing pairs; from as many rivals on nothing says which join is right
+_FEWEST_RIVALS = 2  # pairs that agree on another join, and are named; one always agrees with itself
+AGREEING_PX = 4.0
+"""Pixels by which a match may miss; pieces bend by as much, and wrong pairs miss by hundreds."""
+_LARGEST_SCALE_SIGMA = 0.03  # relative; above, joins come out wrong
+_LARGEST_TURN_SIGMA_DEG = 3.0  # degrees; above, the join is refused
+_LARGEST_CENTER_SIGMA = 0.1  # sizes of the piece; above, the join is refused
+UNTIED = "no pair of images ties it to another"
+"""Why a piece is not joined of which nothing is known."""
+
+
+def _none() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ModelJoin:
-    """How a second model stands in the world of a first one."""
+class PieceJoin:
+    """How a piece stands in the world of another, and how surely."""
 
-    first_from_second: Similarity
+    piece: int
+    to: int
+    """The piece whose world it is."""
+    to_from_piece: Similarity
     scale_sigma: float
     """Relative standard deviation of its scale."""
     turn_sigma_deg: float
-    """Standard deviation of the angle by which its rotation is off."""
     center_sigma: float
-    """Median standard deviation of the second model's cameras, in units of the first."""
-    evidence: str
+    """Standard deviation of the middle of its cameras, in units of the other piece."""
+    agreeing: IntArray = field(default_factory=_none)
+    """Pairs, rows of the ties, between it and the other pieces in that world that agree with it."""
+    contradicting: IntArray = field(default_factory=_none)
+    """Pairs between it and these that do not agree."""
+    rivals: IntArray = field(default_factory=_none)
+    """Pairs among these that agree on another join."""
+    evidence: str = ""
     """What it rests on, in words."""
-    agreeing: BoolArray | None = None
-    """(k,) which of the matches between the models agree with it; None if it does not rest on matches."""
+    reason: str = ""
+    """Why it is refused, a clause; nothing if it is not."""
 
 
-class Ties(NamedTuple):
-    """k matches between images of two models: the rays of each, and the points it is seen to be of."""
+def uncertainty(scale_sigma: float, turn_sigma_deg: float, center_sigma: float) -> str:
+    """Say what of a join is too uncertain, a clause; nothing if it is known well enough.
 
-    eyes_first: FloatArray
-    """(k, 3) center of the first model's camera."""
-    eyes_second: FloatArray
-    """(k, 3) center of the second one's."""
-    rays_first: FloatArray
-    """(k, 3) unit rays in the first model's world."""
-    rays_second: FloatArray
-    """(k, 3) in the second one's."""
-    points_first: FloatArray
-    """(k, 3) NaN where the keypoint observes no point."""
-    points_second: FloatArray
-    """(k, 3)"""
-    pairs: IntArray
-    """(k,) the pair of images of each match, any numbers."""
-    tolerances: FloatArray
-    """(k,) radians by which a ray may miss."""
-
-    def subset(self, rows: BoolArray | IntArray) -> "Ties":
-        """Return some of the matches."""
-        return Ties(
-            self.eyes_first[rows],
-            self.eyes_second[rows],
-            self.rays_first[rows],
-            self.rays_second[rows],
-            self.points_first[rows],
-            self.points_second[rows],
-            self.pairs[rows],
-            self.tolerances[rows],
-        )
-
-
-def join_by_matches(
-    ties: Ties, turns: FloatArray, centers: FloatArray, metric_sigma: float | None = None
-) -> ModelJoin:
-    """Return the join of two models by matches between their images, which are too few to be pairs alone.
-
-    A match whose keypoint in one model observes a point says where that is seen from the other; where neither
-    observes one, both rays and the two centers lie in a plane. UnsolvableError, whose message is the reason,
-    a clause, if it is not safe.
-
-    Args:
-        ties: the matches.
-        turns: (h, 3, 3) rotations first_from_second that single pairs of images suggest.
-        centers: (n, 3) of the second model's cameras.
-        metric_sigma: relative standard deviation of the scale between the models, which is 1, if both are
-            metric.
+    The standard deviations are those of the scale, relative, of the turn, and of the place in sizes of the
+    piece.
     """
-    metric = metric_sigma is not None
-    num_matches, num_pairs = len(ties.pairs), len(np.unique(ties.pairs))
-    if num_matches < _FEWEST_MATCHES or num_pairs < FEWEST_WITNESSES:
-        raise UnsolvableError(
-            f"between them are {num_matches} matches of {counted(num_pairs, 'pair')} of images, and a join "
-            f"needs {_FEWEST_MATCHES} of {FEWEST_WITNESSES}"
-        )
-    used = ties.subset(np.arange(0, num_matches, -(-num_matches // _MOST_MATCHES)))
-    best = _search(used, turns, metric=metric)
-    agreeing = _misses(best, ties) <= 1.0
-    supporting = _supporting_pairs(ties.pairs, agreeing)
-    if agreeing.sum() < _FEWEST_MATCHES or len(supporting) < FEWEST_WITNESSES:
-        raise UnsolvableError(
-            f"no more than {len(supporting)} of {num_pairs} pairs of images between them agree on one join"
-        )
-    _refuse_rivals(used.subset(~np.isin(used.pairs, supporting)), turns, len(supporting), metric=metric)
-    right = used.subset(np.isin(used.pairs, supporting))
-    fits = [
-        _refine(best, right.subset(~np.isin(right.pairs, some)), metric=metric)
-        for some in _groups_left_out(supporting)
-    ]
-    evidence = (
-        f"{int(agreeing.sum())} of {num_matches} matches between them, of {len(supporting)} of "
-        f"{num_pairs} pairs of images"
-    )
-    join = _with_errors(best, [fits], centers, evidence, agreeing)
-    if metric_sigma is not None:
-        # Errors of the size of the second model move its cameras about their middle.
-        spread = metric_sigma * median_spread(centers)
-        place = float(np.hypot(join.center_sigma, spread))
-        join = replace(join, scale_sigma=metric_sigma, center_sigma=place)
-    refuse_uncertain(join, centers)
-    return join
+    if scale_sigma > _LARGEST_SCALE_SIGMA:
+        return f"the scale between them is known to {scale_sigma:.0%} only"
+    if turn_sigma_deg > _LARGEST_TURN_SIGMA_DEG:
+        return f"the turn between them is known to {turn_sigma_deg:.2g} deg only"
+    if center_sigma > _LARGEST_CENTER_SIGMA:
+        return f"where one stands beside the other is known to {center_sigma:.0%} of its size only"
+    return ""
 
 
-class PlacedByPriors(NamedTuple):
-    """A model on the position priors of its cameras, and how well it stands there."""
+def join_pieces(cameras: PieceCameras, ties: PieceTies) -> dict[int, PieceJoin | str]:
+    """Return what comes of joining each piece but the first to an earlier one.
 
-    centers: FloatArray
-    """(n, 3) centers of its cameras, in its world."""
-    priors_from_model: Similarity
-    parts: tuple[Similarity, ...]
-    """The same without some of the priors in turn."""
-    num_priors: int
-
-
-def place_by_priors(centers: FloatArray, priors: PositionPriors) -> PlacedByPriors:
-    """Return a model, cameras at `centers` (n, 3), on their position priors, for `join_by_priors`.
-
-    UnsolvableError, whose message is the reason, a clause, if they are few, lie on a line, or do not fit.
+    A join may be refused; where there was none to judge, the reason stands in its place.
     """
-    best, parts = _fit_priors(centers, priors)
-    return PlacedByPriors(centers, best, tuple(parts), len(priors))
+    whole = _Evidence.of(cameras, ties)
+    told: dict[int, PieceJoin | str] = {}
+    waiting = np.arange(cameras.num_pieces)
+    while len(waiting) > 1:
+        rest = waiting[1:]
+        grown = dict(_grow(whole.part(waiting)))
+        accepted = [k for k, join in grown.items() if isinstance(join, PieceJoin) and not join.reason]
+        for k in rest.tolist():
+            if k in accepted or k not in told or told[k] == UNTIED:
+                told[k] = grown.get(k, UNTIED)
+        waiting = np.setdiff1d(rest, accepted)
+    return told
 
 
-def join_by_priors(first: PlacedByPriors, second: PlacedByPriors) -> ModelJoin:
-    """Return the join of two models by position priors; UnsolvableError, the reason, if it is not safe."""
-    one, other = first.priors_from_model, second.priors_from_model
-    errors = [[_chain(part, other) for part in first.parts], [_chain(one, part) for part in second.parts]]
-    evidence = f"position priors of {first.num_priors} and {second.num_priors} cameras"
-    join = _with_errors(_chain(one, other), errors, second.centers, evidence)
-    refuse_uncertain(join, second.centers)
-    return join
+class _Evidence(NamedTuple):
+    """Ties between pieces in two parts, to place by and to judge by, and the turns that they vote for."""
 
+    cameras: PieceCameras
+    ties: PieceTies
+    aside: PieceTies
+    votes: Votes
+    numbers: IntArray
+    """Numbers of the pieces among all."""
+    rows: IntArray
+    """Numbers of the pairs among all."""
 
-def refuse_uncertain(join: ModelJoin, centers: FloatArray) -> None:
-    """Raise UnsolvableError if a join of a model with these centers (n, 3) is too uncertain."""
-    size = join.first_from_second.scale * median_spread(centers)
-    if join.scale_sigma > _LARGEST_SCALE_SIGMA:
-        raise UnsolvableError(f"the scale between them is known to {join.scale_sigma:.0%} only")
-    if join.turn_sigma_deg > _LARGEST_TURN_SIGMA_DEG:
-        raise UnsolvableError(f"the turn between them is known to {join.turn_sigma_deg:.2g} deg only")
-    if join.center_sigma > _LARGEST_CENTER_SIGMA * size:
-        raise UnsolvableError(
-            f"where one stands beside the other is known to {join.center_sigma / size:.0%} of its size only"
+    @classmethod
+    def of(cls, cameras: PieceCameras, ties: PieceTies) -> "_Evidence":
+        """Set matches aside, and collect the votes of the others."""
+        used, aside = ties.split()
+        votes = collect_votes(cameras, used)
+        return cls(cameras, used, aside, votes, np.arange(cameras.num_pieces), np.arange(ties.num_pairs))
+
+    @property
+    def pieces(self) -> IntArray:
+        """Pieces of each pair, (k, 2)."""
+        return self.votes.pieces
+
+    def touches(self, number: int) -> bool:
+        """Return whether a pair ties a piece, by its number among all, to the first."""
+        return bool((self.numbers[self.pieces] == [self.numbers[0], number]).all(axis=1).any())
+
+    def weigh(self, agreeing: BoolArray) -> int:
+        """Return what agreeing pairs (k,) of two pieces count: all that have one image in common, one."""
+        chosen = np.flatnonzero(agreeing)
+        shared = self.ties.is_shared[chosen]
+        ends = self.ties.matches.pairs[chosen]
+        has_one = len(ends) > 0 and bool((ends == ends[0]).all(axis=0).any())
+        return int(np.sum(np.where(shared, _SHARED, 1))) if not has_one or shared.any() else 1
+
+    def part(self, pieces: IntArray, chosen: BoolArray | None = None) -> "_Evidence":
+        """Return some pieces, by their numbers among all, and their pairs, or the chosen ones (k,)."""
+        here = np.isin(self.numbers, pieces)
+        own = here[self.cameras.piece_of]
+        new, camera_of = np.cumsum(here) - 1, np.cumsum(own) - 1
+        kept = np.asarray(here[self.pieces].all(axis=1) & (True if chosen is None else chosen))
+        turns, *known = (column[kept] for column in self.votes[1:])
+        votes = Votes(new[self.pieces[kept]], turns, *known)
+        return _Evidence(
+            self.cameras.subset(own, new[self.cameras.piece_of[own]], here),
+            self.ties.subset(kept).renumbered(camera_of),
+            self.aside.subset(kept).renumbered(camera_of),
+            votes,
+            self.numbers[here],
+            self.rows[kept],
         )
 
 
-def _chain(priors_from_first: Similarity, priors_from_second: Similarity) -> Similarity:
-    return compose(invert(priors_from_first), priors_from_second)
+class _Joint(NamedTuple):
+    """Pieces in the world of the first, and which pairs agree."""
+
+    evidence: _Evidence
+    standing: Standing
+    covariances: FloatArray
+    agrees: BoolArray
+    """(k,)"""
+
+    def support(self, counted: BoolArray) -> IntArray:
+        """Return how many agreeing pairs are between every two pieces, (G, G), of those that count (k,)."""
+        pieces, count = self.evidence.pieces, self.evidence.cameras.num_pieces
+        support = np.zeros((count, count), dtype=np.int64)
+        for first, second in np.unique(pieces, axis=0).tolist():
+            own = (pieces == [first, second]).all(axis=1)
+            support[first, second] = support[second, first] = self.evidence.weigh(own & self.agrees & counted)
+        return support
 
 
-def _fit_priors(centers: FloatArray, priors: PositionPriors) -> tuple[Similarity, list[Similarity]]:
-    """Return a model's map onto its priors, and maps that leave out some; UnsolvableError if none is good."""
-    if len(priors) <= FEWEST_WITNESSES:
-        raise UnsolvableError(
-            f"one of them has {counted(len(priors), 'position prior')}, and a join needs "
-            f"{FEWEST_WITNESSES + 1} in each"
-        )
-    try:
-        gauge = prior_gauge(centers, priors, axes_known=False)
-    except InputError as error:
-        raise UnsolvableError(str(error)) from error
-    if gauge.warning or gauge.axes is None:
-        raise UnsolvableError(gauge.warning)
-    source, target = centers[priors.known.indices], priors.known.positions
-    best, weights, _ = fit_to_priors(source, priors, median_spread(target), rotate=True)
-    parts = [
-        fit_similarity(source, target, np.where(np.isin(np.arange(len(target)), left_out), 0.0, weights))
-        for left_out in _groups_left_out(np.arange(len(target)))
-    ]
-    return best, parts
+def _search(evidence: _Evidence, enough: int) -> _Joint:
+    """Place pieces; two, of which fewer pairs agree than are enough, by other turns that are voted for too.
+
+    Raises:
+        UnsolvableError: as `_place`, if the first turn leads to none.
+    """
+    best = latest = _place(evidence)
+    rest = best.evidence
+    for _ in range(_MOST_TURNS - 1):
+        if rest.cameras.num_pieces > 2 or best.evidence.weigh(best.agrees) >= enough:
+            break
+        turn = latest.standing.turns[0].T @ latest.standing.turns[1]
+        off_deg = rotation_angles_deg(rest.votes.turns @ turn.T)
+        rest = rest.part(rest.numbers, ~(off_deg <= AGREEMENT_DEG))
+        try:
+            latest = _place(rest)
+        except UnsolvableError:
+            break
+        agrees = _agreeing(best.evidence, latest.standing)
+        if best.evidence.weigh(agrees) > best.evidence.weigh(best.agrees):
+            best = best._replace(standing=latest.standing, covariances=latest.covariances, agrees=agrees)
+    return best
 
 
-def _groups_left_out(witnesses: IntArray) -> list[IntArray]:
-    """Return the witnesses in groups, of which each is left out once."""
-    count = min(len(witnesses), _MOST_FITS)
-    return [witnesses[k::count] for k in range(count)]
+def _place(evidence: _Evidence) -> _Joint:
+    """Place all pieces that are tied to the first, and see which pairs agree.
+
+    Raises:
+        UnsolvableError: if none is tied to it, or the program has no answer.
+    """
+    turns = turn_pieces(evidence.votes, evidence.cameras.num_pieces)
+    turned = np.isfinite(turns).all(axis=(1, 2))
+    if np.sum(turned) < 2:
+        raise UnsolvableError("no pair of images between them tells the turn between them")
+    if not turned.all():
+        return _place(evidence.part(evidence.numbers[turned]))
+    directions = direct_ties(evidence.cameras, evidence.ties, turns)
+    used = np.union1d(directions.usable(), np.flatnonzero(evidence.ties.is_shared))
+    labels = connected_components(evidence.cameras.num_pieces, evidence.pieces[used])
+    tied = labels == labels[0]
+    if np.sum(tied) < 2:
+        raise UnsolvableError("no pair of images between them has a direction")
+    if not tied.all():
+        return _place(evidence.part(evidence.numbers[tied]))
+    standing = solve_pieces(evidence.cameras, evidence.ties, directions, turns)
+    standing, covariances = refine_pieces(evidence.cameras, evidence.ties.subset(used), standing)
+    return _Joint(evidence, standing, covariances, _agreeing(evidence, standing))
 
 
-def _supporting_pairs(pairs: IntArray, agreeing: BoolArray) -> IntArray:
-    """Return the pairs of which most matches agree, ascending."""
-    names, place, counts = np.unique(pairs, return_inverse=True, return_counts=True)
-    return np.asarray(names[2.0 * np.bincount(place, agreeing, len(counts)) > counts])
+def _agreeing(evidence: _Evidence, standing: Standing) -> BoolArray:
+    """Return of which pairs more than half of the matches that were set aside fit."""
+    residuals = residuals_of(evidence.cameras, evidence.aside)
+    fits = misses_px(residuals, standing) <= AGREEING_PX
+    count = evidence.ties.num_pairs
+    rows = np.bincount(residuals.pairs, minlength=count)
+    return np.asarray(2 * np.bincount(residuals.pairs, fits, count) > rows)
 
 
-def _search(ties: Ties, turns: FloatArray, *, metric: bool) -> Similarity:
-    """Return the similarity of least cost of all that the matches suggest; of scale 1 if it is `metric`."""
-    starts = sorted(_starts(ties, turns, metric=metric), key=lambda fit: _cost(fit, ties))[:_NUM_REFINED]
-    if not starts:
-        raise UnsolvableError("the matches between them suggest no common scale")
-    return min((_refine(start, ties, metric=metric) for start in starts), key=lambda fit: _cost(fit, ties))
-
-
-def _refuse_rivals(rest: Ties, turns: FloatArray, num_supporting: int, *, metric: bool) -> None:
-    """Raise UnsolvableError if pairs that contradict a join agree among themselves on another one."""
-    num_against = len(np.unique(rest.pairs))
-    if num_against > _MOST_AGAINST * num_supporting:
-        raise UnsolvableError(
-            f"{num_against} of {num_against + num_supporting} pairs of images between them contradict the "
-            "join that most want"
-        )
-    if num_against < _LEAST_RIVAL_SHARE * num_supporting or len(rest.pairs) < _FEWEST_MATCHES:
-        return
-    try:
-        rival = _search(rest, turns, metric=metric)
-    except UnsolvableError:
-        return
-    num_rivals = len(_supporting_pairs(rest.pairs, _misses(rival, rest) <= 1.0))
-    if num_rivals >= max(_LEAST_RIVAL_SHARE * num_supporting, 2):
-        raise UnsolvableError(
-            f"two joins are possible: {counted(num_supporting, 'pair')} of images between them agree on one, "
-            f"{num_rivals} on another"
-        )
-
-
-def _starts(ties: Ties, turns: FloatArray, *, metric: bool) -> Iterator[Similarity]:
-    """Yield similarities that a few points of both models, or the rotation of a pair, suggest."""
-    for fit in _free_starts(ties, turns):
-        if not metric:
-            yield fit
-            continue
-        # The same motion without its scaling, about the middle of the second model's cameras.
-        middle = ties.eyes_second.mean(axis=0)
-        shift = fit.apply(middle[None])[0] - fit.rotation @ middle
-        yield Similarity(scale=1.0, rotation=fit.rotation, translation=shift)
-
-
-def _free_starts(ties: Ties, turns: FloatArray) -> Iterator[Similarity]:
-    """Yield the same, of any scale."""
-    both = np.asarray(np.isfinite(ties.points_first + ties.points_second).all(axis=1), dtype=np.bool_)
-    if both.sum() >= _FEWEST_POINTS:
-        points = ties.subset(both)
-        fits = fits_of_few_points(points.points_second, points.points_first, rotate=True, count=_NUM_SAMPLES)
-        yield from (fit for fit in fits if fit.scale > 0.0)
-    for turn in _frequent_turns(turns):
-        scale, *shift = _solve_scale_and_shift(ties, turn).tolist()
-        if scale > 0.0:
-            yield Similarity(scale=scale, rotation=turn, translation=np.array(shift))
-
-
-def _frequent_turns(turns: FloatArray) -> Iterator[FloatArray]:
-    """Yield the turn that most of the turns (h, 3, 3) agree with, then that of the others, and so on."""
-    for _ in range(_MOST_TURNS):
-        if not len(turns):
+def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
+    """Yield what comes of joining pieces to the first, by their numbers among all."""
+    while True:
+        try:
+            joint = _search(evidence, FEWEST_PAIRS)
+        except UnsolvableError as error:
+            yield from ((k, str(error)) for k in evidence.numbers[1:].tolist() if evidence.touches(k))
             return
-        apart = rotation_angles_deg(turns[:, None].transpose(0, 1, 3, 2) @ turns[None])
-        near = apart <= _SAME_TURN_DEG
-        chosen = int(np.argmax(near.sum(axis=1)))
-        yield mean_rotation_l1(turns[near[chosen]])
-        turns = turns[~near[chosen]]
+        joins = list(_judge(joint))
+        accepted = [join.piece for join in joins if not join.reason]
+        yield from ((join.piece, join) for join in joins if join.reason)
+        if len(accepted) == len(joins):
+            yield from ((join.piece, join) for join in joins)
+            return
+        if not accepted:
+            return
+        evidence = evidence.part(np.append(evidence.numbers[0], accepted))
 
 
-def _solve_scale_and_shift(ties: Ties, turn: FloatArray) -> FloatArray:
-    """Return scale and shift (4,) of a similarity of known rotation, by reweighted least squares (L1).
-
-    Each tie is linear in them: a ray u meets a point of the other model, or normal n = u_first x u_second is
-    orthogonal to the baseline.
-    """
-    eyes, rays = ties.eyes_second @ turn.T, ties.rays_second @ turn.T
-    points = ties.points_second @ turn.T
-    into_second = cross_matrices(rays)
-    into_first = cross_matrices(ties.rays_first)
-    normals = np.cross(ties.rays_first, rays)[:, None, :]
-    matrices, targets = [], []
-    for across, moved, aim, there in (
-        (into_second, eyes, ties.points_first, np.isfinite(ties.points_first).all(axis=1)),
-        (into_first, points, ties.eyes_first, np.isfinite(points).all(axis=1)),
-        (normals, eyes, ties.eyes_first, np.ones(len(eyes), dtype=np.bool_)),
-    ):
-        rows = across[there]
-        matrices.append(np.concatenate([rows @ moved[there, :, None], rows], axis=2).reshape(-1, 4))
-        targets.append((rows @ aim[there, :, None]).ravel())
-    matrix, target = np.concatenate(matrices), np.concatenate(targets)
-    floor = 1e-6 * (float(np.abs(target).max()) or 1.0)
-    weights = np.ones(len(target))
-    solution = np.zeros(4)
-    for _ in range(_REWEIGHTINGS):
-        solution = np.linalg.lstsq(weights[:, None] * matrix, weights * target)[0]
-        weights = np.maximum(np.abs(matrix @ solution - target), floor) ** -0.5
-    return solution
+def _judge(joint: _Joint) -> Iterator[PieceJoin]:
+    """Yield the join of each piece but the first, or why it is refused."""
+    evidence = joint.evidence
+    rivals = _find_rivals(joint)
+    in_doubt = np.zeros(len(evidence.rows), dtype=np.bool_)
+    for two in np.unique(evidence.pieces[rivals], axis=0):
+        own = (evidence.pieces == two).all(axis=1)
+        if evidence.weigh(own & rivals) >= _RIVAL_SHARE * evidence.weigh(own & joint.agrees):
+            in_doubt |= own
+    clean, whole = joint.support(~in_doubt), joint.support(np.ones_like(in_doubt))
+    held = _reached(clean, 0)
+    for k in range(1, evidence.cameras.num_pieces):
+        join = _join_of(joint, k, rivals)
+        if not held[k]:
+            join = replace(join, reason=_reason_of_few(join, has_rival=bool(_reached(whole, 0)[k])))
+        yield join
 
 
-def _off(fit: Similarity, ties: Ties) -> tuple[FloatArray, FloatArray]:
-    """Return how rays miss points of the other model, (2, k, 3), and one another, (k,), in tolerances.
-
-    Both are NaN where they do not apply: a pair of rays counts where neither keypoint observes a point.
-    """
-    there, back = fit.apply(ties.points_second), invert(fit).apply(ties.points_first)
-    off = np.stack(
-        [
-            normalized(there - ties.eyes_first) - ties.rays_first,
-            normalized(back - ties.eyes_second) - ties.rays_second,
-        ]
-    )
-    rays = ties.rays_second @ fit.rotation.T
-    baselines = normalized(fit.apply(ties.eyes_second) - ties.eyes_first)
-    planes = [np.linalg.norm(np.cross(baselines, one), axis=1) for one in (ties.rays_first, rays)]
-    volume = np.vecdot(np.cross(ties.rays_first, rays), baselines)
-    apart = volume / np.maximum(np.minimum(*planes), 1e-12)
-    apart = np.where(np.isnan(off).any(axis=2).all(axis=0), apart, np.nan)
-    return off / ties.tolerances[:, None], apart / ties.tolerances
+def _reached(support: IntArray, first: int) -> BoolArray:
+    """Return which pieces enough pairs tie to the first, or to those that are tied to it, one by one."""
+    held = np.arange(len(support)) == first
+    while True:
+        ties = np.where(held, 0, support[:, held].sum(axis=1))
+        best = int(np.argmax(ties))
+        if ties[best] < FEWEST_PAIRS:
+            return np.asarray(held)
+        held[best] = True
 
 
-def _misses(fit: Similarity, ties: Ties) -> FloatArray:
-    """Return by how many tolerances rays miss what they should see, the worst of each match, (k,)."""
-    off, apart = _off(fit, ties)
-    return np.asarray(np.fmax.reduce([*np.linalg.norm(off, axis=2), np.abs(apart)]))
+def _find_rivals(joint: _Joint) -> BoolArray:
+    """Return the pairs (k,) that agree on another join of their two pieces than the rest does."""
+    evidence = joint.evidence
+    found = np.zeros(len(evidence.rows), dtype=np.bool_)
+    for two in np.unique(evidence.pieces[~joint.agrees], axis=0):
+        part = evidence.part(evidence.numbers[two], ~joint.agrees)
+        try:
+            rival = _search(part, _FEWEST_RIVALS)
+        except UnsolvableError:
+            continue
+        if rival.evidence.weigh(rival.agrees) >= _FEWEST_RIVALS:
+            found[np.isin(evidence.rows, rival.evidence.rows[rival.agrees])] = True
+    return found
 
 
-def _cost(fit: Similarity, ties: Ties) -> float:
-    return float(np.minimum(_misses(fit, ties), 1.0).sum())
-
-
-def _refine(start: Similarity, ties: Ties, *, metric: bool) -> Similarity:
-    """Return the similarity of least robust (Cauchy) angular cost; it keeps a `metric` scale of its start."""
-    # Here, since they take long to import, and every command that writes results loads this module.
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
-    middle = ties.eyes_second.mean(axis=0)
-    size = start.scale * (median_spread(ties.eyes_second) or 1.0)
-
-    def moved(x: FloatArray) -> Similarity:
-        turn = Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation
-        scale = start.scale if metric else start.scale * float(np.exp(x[6]))
-        there = start.apply(middle[None])[0] + size * x[3:6]
-        return Similarity(scale=scale, rotation=turn, translation=there - scale * turn @ middle)
-
-    def residuals(x: FloatArray) -> FloatArray:
-        off, apart = _off(moved(x), ties)
-        return np.asarray(np.nan_to_num(np.concatenate([off.ravel(), apart]), nan=0.0))
-
-    return moved(
-        least_squares(residuals, np.zeros(6 if metric else 7), loss="cauchy", f_scale=0.3, max_nfev=50).x
+def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
+    """Return the join of one piece, refused if it is uncertain."""
+    evidence, standing = joint.evidence, joint.standing
+    middles, size = evidence.cameras.middles(), evidence.cameras.sizes()[k]
+    own = (evidence.pieces == k).any(axis=1)
+    sigmas = np.sqrt(np.diagonal(joint.covariances[k]))
+    scale_sigma, center_sigma = float(sigmas[3]), float(np.linalg.norm(sigmas[4:]))
+    turn_sigma_deg = float(np.degrees(np.linalg.norm(sigmas[:3])))
+    agreeing, against = own & joint.agrees, own & ~joint.agrees
+    shared = int(np.sum(evidence.ties.is_shared & agreeing))
+    pairs = f"{int(agreeing.sum())} of {counted(int(own.sum()), 'pair')} of images between them"
+    same = f", {shared} of which {'is' if shared == 1 else 'are'} one image in both" if shared else ""
+    return PieceJoin(
+        piece=int(evidence.numbers[k]),
+        to=int(evidence.numbers[0]),
+        to_from_piece=compose(invert(standing.similarity(0, middles)), standing.similarity(k, middles)),
+        scale_sigma=scale_sigma,
+        turn_sigma_deg=turn_sigma_deg,
+        center_sigma=float(standing.scales[k] * size * center_sigma),
+        agreeing=evidence.rows[agreeing],
+        contradicting=evidence.rows[against],
+        rivals=evidence.rows[own & rivals],
+        evidence=pairs + same,
+        reason=uncertainty(scale_sigma, turn_sigma_deg, center_sigma),
     )
 
 
-def _with_errors(
-    best: Similarity,
-    fits: Sequence[Sequence[Similarity]],
-    centers: FloatArray,
-    evidence: str,
-    agreeing: BoolArray | None = None,
-) -> ModelJoin:
-    """Return a join with the errors of its jackknives, whose variances add up; one per kind of witness."""
-    scale, turn, place = 0.0, 0.0, np.zeros(len(centers))
-    for partial in fits:
-        share = (len(partial) - 1) / len(partial)
-        scale += share * sum(np.log(fit.scale / best.scale) ** 2 for fit in partial)
-        turn += share * sum(
-            float(rotation_angles_deg(fit.rotation @ best.rotation.T)) ** 2 for fit in partial
+def _reason_of_few(join: PieceJoin, *, has_rival: bool) -> str:
+    """Say why the pairs do not suffice for a join."""
+    agreeing, total = len(join.agreeing), len(join.agreeing) + len(join.contradicting)
+    if has_rival:
+        return (
+            f"two joins are possible: {counted(agreeing, 'pair')} of images between them agree on one, "
+            f"{len(join.rivals)} on another"
         )
-        place += share * sum(
-            np.sum((fit.apply(centers) - best.apply(centers)) ** 2, axis=1) for fit in partial
+    if agreeing >= FEWEST_PAIRS:
+        return (
+            f"the {agreeing} of {counted(total, 'pair')} of images between them that agree are all of one "
+            "image, which may be taken for another; match others"
         )
-    return ModelJoin(
-        first_from_second=best,
-        scale_sigma=float(np.sqrt(scale)),
-        turn_sigma_deg=float(np.sqrt(turn)),
-        center_sigma=float(np.sqrt(np.median(place))),
-        evidence=evidence,
-        agreeing=agreeing,
+    return (
+        f"no more than {agreeing} of {counted(total, 'pair')} of images between them agree on one join, and "
+        f"it needs {FEWEST_PAIRS}; match more of their images with one another"
     )

@@ -20,17 +20,19 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
+from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.solve import refuse_admm, solve_groups
+from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
+_LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means nothing
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
@@ -277,3 +279,48 @@ def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_came
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
             "match more pairs, above all pairs that close triangles"
         )
+
+
+def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
+    """Return whether a group has two nodes apart that others see; else the offsets' scale is open."""
+    nodes = np.unique(edges[groups.joins(edges)])
+    return bool(len(nodes)) and bool(groups.restricted_to(nodes).center().offsets.any())
+
+
+def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
+    """Return the nodes of the groups that the pairs tie to one another, and the edges between these groups.
+
+    They are those around the fixed group, or the largest set if none is fixed. UnsolvableError, which says
+    which, if the pairs do not tie the groups, or leave the scale of their offsets open.
+    """
+    groups, edges = measured.groups, measured.graph.edges
+    assert groups is not None
+    if not is_scaled(groups, edges):
+        raise UnsolvableError(
+            "no pair sees two cameras of one rig or of the fixed ones, so that nothing determines the scale"
+        )
+    sizes = measured.cameras_per_group
+    tied = largest_tied(edges, groups, sizes, around=measured.fixed_group)
+    if np.sum(sizes[tied] > 0) < 2:
+        raise UnsolvableError(
+            "the pairs tie no two frames to one another; match more pairs, of different cameras of a frame"
+            if measured.fixed_group is None
+            else "the pairs tie no camera to the fixed ones; match the new images with more of those"
+        )
+    inside = np.isin(groups.group_of[edges], tied).all(axis=1)
+    rows = np.flatnonzero(inside & groups.joins(edges))
+    return RigidPiece(nodes=np.unique(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
+
+
+def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
+    """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
+    assert part.groups is not None
+    unit = float(part.groups.fit(locations)[0][-1])
+    size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())
+    baseline = float(np.median(np.linalg.norm(differences(locations, part.graph.edges), axis=1)))
+    if not unit * size > _LEAST_UNIT * baseline:
+        raise UnsolvableError(
+            "the directions contradict the known offsets between cameras: their scale comes out as "
+            f"{unit * size / baseline:.1e} of a baseline; check the rigs, or which cameras are fixed"
+        )
+    return unit

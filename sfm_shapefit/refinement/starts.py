@@ -34,8 +34,8 @@ from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
-from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
+from sfm_shapefit.solver.rigs.solve import lud_over_groups
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 

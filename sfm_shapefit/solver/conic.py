@@ -13,19 +13,17 @@ is tested against it.
 
 import contextlib
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, hstack
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import scale_functional
-
-if TYPE_CHECKING:  # rigs.solve calls this solver
-    from sfm_shapefit.graph.groups import RigidGroups
 
 _LEAST_CONE_TOL = 1e-12  # tolerance of the cone solver; double precision serves no smaller one
 # The cone solver's tolerance per tolerance of ours: its own gap is relative to an inexact dual.
@@ -34,7 +32,7 @@ _LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)  # on the tolerance; tried in turn 
 
 
 def solve_conic(
-    graph: ViewGraph, tol: float, max_iterations: int, groups: "RigidGroups | None" = None
+    graph: ViewGraph, tol: float, max_iterations: int, groups: RigidGroups | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with cvxpy and Clarabel; return locations (n, d), approximate dual (m, d), and steps.
 
@@ -50,11 +48,7 @@ def solve_conic(
 
     bases = tangent_bases(graph.directions)
     m, d = graph.num_edges, graph.dimension
-    reduction = (
-        _reduction(np.arange(graph.num_nodes), np.zeros((graph.num_nodes, d)))
-        if groups is None
-        else _reduction(groups.group_of, groups.offsets)
-    )
+    reduction = _reduction(groups or separate(graph.num_nodes, d))
     matrix = _operator(graph, bases) @ reduction
     c = reduction.T @ scale_functional(graph).ravel()
 
@@ -91,15 +85,16 @@ def _operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
     return coo_array((values, (row, column)), shape=(m * k, graph.num_nodes * d)).tocsr()
 
 
-def _reduction(group_of: IntArray, offsets: FloatArray) -> csr_array:
-    """Return A without the columns of group 0, which is grounded, and without that of s if it is 0."""
-    n, d = offsets.shape
+def _reduction(groups: RigidGroups) -> csr_array:
+    """Return A without the columns of group 0, which is grounded, and without those of s without offsets."""
+    n, d = groups.offsets.shape
     rows = np.arange(n * d)
-    columns = (group_of[:, None] * d + np.arange(d)).ravel()
-    width = (int(group_of.max()) + 1) * d
-    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, width)).tocsc()[:, d:]
-    scaled = [csr_array(offsets.reshape(-1, 1))] if offsets.any() else []
-    return csr_array(hstack([moving, *scaled]))
+    columns = (groups.group_of[:, None] * d + np.arange(d)).ravel()
+    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, groups.num_groups * d)).tocsc()[:, d:]
+    if not groups.offsets.any():
+        return csr_array(moving)
+    scaled = (groups.offsets.ravel(), (rows, np.repeat(groups.units, d)))
+    return csr_array(hstack([moving, coo_array(scaled, shape=(n * d, groups.num_units))]))
 
 
 def _run(program: Any, tolerance: float, max_iterations: int) -> int:

@@ -71,6 +71,7 @@ def test_a_written_graph_is_read_back_to_the_bit(tmp_path, weighted):
 
 def test_the_bundled_graph_and_tables_are_those_that_their_script_makes():
     from scripts.make_data import (
+        across_text,
         bundled_graph_text,
         control_points_text,
         gravity_text,
@@ -82,6 +83,7 @@ def test_the_bundled_graph_and_tables_are_those_that_their_script_makes():
     assert (BUNDLED / "gcp_list.txt").read_text() == control_points_text()
     assert (BUNDLED / "gravity.txt").read_text() == gravity_text()
     assert (BUNDLED / "names.txt").read_text() == names_text()
+    assert (BUNDLED / "across.txt").read_text() == across_text()
 
     ours = read_graph(BUNDLED / "graph40.txt")
     lines = bundled_graph_text().splitlines()[1:]

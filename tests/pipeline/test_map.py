@@ -455,10 +455,29 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     models = [model.located.reconstruction for model in found.models]
     assert whole.reconstruction.num_points3D() == sum(model.num_points3D() for model in models)
     same = [(min(models[0].point3D_ids()), min(models[1].point3D_ids()))]
-    merged, renamed, new = merge_models(*models, told.join.first_from_second, same)
+    merged, renamed, new = merge_models(*models, told.join.to_from_piece, same)
     assert merged.num_points3D() == whole.reconstruction.num_points3D() - 1
     assert renamed[same[0][0]] == new[same[0][1]]
     check_joined_folder(tmp_path / "out" / "joined_0", found)
+
+
+# One of the pairs between the first images and the others stays: it tells the turn, and no scale.
+KEEP_ONE = f"{PAIRS} {ACROSS} AND pair_id != {1 * PAIR + 8}"
+
+
+def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_path):
+    found = sfm_shapefit.map_database(changed(RING, tmp_path, KEEP_ONE), **FAST)
+    assert [int(model.located.kept.sum()) for model in found.models] == [4, 4]
+    placed = {row.name for model in found.models for row in model.located.cameras if row.placed}
+    assert len(placed) == found.num_placed == 8
+    assert not found.left_out
+    (told,) = found.joins
+    assert "1 pair of images cannot tell how large it is and where" in told.reason
+    sfm_shapefit.write_result(found, tmp_path / "out")
+    for folder in ("0", "1"):
+        assert read_model(tmp_path / "out" / folder).images.num_images == 4
+    reasons = {row["reason"] for row in read_cameras(tmp_path / "out" / "1") if row["placed"] == "false"}
+    assert reasons == {"in a larger piece, to which this one is not rigidly tied"}
 
 
 APART = "they are in models 0 and 1, which are not joined"

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,12 +14,15 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.join import judge_joins
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.points import number_points
@@ -465,7 +469,7 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     assert [len(model.names) for model in found.models] == [16, 16]
     (told,) = found.joins
     assert told.join is not None, told.statement
-    assert told.join.first_from_second.scale == 1.0
+    assert told.join.to_from_piece.scale == 1.0
     sigmas = [model.located.gauge.scale_sigma for model in found.models]
     assert told.join.scale_sigma == pytest.approx(np.hypot(*sigmas))
     (joined,) = found.joined
@@ -486,3 +490,28 @@ def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rot
     write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
     # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
     assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, adjust="full")
+
+
+def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace):
+    whole = pycolmap.Reconstruction(workspace / "truth")
+    parts = [pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)]
+    for part, gone in zip(parts, (range(7, 13), range(1, 7)), strict=True):
+        for frame in gone:
+            part.deregister_frame(frame)
+        assert part.num_reg_frames() == 6
+    parts[1].transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d([0.0, 0.0, 0.6, 0.8]), [5.0, 1.0, 0.0]))
+    found = sfm_shapefit.join(parts, workspace / "database.db")
+    assert found.joins[0].join.to_from_piece.scale == 1.0
+    errors = sfm_shapefit.evaluate(found.reconstruction, whole)
+    assert len(errors.names) == 36
+    assert errors.position.max < 0.01 * errors.extent
+    assert found.reconstruction.num_reg_frames() == 12
+    pieces = [ModelPiece(label=f"model {k}", model=read_model(part)) for k, part in enumerate(parts)]
+    with closing(open_database(workspace / "database.db", read_model(whole).images.names)) as matches:
+        (told,) = judge_joins(pieces, tie_pieces(pieces, matches, frozenset()))
+    assert told.statement == "model 1 is not joined to model 0: their rigs do not tell the scale of both"
+    alone = pycolmap.Reconstruction(RING / "sparse" / "0")
+    with pytest.raises(
+        InputError, match="model 1 has rigs of several cameras, and a scale by that, but model 0"
+    ):
+        sfm_shapefit.join([alone, whole])

@@ -1,7 +1,6 @@
 """Each stage of the pipeline alone: from the ring as it stands, or a little off, not from other stages."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -17,7 +16,6 @@ from sfm_shapefit.base.geometry import (
     normalized,
     rotation_angles_deg,
 )
-from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -25,23 +23,23 @@ from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline import joins
 from sfm_shapefit.pipeline.adjustment import adjust_placed
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
-from sfm_shapefit.pipeline.joined import ToldOfJoins
+from sfm_shapefit.pipeline.join import judge_joins, merge_groups
 from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.rigs import place_cameras, rigid_parts
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
-from sfm_shapefit.tracks.options import NodeOptions, StructureOptions
+from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, only, posed
 from tests.pipeline.made import DATABASE, FOLDER, directions_of, opened, placement_at, stand_at
 from tests.problems import all_pairs, exact_graph, turn
-from tests.scenes import read_from, view_of
+from tests.scenes import view_of
 
 MODEL = read_model(FOLDER)
 TRUTH = MODEL.images
@@ -253,21 +251,17 @@ def models():
         half = only(MODEL.reconstruction, chosen)
         if halves:
             half.transform(pycolmap.Sim3d(0.5, pycolmap.Rotation3d(TURN), np.ones(3)))
-        options = SimpleNamespace(structure=StructureOptions())
-        located = SimpleNamespace(reconstruction=half, images=TRUTH, placed=TRUTH, options=options)
-        halves.append(SimpleNamespace(names=TRUTH.names, located=located))
+        halves.append(ModelPiece(label=f"model {len(halves)}", model=read_model(half)))
     return halves
 
 
 @pytest.mark.parametrize("by", ["matches", "priors"])
-def test_join_brings_models_into_the_world_of_the_first(models, by, monkeypatch):
-    monkeypatch.setattr(joins, "tell_group", lambda group, *_: group)
-    unposed = read_from(DATABASE, read_images).images
-    priors = None if by == "matches" else known(7.0 * TRUTH.centers)
-    with view_of(DATABASE, unposed) as view:
-        found = joins.join_models(models, unposed, view.matches, ToldOfJoins(priors), Clock())
-    (told,), (group,) = found.joins, found.joined
+def test_join_brings_models_into_the_world_of_the_first(models, by):
+    priors = [] if by == "matches" else [known(7.0 * TRUTH.centers[half]) for half in (slice(4), slice(4, 8))]
+    with view_of(DATABASE, TRUTH) as view:
+        tied = tie_pieces(models, view.matches if by == "matches" else None, frozenset())
+    (told,) = judge_joins(models, tied, priors)
+    (group,) = merge_groups(models, tied, [told])
     assert ("position priors" in told.statement) == (by == "priors")
     assert list(group.world_from) == [0, 1]
     np.testing.assert_allclose(centers_of(group.reconstruction), TRUTH.centers, atol=2e-3)
-    assert joins.join_models(models[:1], unposed, None, ToldOfJoins(), Clock()) == joins.JoinedModels((), ())

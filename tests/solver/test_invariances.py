@@ -10,8 +10,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions
-from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.solve import lud_over_groups, solve_groups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from tests.problems import outer, rig_problem, shape

@@ -17,9 +17,8 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.rigs import solve as groups_solve
 from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.solve import lud_over_groups, solve_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.lud import solve_lud
@@ -112,6 +111,65 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     assert abs(system.rows[1] @ h) < 1e-10
     at = unit.expand(h)
     assert (at[i] - at[j]) @ v[pinned] == pytest.approx(0.0, abs=1e-10)
+
+
+def mixed_problem(wrong=0.2):
+    """Two rigs of one unit, two pieces with units of their own, and single nodes; exact but for a share."""
+    rng = np.random.default_rng(4)
+    labels = np.array([0] * 4 + [1] * 4 + [2] * 8 + [3] * 8 + [4, 5, 6])
+    unit_of = np.array([0, 0, 1, 2, 0, 0, 0])
+    t, lengths = rng.normal(size=(len(labels), 3)), np.array([0.5, 3.0, 0.2])
+    offsets = t / lengths[unit_of[labels]][:, None]
+    offsets[labels > 3] = 0.0
+    groups = RigidGroups(group_of=labels, offsets=offsets, unit_of=unit_of)
+    edges = np.array([(i, j) for i in range(len(labels)) for j in range(i) if labels[i] != labels[j]])
+    edges = edges[rng.permutation(len(edges))[:110]]
+    v = normalized(t[edges[:, 0]] - t[edges[:, 1]])
+    bad = rng.random(len(edges)) < wrong
+    v[bad] = normalized(rng.normal(size=(int(bad.sum()), 3)))
+    return ViewGraph(len(labels), edges, v), groups, t, lengths
+
+
+def test_rigs_pieces_with_scales_of_their_own_and_single_cameras_are_one_program():
+    graph, groups, t, lengths = mixed_problem()
+    assert (groups.num_units, groups.num_unknowns) == (3, 24)
+    result = solve_groups(graph, groups, SolverOptions(uniqueness=True))
+    assert result.status is Status.CONVERGED
+    assert result.unique
+    x, apart = groups.fit(result.locations)
+    scales = groups.split(x)[1]
+    assert apart < 1e-12
+    np.testing.assert_allclose(scales / scales[0], lengths / lengths[0], rtol=1e-6)
+    np.testing.assert_allclose(centered(result.locations) / scales[0] * lengths[0], centered(t), atol=1e-6)
+    conic = solve_groups(graph, groups, SolverOptions(solver="conic"))
+    np.testing.assert_allclose(conic.locations, result.locations, atol=1e-6)
+    lud = lud_over_groups(graph, groups)
+    assert groups.fit(lud)[1] < 1e-9
+    found = groups.split(groups.fit(lud)[0])[1]
+    np.testing.assert_allclose(found / found[0], lengths / lengths[0], rtol=0.2)
+
+
+def test_a_matrix_with_several_units_is_factored_as_it_is_written_out():
+    graph, groups, _, _ = mixed_problem(wrong=1.0)
+    unit, edges = groups.normalize(), graph.edges
+    for number in range(3):
+        own = np.linalg.norm(unit.offsets[unit.units == number], axis=1)
+        assert np.sqrt(np.mean(own[own > 0.0] ** 2)) == pytest.approx(1.0)
+    blocks = (
+        np.tile(np.eye(3), (len(edges), 1, 1))
+        + 0.5 * graph.directions[:, :, None] * graph.directions[:, None]
+    )
+    matrix, expand = written_out(edges, unit, blocks)
+    factor = RigidReduction(edges, unit)
+    factor.refactor(blocks)
+    g = adjoint(np.random.default_rng(0).normal(size=graph.directions.shape), edges, graph.num_nodes)
+    x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
+    np.testing.assert_allclose(centered(factor.solve(g)), centered((expand @ x).reshape(-1, 3)), atol=1e-10)
+    part = groups.restricted_to(np.flatnonzero(groups.units > 0))
+    assert part.unit_of.tolist() == [0, 1]
+    alone = part.restricted_to(np.array([0, 8]))  # one node of each: nothing tells a scale
+    with pytest.raises(UnsolvableError, match="do not determine a scale"):
+        RigidReduction(np.array([[0, 1]]), alone.center()).refactor(np.eye(3)[None])
 
 
 def test_a_scale_that_nothing_holds_is_refused():

@@ -1,13 +1,18 @@
-"""Two reconstructions as one: a second one moved into the world of a first, which share no image."""
+"""Two reconstructions as one: a second one moved into the world of a first."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.files.colmap.seed import transform_model
+
+_LEAST_TRACK = 2  # observations; a point with fewer is none
+_SAME_PIXEL = 0.5  # pixels; keypoints of two models that are no farther apart are one
 
 
 def merge_models(
@@ -18,8 +23,10 @@ def merge_models(
 ) -> tuple[pycolmap.Reconstruction, dict[int, int], dict[int, int]]:
     """Return a new reconstruction of the posed images and points of both, and new ids of their points.
 
-    Cameras of the same id and parameters are one, rigs if also their sensors stand alike; others of `second`
-    get new ids. Frames of rigs stay together.
+    Images without a pose are left out. Images of the same name are one, which stays where the first has it;
+    the observations of the second join its own where the keypoints are the same. Cameras of the same
+    id and parameters are one, rigs if also their sensors stand alike; others of `second` get new ids. Frames
+    of rigs stay together.
 
     Args:
         first, second: neither is changed.
@@ -27,9 +34,13 @@ def merge_models(
         same_points: ids of points of both that are one; each point at most once.
 
     Returns:
-        The model, the new ids of the first one's points that changed, and those of all of the second one's.
+        The model, the new ids of the first one's points that changed, and those of the second one's.
+
+    Raises:
+        InputError: if a rig took some images of one frame in the first model and others in the second.
     """
     joined = pycolmap.Reconstruction(first)
+    joined.tear_down()
     moved = transform_model(second, first_from_second)
     rigs = {rig_id: rig for rig_id, rig in moved.rigs.items() if rig.num_sensors() > 1}
     in_rigs = {sensor.id for rig in rigs.values() for sensor in rig.sensor_ids()}
@@ -37,59 +48,125 @@ def merge_models(
     rig_ids = {}
     for rig_id, rig in sorted(rigs.items()):
         rig_ids[rig_id] = _add_rig(joined, moved, rig, cameras)
-    for frame_id in sorted(moved.reg_frame_ids()):
-        _add_frame(joined, moved, frame_id, cameras, rig_ids)
-    new = {}
-    last = max(joined.point3D_ids(), default=0)
-    for number, point_id in enumerate(sorted(moved.point3D_ids()), start=1):
-        point = moved.point3D(point_id)
-        new[point_id] = last + number
-        copy = pycolmap.Point3D(xyz=point.xyz, track=point.track)
-        copy.color = point.color
-        joined.add_point3D_with_id(new[point_id], copy)
-    renamed = {}
-    for one, other in same_points:
-        new[other] = renamed[one] = joined.merge_points3D(one, new[other])
+    image_ids = _add_frames(joined, moved, cameras, rig_ids)
+    new, same = _add_points(joined, moved, image_ids)
+    renamed: dict[int, int] = {}
+    for one, other in [*((one, new[other]) for one, other in same_points if other in new), *same]:
+        if one not in renamed and other not in renamed.values():
+            renamed[one] = joined.merge_points3D(one, other)
+            new = {point: renamed[one] if now == other else now for point, now in new.items()}
     joined.update_point_3d_errors()
     return joined, renamed, new
 
 
-def _add_frame(
+def _add_frames(
     joined: pycolmap.Reconstruction,
     second: pycolmap.Reconstruction,
-    frame_id: int,
     cameras: dict[int, int],
     rig_ids: dict[int, int],
+) -> dict[int, int]:
+    """Add the posed frames that only the second model has, and return the new ids of all its posed images."""
+    there = {joined.image(i).name: i for i in joined.reg_image_ids()}
+    ids = {i: there[second.image(i).name] for i in second.reg_image_ids() if second.image(i).name in there}
+    fresh = max([*joined.images, *second.images, *joined.frames, *second.frames], default=0) + 1
+    for frame_id in sorted(second.reg_frame_ids()):
+        own = [data.id for data in second.frame(frame_id).image_ids]
+        if shared := [i for i in own if i in ids]:
+            if len(shared) < len(own):
+                name = second.image(shared[0]).name
+                raise InputError(f"a rig took {name} with images that only one of two models has")
+            continue
+        for i in own:
+            ids[i] = i if i not in joined.images else fresh
+            fresh += ids[i] == fresh
+        new_id = frame_id if frame_id not in joined.frames else fresh
+        fresh += new_id == fresh
+        _add_frame(
+            joined,
+            second.frame(frame_id),
+            new_id,
+            [second.image(i) for i in sorted(own)],
+            _Renamed(cameras, rig_ids, ids),
+        )
+    return ids
+
+
+class _Renamed(NamedTuple):
+    """New ids of what the second model has, by the old ones."""
+
+    cameras: dict[int, int]
+    rigs: dict[int, int]
+    """Rigs of several cameras."""
+    images: dict[int, int]
+
+
+def _add_frame(
+    joined: pycolmap.Reconstruction,
+    before: pycolmap.Frame,
+    frame_id: int,
+    images: Sequence[pycolmap.Image],
+    renamed: _Renamed,
 ) -> None:
-    """Add a posed frame of a second model with its images; cameras and rigs of several have new ids."""
-    before = second.frame(frame_id)
-    images = [second.image(data.id) for data in sorted(before.image_ids, key=lambda data: data.id)]
-    frame = None
-    if before.rig_id in rig_ids:
-        frame = pycolmap.Frame(frame_id=frame_id, rig_id=rig_ids[before.rig_id])
-    added = []
-    for image in images:
-        if joined.exists_image(image.image_id):
-            raise ValueError(f"both models have the image {image.name}")
-        copy = pycolmap.Image(
+    """Add a posed frame of a second model with its images."""
+    copies = [
+        pycolmap.Image(
             name=image.name,
             keypoints=points2d_xy(image),
-            camera_id=cameras[image.camera_id],
-            image_id=image.image_id,
+            camera_id=renamed.cameras[image.camera_id],
+            image_id=renamed.images[image.image_id],
         )
-        if frame is None:
+        for image in images
+    ]
+    if before.rig_id not in renamed.rigs:
+        for copy, image in zip(copies, images, strict=True):
             joined.add_image_with_trivial_frame(copy, image.cam_from_world())
-            continue
+        return
+    frame = pycolmap.Frame(frame_id=frame_id, rig_id=renamed.rigs[before.rig_id])
+    for copy in copies:
         frame.add_data_id(copy.data_id)
         copy.frame_id = frame_id
-        added.append(copy)
-    if frame is None:
-        return
     frame.rig_from_world = before.rig_from_world
     joined.add_frame(frame)
-    for copy in added:
+    for copy in copies:
         joined.add_image(copy)
     joined.register_frame(frame_id)
+
+
+def _add_points(
+    joined: pycolmap.Reconstruction, second: pycolmap.Reconstruction, image_ids: dict[int, int]
+) -> tuple[dict[int, int], list[tuple[int, int]]]:
+    """Add the points of a second model; return their new ids, and those of points that are one.
+
+    Observations go with images whose keypoints are others in the first model, and points without two.
+    """
+    is_same = {i: _have_same_keypoints(joined.image(now), second.image(i)) for i, now in image_ids.items()}
+    new, same = {}, []
+    last = max(joined.point3D_ids(), default=0)
+    for point_id in sorted(second.point3D_ids()):
+        point = second.point3D(point_id)
+        track, meets = pycolmap.Track(), set()
+        for element in point.track.elements:
+            if not is_same.get(element.image_id, False):
+                continue
+            seen = joined.image(image_ids[element.image_id]).points2D[element.point2D_idx]
+            if seen.has_point3D():
+                meets.add(int(seen.point3D_id))
+            else:
+                track.add_element(image_ids[element.image_id], element.point2D_idx)
+        if track.length() + len(meets) < _LEAST_TRACK or not track.length():
+            continue
+        last += 1
+        new[point_id] = last
+        copy = pycolmap.Point3D(xyz=point.xyz, track=track)
+        copy.color = point.color
+        joined.add_point3D_with_id(last, copy)
+        same += [(one, last) for one in sorted(meets)[:1]]
+    return new, same
+
+
+def _have_same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
+    first, second = points2d_xy(one), points2d_xy(other)
+    return first.shape == second.shape and bool((np.abs(first - second) <= _SAME_PIXEL).all())
 
 
 def _add_cameras(

@@ -69,7 +69,7 @@ def certify_groups(
         objective=value,
         dual_bound=bound,
         dual=frozen(every),
-        equality_residual=_largest(total - bound * c, graph.dimension) / degree,
+        equality_residual=_largest(total - bound * c, unit) / degree,
         unique=_is_unique(between, unit, locations, y) if uniqueness else None,
     )
 
@@ -91,23 +91,23 @@ def _refuse(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, dual: 
         raise InputError(f"the locations are not those of rigid groups: a node is {apart:.1e} off its group")
 
 
-def _largest(violation: FloatArray, dimension: int) -> float:
-    """Return the largest norm of a reduced vector at a group, or its size for the scale."""
-    at_groups = np.linalg.norm(violation[:-1].reshape(-1, dimension), axis=1)
-    return float(max(at_groups.max(), abs(violation[-1])))
+def _largest(violation: FloatArray, groups: RigidGroups) -> float:
+    """Return the largest norm of a reduced vector at a group, or its size for a scale."""
+    at_groups, at_units = groups.split(violation)
+    return float(max(np.linalg.norm(at_groups, axis=1).max(), np.abs(at_units).max()))
 
 
 def _balance(
     graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray, allowed: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the dual moved to A^T D^T y = lambda A^T c, up to `allowed`, and A^T D^T y."""
-    n, d, c = graph.num_nodes, graph.dimension, groups.reduce(scale_functional(graph))
+    n, c = graph.num_nodes, groups.reduce(scale_functional(graph))
     total = groups.reduce(adjoint(y, graph.edges, n))
     multiplier = float(total @ c / (c @ c))
-    if _largest(total - multiplier * c, d) <= allowed:
+    if _largest(total - multiplier * c, groups) <= allowed:
         return y, total
     stiffness, v = _stiffness(graph, locations), graph.directions
-    blocks = stiffness[:, None, None] * (np.eye(d) - v[:, :, None] * v[:, None, :])
+    blocks = stiffness[:, None, None] * (np.eye(graph.dimension) - v[:, :, None] * v[:, None, :])
     longest = _longest(graph, locations)
     pin = Pin(longest, graph.edges[longest], v[longest], float(np.mean(stiffness)))
     system = factor_pinned(RigidReduction(graph.edges, groups), blocks, c, pin)
@@ -118,7 +118,7 @@ def _balance(
         moved = across(differences(groups.expand(h), graph.edges), v)
         y = across(y - stiffness[:, None] * moved, v)
         total = groups.reduce(adjoint(y, graph.edges, n))
-        if _largest(total - multiplier * c, d) <= allowed:
+        if _largest(total - multiplier * c, groups) <= allowed:
             break
     return y, total
 

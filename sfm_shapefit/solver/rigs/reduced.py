@@ -1,14 +1,17 @@
-"""The normal matrix of groups, A^T D^T S D A, factored: a block Laplacian with one dense row for the scale.
+"""The normal matrix of groups, A^T D^T S D A, factored: a block Laplacian with a dense row for each unit.
 
 Over x = (f, s) the matrix of edge blocks S_e is
 
     [ K    h   ]     K    the Laplacian of S_e on the graph of groups, repeated pairs added up
-    [ h^T  eta ]     h    at each group the sum of its signed S_e (o_i - o_j)
-                     eta  sum_e (o_i - o_j)^T S_e (o_i - o_j)
+    [ h^T  eta ]     h    (., S) at each group the sums of its signed S_e p_e^c
+                     eta  (S, S) sums of p_e^c . S_e p_e^k
 
-K is factored in d x d blocks, sparse as the graph of groups is; what remains for s is the Schur complement
-eta - h^T K^-1 h. Translations are taken away by grounding one group.
+with p_e^c = o_i - o_j of what is in unit c. K is factored in d x d blocks, sparse as the graph of groups is;
+what remains for s is the Schur complement eta - h^T K^-1 h. Translations are taken away by grounding one
+group.
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -41,8 +44,10 @@ class RigidReduction(Reduction):
         """
         self.groups = groups
         self._ends = np.ascontiguousarray(groups.group_of[edges])
-        self._offsets = groups.offsets[edges[:, 0]] - groups.offsets[edges[:, 1]]
-        self._metric = bool(self._offsets.any())
+        units = range(groups.num_units)
+        columns = [np.where(groups.units[:, None] == c, groups.offsets, 0.0) for c in units]
+        self._offsets = [own[edges[:, 0]] - own[edges[:, 1]] for own in columns]
+        self._metric = any(own.any() for own in self._offsets)
         dimension = groups.offsets.shape[1]
         plan = analyze(groups.num_groups, self._ends)
         needed = plan.num_bytes(dimension, np.float64, threads)
@@ -60,7 +65,7 @@ class RigidReduction(Reduction):
         return self.groups.expand(x)
 
     def reduce(self, g: FloatArray, /) -> FloatArray:
-        """Return A^T g, (B d + 1,), for g (n, d)."""
+        """Return A^T g, (B d + S,), for g (n, d)."""
         return self.groups.reduce(g)
 
     def refactor(self, weights: FloatArray, /) -> None:
@@ -68,27 +73,31 @@ class RigidReduction(Reduction):
 
         UnsolvableError if it is not positive definite to working precision.
         """
-        d = self._offsets.shape[1]
+        d = self._offsets[0].shape[1]
         blocks = weights if weights.ndim > 1 else weights[:, None, None] * np.eye(d)
         self.factor.refactor(blocks)
         self.smallest_pivot = self.factor.smallest_pivot
-        bent = np.einsum("eab,eb->ea", blocks, self._offsets)
-        self._row = self._at_groups(bent)
-        eta = float(np.vdot(bent, self._offsets))
-        if not self._metric:
-            self._column, self._schur = np.zeros_like(self._row), np.inf
+        bent = [np.einsum("eab,eb->ea", blocks, own) for own in self._offsets]
+        self._rows = [self._at_groups(values) for values in bent]
+        eta = _products(bent, self._offsets)
+        if not self._metric and self.groups.num_units == 1:
+            self._columns, self._schur = np.zeros((*self._rows[0].shape, 1)), np.full((1, 1), np.inf)
             return
-        self._column = self.factor.solve(self._row)
-        self._schur = eta - float(np.vdot(self._row, self._column))
-        if not self._schur > _LEAST_SCHUR * eta:
+        self._columns = self.factor.solve(np.stack(self._rows, axis=2))
+        self._schur = eta - _products(self._rows, np.moveaxis(self._columns, 2, 0))
+        sizes = np.sqrt(np.diagonal(eta))
+        least = float(np.linalg.eigvalsh(self._schur / np.outer(sizes, sizes))[0]) if sizes.all() else 0.0
+        if not least > _LEAST_SCHUR:
             raise UnsolvableError("the offsets inside the groups do not determine a scale")
-        self.smallest_pivot = min(self.smallest_pivot, self._schur / eta)
+        self.smallest_pivot = min(self.smallest_pivot, least)
 
     def solve_reduced(self, right: FloatArray, /) -> FloatArray:
-        """Return the x (B d + 1,) with (A^T D^T S D A) x = right; s stays 0 without offsets."""
-        z = self.factor.solve(right[:-1].reshape(self._row.shape))
-        s = (right[-1] - float(np.vdot(self._row, z))) / self._schur
-        return np.append((z - s * self._column).ravel(), s)
+        """Return the x (B d + S,) with (A^T D^T S D A) x = right; s stays 0 without offsets."""
+        at_groups, at_units = self.groups.split(right)
+        z = self.factor.solve(at_groups)
+        rest = at_units - _products(self._rows, [z])[:, 0]
+        s = rest / self._schur[0] if len(rest) == 1 else np.linalg.solve(self._schur, rest)
+        return np.append((z - self._columns @ s).ravel(), s)
 
     def solve_two_reduced(self, first: FloatArray, second: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return x for two right-hand sides."""
@@ -102,3 +111,9 @@ class RigidReduction(Reduction):
         """Return the sum of the signed values (m, d) at each group, (B, d)."""
         leaving, entering = (sum_by(end, values, self.groups.num_groups) for end in self._ends.T)
         return np.asarray(leaving - entering)
+
+
+def _products(first: Iterable[FloatArray], second: Iterable[FloatArray]) -> FloatArray:
+    """Return the inner products of arrays with others, a row for each of the first."""
+    others = list(second)
+    return np.array([[np.vdot(one, other) for other in others] for one in first])

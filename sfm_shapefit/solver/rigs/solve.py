@@ -1,4 +1,4 @@
-"""The entry to the solvers over rigid groups: choose a method, solve, certify."""
+"""The entry to the solvers over rigid groups: choose a method, solve, certify; and the start of LUD."""
 
 import time
 from typing import Any
@@ -18,7 +18,10 @@ from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.solve import Choice, run_choice
+from sfm_shapefit.solver.splitting.linear import Resources
+from sfm_shapefit.solver.splitting.lud import solve_lud
 
+_LUD_STEPS = 150  # steps of LUD as the start of a refinement; more hardly move it
 _DIRECTIONS_CANCEL = 1e-12  # A^T c relative to the sum of weights; smaller counts as 0
 
 
@@ -88,3 +91,18 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
         return solve_newton_reduced(graph, factor, tol, limit, watch)
 
     return Choice("newton", newton, reason)
+
+
+def lud_over_groups(graph: ViewGraph, groups: RigidGroups, max_steps: int = _LUD_STEPS) -> FloatArray | None:
+    """Return LUD's locations (n, d), centered, after some steps; None if the system breaks down.
+
+    The splitting sees the groups through its linear solve alone, which moves the locations by A x. Every pair
+    of the graph joins two groups, and all groups are connected.
+    """
+    try:
+        factor = RigidReduction(graph.edges, groups.normalize())
+        resources = Resources(factor=factor)
+        locations = solve_lud(graph, max_steps, certified=False, resources=resources).locations
+    except UnsolvableError:
+        return None
+    return locations if np.isfinite(locations).all() else None

@@ -1,0 +1,228 @@
+"""Models as pieces: their cameras, and what ties those of two: matches of a database, and images of both."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import METRIC_SIGMA
+from sfm_shapefit.files.colmap.model import ColmapModel
+from sfm_shapefit.files.colmap.points import ModelPictures, observed_points, points2d_of
+from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import Matches, PairNames, RayMatches
+
+_LEAST_MATCHES = 10  # matches of a pair; fewer tell no direction, and would be taken for one by chance
+_SAME_PIXEL = 0.5  # pixels; keypoints of a model and of a database that are no farther apart are one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModelPiece:
+    """A model with a world of its own."""
+
+    label: str
+    model: ColmapModel
+    scale_sigma: float | None = None
+    """Relative standard deviation of its scale, where its rigs tell one; None where it is arbitrary."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether its scale must stay."""
+        return self.scale_sigma is not None and self.scale_sigma <= METRIC_SIGMA
+
+
+class TiedPieces(NamedTuple):
+    """Pieces and their ties, with what the arrays refer to."""
+
+    cameras: PieceCameras
+    ties: PieceTies
+    names: tuple[str, ...]
+    """Image of each camera, (v,)."""
+    keypoints: IntArray
+    """(M, 2) points of the two pieces that the keypoints of a match observe, by their ids; -1 for none."""
+
+
+class _Tie(NamedTuple):
+    """The matches of one pair of cameras."""
+
+    cameras: tuple[int, int]
+    rays: tuple[FloatArray, FloatArray]
+    """(m, 3) each, in axes of the cameras."""
+    ids: IntArray
+    """(m, 2)"""
+    pixel_angle: float
+    is_shared: bool
+
+
+def tie_pieces(pieces: Sequence[ModelPiece], matches: Matches | None, left_out: PairNames) -> TiedPieces:
+    """Return what ties pieces to one another.
+
+    Args:
+        pieces: the first is the world.
+        matches: of images of theirs; None if there are none beside the images that they share.
+        left_out: pairs of images whose matches count for nothing.
+    """
+    seen = _Seen(pieces)
+    found = list(seen.shared())
+    if matches is not None:
+        found += seen.matched(matches, left_out)
+    first = [one.cameras for one in found]
+    counts = [len(one.ids) for one in found]
+    ids = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(one.ids for one in found)])
+    ends = np.repeat(np.reshape(np.array(first, dtype=np.int64), (-1, 2)), counts, axis=0)
+    ties = PieceTies(
+        matches=RayMatches(
+            pairs=np.reshape(np.array(first, dtype=np.int64), (-1, 2)),
+            offsets=np.append(0, np.cumsum(counts)).astype(np.int64),
+            rays_i=np.concatenate([np.zeros((0, 3)), *(one.rays[0] for one in found)]),
+            rays_j=np.concatenate([np.zeros((0, 3)), *(one.rays[1] for one in found)]),
+            pixel_angles=np.array([one.pixel_angle for one in found]),
+        ),
+        points=np.stack([seen.points(ends[:, k], ids[:, k]) for k in range(2)], axis=1),
+        is_shared=np.array([one.is_shared for one in found], dtype=np.bool_),
+    )
+    return TiedPieces(seen.cameras, ties, seen.names, ids)
+
+
+class _Seen:
+    """The cameras of all pieces, by piece and then by name, and what their keypoints observe."""
+
+    def __init__(self, pieces: Sequence[ModelPiece]) -> None:
+        self.pieces = pieces
+        own = [piece.model.images for piece in pieces]
+        self.names = tuple(name for images in own for name in images.names)
+        self.row = np.concatenate([np.arange(images.num_images) for images in own])
+        self.cameras = PieceCameras(
+            piece_of=np.repeat(np.arange(len(own)), [images.num_images for images in own]),
+            rotations=np.concatenate([images.rotations for images in own]),
+            centers=np.concatenate([images.centers for images in own]),
+            is_metric=np.array([piece.is_metric for piece in pieces], dtype=np.bool_),
+        )
+        self.of_name: dict[str, list[int]] = {}
+        for v, name in enumerate(self.names):
+            self.of_name.setdefault(name, []).append(v)
+        self.pictures = [
+            ModelPictures(i, points2d_of(p.model.reconstruction, i)) for p, i in zip(pieces, own, strict=True)
+        ]
+        self.observed = [self._observed(v) for v in range(len(self.names))]
+
+    def _observed(self, v: int) -> tuple[IntArray, IntArray]:
+        """Return which keypoints of a camera's image observe a point, and the ids of these."""
+        model = self.pieces[self.cameras.piece_of[v]].model
+        keypoints, points = observed_points(model.reconstruction.image(int(model.images.ids[self.row[v]])))
+        return keypoints, points.astype(np.int64)
+
+    def points(self, cameras: IntArray, ids: IntArray) -> FloatArray:
+        """Return the points (m, 3) of cameras' pieces by their ids; NaN for none."""
+        found = np.full((len(ids), 3), np.nan)
+        numbers = self.cameras.piece_of[cameras]
+        for m in np.flatnonzero(ids >= 0).tolist():
+            found[m] = self.pieces[numbers[m]].model.reconstruction.point3D(int(ids[m])).xyz
+        return found
+
+    def shared(self) -> Iterator[_Tie]:
+        """Yield a tie for each two cameras that are one image; its rays are those of observed keypoints."""
+        for own in self.of_name.values():
+            for second in range(1, len(own)):
+                for first in range(second):
+                    yield self._shared(own[first], own[second])
+
+    def _shared(self, first: int, second: int) -> _Tie:
+        rays, ids = [], []
+        for place, v in enumerate((first, second)):
+            keypoints, points = self.observed[v]
+            pictures, row = self.pictures[self.cameras.piece_of[v]], int(self.row[v])
+            seen = pictures.rays(row, pictures.pixels(row, keypoints)) if len(keypoints) else np.zeros((0, 3))
+            rays.append(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+            column = np.full((len(points), 2), -1)
+            column[:, place] = points
+            ids.append(column)
+        both, known = np.concatenate(rays), np.concatenate(ids)
+        finite = np.isfinite(both).all(axis=1)
+        return _Tie(
+            (first, second), (both[finite], both[finite]), known[finite], self._angle(first, second), True
+        )
+
+    def _angle(self, first: int, second: int) -> float:
+        """Return the angle of a pixel of the wider of two lenses."""
+        focal = [
+            self.pieces[self.cameras.piece_of[v]].model.images.focal_lengths_px[self.row[v]]
+            for v in (first, second)
+        ]
+        return float(1.0 / min(focal))
+
+    def matched(self, matches: Matches, left_out: PairNames) -> Iterator[_Tie]:
+        """Yield the pairs of a database whose images no piece has both of."""
+        images, labels = self._union()
+        view = matches.at(images, left_out)
+        ids = {}
+        for batch in view.between(labels):
+            for k, (i, j) in enumerate(batch.pairs.tolist()):
+                rows = slice(int(batch.offsets[k]), int(batch.offsets[k + 1]))
+                if rows.stop - rows.start < _LEAST_MATCHES:
+                    continue
+                ends = [self.of_name[images.names[end]] for end in (i, j)]
+                piece_of = self.cameras.piece_of
+                if {*piece_of[ends[0]].tolist()} & {*piece_of[ends[1]].tolist()}:
+                    continue
+                for v in ends[0]:
+                    for w in ends[1]:
+                        for one in (v, w):
+                            if one not in ids:
+                                ids[one] = self._by_keypoint(one, view.keypoints(i if one == v else j))
+                        found = np.stack(
+                            [ids[v][batch.keypoints[rows, 0]], ids[w][batch.keypoints[rows, 1]]], axis=1
+                        )
+                        rays = batch.rays_i[rows], batch.rays_j[rows]
+                        if piece_of[v] > piece_of[w]:
+                            yield _Tie(
+                                (w, v), rays[::-1], found[:, ::-1], float(batch.pixel_angles[k]), False
+                            )
+                        else:
+                            yield _Tie((v, w), rays, found, float(batch.pixel_angles[k]), False)
+
+    def _union(self) -> tuple[Images, IntArray]:
+        """Return every image once, apart from all others, and labels that differ unless one piece has both.
+
+        An image of several pieces looks through the lens of the first.
+        """
+        names = sorted(self.of_name)
+        first = [self.of_name[name][0] for name in names]
+        lens_of = []
+        begins = np.cumsum([0, *(len(piece.model.images.lenses) for piece in self.pieces)])
+        lenses = [lens for piece in self.pieces for lens in piece.model.images.lenses]
+        for v in first:
+            number = int(self.cameras.piece_of[v])
+            lens_of.append(begins[number] + self.pieces[number].model.images.lens_of[self.row[v]])
+        used, lens_of_image = np.unique(lens_of, return_inverse=True)
+        example = self.pieces[0].model.images
+        images = replace(
+            example,
+            names=tuple(names),
+            ids=np.arange(len(names)),
+            frame_of=np.arange(len(names)),
+            lens_of=lens_of_image,
+            lenses=tuple(replace(lenses[k], id=number) for number, k in enumerate(used.tolist())),
+        ).apart()
+        is_shared = [len(self.of_name[name]) > 1 for name in names]
+        labels = np.where(is_shared, len(self.pieces) + np.arange(len(names)), self.cameras.piece_of[first])
+        return images, labels
+
+    def _by_keypoint(self, v: int, pixels: FloatArray) -> IntArray:
+        """Return the id of the point that each keypoint (k, 2) of a database observes; -1 for none."""
+        found = np.full(len(pixels), -1)
+        keypoints, points = self.observed[v]
+        if not len(keypoints) or not len(pixels):
+            return found
+        own = self.pictures[self.cameras.piece_of[v]].pixels(int(self.row[v]), keypoints)
+        places = np.minimum(keypoints, len(pixels) - 1)
+        if not np.abs(own - pixels[places]).max() <= _SAME_PIXEL:
+            from scipy.spatial import KDTree  # here, since it takes long to import
+
+            apart, nearest = KDTree(pixels).query(own)
+            places = np.asarray(nearest)
+            points = np.where(apart <= _SAME_PIXEL, points, -1)
+        found[places] = points
+        return found

@@ -1,0 +1,335 @@
+"""Pieces in one world: ShapeFit over their scales and places, then all seven unknowns of each by the rays.
+
+With the turn R_g of each piece known, x = s_g R_g c + t_g is linear in its scale and place, so the pieces are
+rigid groups with units of their own (`graph.groups`), and the program is the certified one of `solver.rigs`,
+over two kinds of directions:
+
+    pairs   from a camera to a camera of another piece
+    rays    from a camera to a point of another piece, which its keypoint observes there
+
+Three pairs at least tell a scale; one pair with rays does, and pieces that follow one another need these.
+Half of the weight goes to each kind, the rays of a pair count as the root of their number, and the program is
+solved twice, the second time with weights over lengths, so that angles count. Places are only as good as the
+turns, so that a robust refinement moves all seven unknowns, its scale of the residuals falling in steps.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.wording import counted
+from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.rigs.solve import solve_groups
+
+_MOST_RAYS = 30  # rays from one camera of a pair to the other's points; more tell nothing new
+_LEAST_LENGTH = 1e-6  # share of the median; ends that nearly coincide would have all of the weight
+_SCALES_PX = (32.0, 8.0, 2.0)  # pixels; a turn off by half a degree is 13 to 29 of them
+_STEPS = 10  # Gauss-Newton steps at each scale; most scales settle in fewer
+_SETTLED = 1e-5  # share of the cost; steps that lower it by less end a scale
+_SHIFT = 1e-6  # step of an unknown that tells its derivative; larger ones bend, smaller ones are rounding
+_EFFECTIVE = 10.0  # matches that count of a pair; its errors are common to all of them
+
+
+class Standing(NamedTuple):
+    """Where pieces stand in the world of piece 0."""
+
+    scales: FloatArray
+    """(G,)"""
+    turns: FloatArray
+    """(G, 3, 3) world_from_piece."""
+    middles: FloatArray
+    """(G, 3) where the mean center of each piece's cameras comes to lie."""
+
+    def similarity(self, piece: int, own_middles: FloatArray) -> Similarity:
+        """Return world_from_piece; `own_middles` (G, 3) are the mean centers in the pieces' worlds."""
+        scale, turn = float(self.scales[piece]), self.turns[piece]
+        shift = self.middles[piece] - scale * turn @ own_middles[piece]
+        return Similarity(scale=scale, rotation=turn, translation=shift)
+
+
+def solve_pieces(
+    cameras: PieceCameras, ties: PieceTies, directions: PairDirections, turns: FloatArray
+) -> Standing:
+    """Return where pieces stand by the convex program, with their turns (G, 3, 3) held.
+
+    Raises:
+        UnsolvableError: if the directions do not determine it, or turn a piece inside out.
+    """
+    usable = np.union1d(directions.usable(), np.flatnonzero(ties.is_shared))
+    rays = _rays_of(cameras, ties.subset(usable))
+    between = directions.usable()
+    num_cameras, num_rays = len(cameras.piece_of), len(rays.cameras)
+    pieces = np.concatenate([cameras.piece_of, rays.targets])
+    offsets = np.concatenate([cameras.centers, rays.points])
+    edges = np.concatenate(
+        [ties.matches.pairs[between], np.stack([num_cameras + np.arange(num_rays), rays.cameras], axis=1)]
+    )
+    if not len(edges):
+        raise UnsolvableError("no pair of images between them has a direction")
+    looks = np.einsum("rkl,rl->rk", turns[cameras.piece_of[rays.cameras]], rays.looks)
+    units = np.where(cameras.is_metric, 0, np.cumsum(~cameras.is_metric) - (not cameras.is_metric.any()))
+    every = RigidGroups(
+        group_of=pieces, offsets=np.einsum("nkl,nl->nk", turns[pieces], offsets), unit_of=units
+    )
+    nodes, renumbered = np.unique(edges, return_inverse=True)
+    groups = every.restricted_to(nodes)
+    seen = np.concatenate([directions.directions[between], looks])
+    sigmas = np.hypot(directions.sigma_deg()[between], 0.1)
+    weights = _halved(np.concatenate([directions.weights()[between], rays.weights]), len(between))
+    locations = np.zeros((0, 3))
+    for solve in range(2):
+        if solve:
+            lengths = np.linalg.norm(differences(locations, renumbered.reshape(-1, 2)), axis=1)
+            lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
+            weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
+        graph = ViewGraph(len(nodes), renumbered.reshape(-1, 2), seen, weights)
+        try:
+            locations = solve_groups(graph, groups, certified=False).locations
+        except UnsolvableError as error:
+            number = counted(len(usable), "pair")
+            raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error
+    centers, scales = groups.split(groups.fit(locations)[0])
+    scales = scales[units]
+    if not scales.min() > 0.0:
+        raise UnsolvableError("the pairs of images between them turn one of them inside out")
+    # `fit` returns where the origin of each group's own offsets comes to lie.
+    own = np.einsum("gkl,gl->gk", turns, cameras.middles())
+    middles = centers + scales[:, None] * own
+    back = turns[0].T
+    return Standing(
+        scales / scales[0],
+        back @ turns,
+        (middles - centers[0]) / scales[0] @ back.T,
+    )
+
+
+class _Rays(NamedTuple):
+    """Rays of cameras v to points of other pieces, r in all."""
+
+    cameras: IntArray
+    looks: FloatArray
+    """(r, 3) unit, in the world of the camera's piece."""
+    targets: IntArray
+    """Piece of the point."""
+    points: FloatArray
+    """(r, 3) in the world of that piece."""
+    pairs: IntArray
+    """Pair of cameras by which it is seen."""
+    pixel_angles: FloatArray
+
+    @property
+    def weights(self) -> FloatArray:
+        """Return the inverse root of the number of rays of a pair, (r,)."""
+        return np.asarray(np.bincount(self.pairs)[self.pairs] ** -0.5)
+
+
+def _rays_of(cameras: PieceCameras, ties: PieceTies) -> _Rays:
+    """Return some rays of every pair, both ways."""
+    found = []
+    pair_of = ties.pair_of
+    for way, rays in enumerate((ties.matches.rays_i, ties.matches.rays_j)):
+        there = np.isfinite(ties.points[:, 1 - way]).all(axis=1)
+        rows = _thinned(np.flatnonzero(there), pair_of)
+        pairs = pair_of[rows]
+        eyes, others = ties.matches.pairs[pairs, way], ties.matches.pairs[pairs, 1 - way]
+        looks = np.einsum("rk,rkl->rl", rays[rows], cameras.rotations[eyes])
+        found.append(
+            _Rays(
+                eyes,
+                looks,
+                cameras.piece_of[others],
+                ties.points[rows, 1 - way],
+                pairs,
+                ties.matches.pixel_angles[pairs],
+            )
+        )
+    return _Rays(*(np.concatenate(column) for column in zip(*found, strict=True)))
+
+
+def _thinned(rows: IntArray, pair_of: IntArray) -> IntArray:
+    """Return the rows with a bounded number of each pair, taken evenly."""
+    pairs = pair_of[rows]
+    starts = np.searchsorted(pairs, pairs)
+    steps = -(-np.bincount(pairs, minlength=1)[pairs] // _MOST_RAYS)
+    return np.asarray(rows[(np.arange(len(rows)) - starts) % steps == 0])
+
+
+def _halved(weights: FloatArray, first: int) -> FloatArray:
+    """Return positive weights whose first ones, and whose others, add up to the same."""
+    totals = weights[:first].sum(), weights[first:].sum()
+    return np.concatenate([weights[:first] / (totals[0] or 1.0), weights[first:] / (totals[1] or 1.0)])
+
+
+class Residuals(NamedTuple):
+    """Residuals of k rows, each between two pieces, in pixels."""
+
+    pieces: IntArray
+    """(k, 2)"""
+    pairs: IntArray
+    """(k,) pair of cameras."""
+    eyes: FloatArray
+    """(k, 3) center of the first piece's camera, in its world, from the middle of its cameras."""
+    looks: FloatArray
+    """(k, 3) its unit ray, there."""
+    targets: FloatArray
+    """(k, 3) in the second piece: the point, or the other camera's center."""
+    other_looks: FloatArray
+    """(k, 3) in the second piece, the other camera's unit ray; NaN where the target is a point."""
+    pixel_angles: FloatArray
+    """(k,)"""
+
+    def at(self, first: Standing, second: Standing) -> FloatArray:
+        """Return them, (k, 3), for the pieces of each row standing as given, a row each."""
+        eyes, targets = _stand(first, self.eyes), _stand(second, self.targets)
+        looks = np.einsum("rkl,rl->rk", first.turns, self.looks)
+        across = normalized(targets - eyes)
+        off = across - looks
+        rows = np.flatnonzero(np.isfinite(self.other_looks).all(axis=1))
+        others = np.einsum("rkl,rl->rk", second.turns[rows], self.other_looks[rows])
+        planes = [np.linalg.norm(np.cross(across[rows], one), axis=1) for one in (looks[rows], others)]
+        volume = np.vecdot(np.cross(looks[rows], others), across[rows])
+        off[rows] = 0.0
+        off[rows, 0] = volume / np.maximum(np.minimum(*planes), 1e-12)
+        return np.asarray(off / self.pixel_angles[:, None])
+
+
+def _stand(standing: Standing, places: FloatArray) -> FloatArray:
+    """Return where places (k, 3) come to lie, each in a piece of its own that stands as given."""
+    turned = np.einsum("rkl,rl->rk", standing.turns, places)
+    return np.asarray(standing.scales[:, None] * turned + standing.middles)
+
+
+def residuals_of(cameras: PieceCameras, ties: PieceTies) -> Residuals:
+    """Return the residuals of some matches of a pair: of rays to points or, where none is, of two rays."""
+    middles = cameras.middles()
+    rays = _rays_of(cameras, ties)
+    has_point = np.asarray(np.isfinite(ties.points).all(axis=2))
+    bare = ~has_point.any(axis=1) & ~ties.is_shared[ties.pair_of]
+    rows = _thinned(np.flatnonzero(bare), ties.pair_of)
+    pairs = ties.pair_of[rows]
+    i, j = ties.matches.pairs[pairs].T
+    looks = [
+        np.einsum("rk,rkl->rl", side[rows], cameras.rotations[eyes])
+        for side, eyes in ((ties.matches.rays_i, i), (ties.matches.rays_j, j))
+    ]
+    eyes = np.concatenate([rays.cameras, i])
+    pieces = np.stack([cameras.piece_of[eyes], np.append(rays.targets, cameras.piece_of[j])], axis=1)
+    return Residuals(
+        pieces=pieces,
+        pairs=np.append(rays.pairs, pairs),
+        eyes=cameras.centers[eyes] - middles[pieces[:, 0]],
+        looks=np.concatenate([rays.looks, looks[0]]),
+        targets=np.concatenate([rays.points, cameras.centers[j]]) - middles[pieces[:, 1]],
+        other_looks=np.concatenate([np.full_like(rays.looks, np.nan), looks[1]]),
+        pixel_angles=np.append(rays.pixel_angles, ties.matches.pixel_angles[pairs]),
+    )
+
+
+def misses_px(residuals: Residuals, standing: Standing) -> FloatArray:
+    """Return the sizes of residuals, (k,)."""
+    first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
+    return np.asarray(np.linalg.norm(residuals.at(first, second), axis=1))
+
+
+def refine_pieces(cameras: PieceCameras, ties: PieceTies, standing: Standing) -> tuple[Standing, FloatArray]:
+    """Return the standing of least robust (Cauchy) cost near one, and its covariance.
+
+    The covariance (G, 7, 7) of each piece but the first, which is 0, is that of its turn (rad), the logarithm
+    of its scale, and the place of its middle in sizes of the piece; infinite where nothing determines it.
+    """
+    residuals = residuals_of(cameras, ties)
+    sizes, free = cameras.sizes(), ~cameras.is_metric
+    counts = np.bincount(residuals.pairs, minlength=ties.num_pairs)[residuals.pairs]
+    weights = np.asarray(counts**-0.5, dtype=np.float64)
+    held = np.zeros((len(sizes), 7), dtype=np.bool_)
+    held[0] = True
+    held[:, 3] |= ~free
+    hessian = np.zeros((7 * len(sizes), 7 * len(sizes)))
+    for scale in _SCALES_PX:
+        damping = 1e-6
+        cost, hessian, slope = _linearize(residuals, standing, sizes, weights, scale)
+        for _ in range(_STEPS):
+            moved = _moved(standing, -_solve(hessian, slope, held.ravel(), damping), sizes)
+            then = _linearize(residuals, moved, sizes, weights, scale)
+            if not then[0] < cost:
+                damping *= 100.0
+                if damping > 1.0:
+                    break
+                continue
+            settled = cost - then[0] < _SETTLED * cost
+            standing, (cost, hessian, slope), damping = moved, then, damping / 10.0
+            if settled:
+                break
+    _, hessian, _ = _linearize(
+        residuals, standing, sizes, np.minimum(_EFFECTIVE / counts, 1.0), _SCALES_PX[-1]
+    )
+    return standing, _covariances(hessian, held)
+
+
+def _solve(hessian: FloatArray, slope: FloatArray, held: BoolArray, damping: float) -> FloatArray:
+    """Return the step of the free unknowns, damped along the diagonal."""
+    rows = np.flatnonzero(~held)
+    matrix = hessian[np.ix_(rows, rows)]
+    diagonal = np.diagonal(matrix)
+    matrix = matrix + np.diag(damping * diagonal + 1e-12 * (diagonal.max() or 1.0))
+    step = np.zeros(len(held))
+    step[rows] = np.linalg.solve(matrix, slope[rows])
+    return step
+
+
+def _covariances(hessian: FloatArray, held: BoolArray) -> FloatArray:
+    """Return the 7 x 7 blocks of the inverse of the free unknowns."""
+    rows = np.flatnonzero(~held.ravel())
+    values, vectors = np.linalg.eigh(hessian[np.ix_(rows, rows)])
+    least = 1e-12 * max(float(values.max(initial=0.0)), 1e-300)
+    whole = np.zeros((held.size, held.size))
+    whole[np.ix_(rows, rows)] = (vectors / np.maximum(values, least)) @ vectors.T
+    return np.stack([whole[k : k + 7, k : k + 7] for k in range(0, held.size, 7)])
+
+
+def _moved(standing: Standing, step: FloatArray, sizes: FloatArray) -> Standing:
+    """Return the pieces after a step (7 G,): turned about their middles, scaled, and shifted."""
+    from scipy.spatial.transform import Rotation  # here, since it takes long to import
+
+    by_piece = step.reshape(-1, 7)
+    return Standing(
+        standing.scales * np.exp(by_piece[:, 3]),
+        Rotation.from_rotvec(by_piece[:, :3]).as_matrix() @ standing.turns,
+        standing.middles + (standing.scales * sizes)[:, None] * by_piece[:, 4:],
+    )
+
+
+def _linearize(
+    residuals: Residuals, standing: Standing, sizes: FloatArray, weights: FloatArray, scale: float
+) -> tuple[float, FloatArray, FloatArray]:
+    """Return the Cauchy cost, and Hessian (7 G, 7 G) and slope (7 G,) of its reweighted squares."""
+    first, second = (Standing(*(part[ends] for part in standing)) for ends in residuals.pieces.T)
+    now = residuals.at(first, second)
+    squares = np.sum(now**2, axis=1) / scale**2
+    cost = float(weights @ np.log1p(squares)) * scale**2
+    robust = weights / (1.0 + squares)
+    num_unknowns = 7 * len(sizes)
+    columns = np.empty((len(now), 3, 14))
+    for k in range(7):
+        for end, own in enumerate((first, second)):
+            step = np.zeros((len(now), 7))
+            step[:, k] = _SHIFT
+            moved = _moved(own, step.ravel(), sizes[residuals.pieces[:, end]])
+            ends = (moved, second) if end == 0 else (first, moved)
+            columns[:, :, 7 * end + k] = (residuals.at(*ends) - now) / _SHIFT
+    hessian, slope = np.zeros((num_unknowns, num_unknowns)), np.zeros(num_unknowns)
+    for two in np.unique(residuals.pieces, axis=0):
+        rows = (residuals.pieces == two).all(axis=1)
+        places = (7 * two[:, None] + np.arange(7)).ravel()
+        part = columns[rows].reshape(-1, 14)
+        weighted = np.repeat(robust[rows], 3)[:, None] * part
+        hessian[np.ix_(places, places)] += weighted.T @ part
+        slope[places] += weighted.T @ now[rows].ravel()
+    return cost, hessian, slope

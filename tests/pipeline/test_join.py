@@ -1,0 +1,170 @@
+"""`join`: models of one scene in one world, and one sentence for each that cannot be."""
+
+import json
+from contextlib import closing
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
+from tests.facts.test_schema import problems
+from tests.models import only
+from tests.pipeline.made import DATABASE, FOLDER
+from tests.problems import turn
+from tests.program import run, run_refused
+from tests.scenes import COURTYARD, RING, fingerprint
+
+WHOLE = pycolmap.Reconstruction(FOLDER)
+IDS = sorted(WHOLE.reg_image_ids())
+MOVE = pycolmap.Sim3d(0.4, pycolmap.Rotation3d(turn([0.3, -0.2, 0.1], 70.0)), np.array([1.0, -2.0, 3.0]))
+
+
+def piece(ids, *, moved=False, renumbered=False, compact=False):
+    """Some images of the ring, in a world of their own, with the ids or the keypoints of another program."""
+    part = only(WHOLE, ids)
+    if moved:
+        part.transform(MOVE)
+    if not (renumbered or compact):
+        return part
+    other = pycolmap.Reconstruction()
+    (camera,) = part.cameras.values()
+    other.add_camera_with_trivial_rig(camera)
+    new, place = {}, {}
+    for k, i in enumerate(sorted(part.reg_image_ids()), start=1):
+        seen = [p for p, point in enumerate(part.image(i).points2D) if point.has_point3D() or not compact]
+        place |= {(i, p): row for row, p in enumerate(seen[::-1] if compact else seen)}
+        xy = np.array([part.image(i).points2D[p].xy for p in (seen[::-1] if compact else seen)])
+        image = pycolmap.Image(name=part.image(i).name, keypoints=xy, camera_id=camera.camera_id, image_id=k)
+        other.add_image_with_trivial_frame(image, part.image(i).cam_from_world())
+        new[i] = k
+    for point in part.points3D.values():
+        elements = [
+            pycolmap.TrackElement(new[e.image_id], place[e.image_id, e.point2D_idx])
+            for e in point.track.elements
+        ]
+        other.add_point3D(point.xyz, pycolmap.Track(elements), point.color)
+    return other
+
+
+def written(folder, *models):
+    """Write models to folders and return these."""
+    folders = [folder / str(k) for k in range(len(models))]
+    for path, model in zip(folders, models, strict=True):
+        path.mkdir()
+        write_model(model, path)
+    return folders
+
+
+def errors_of(model):
+    found = sfm_shapefit.evaluate(model, FOLDER)
+    return len(found.names), found.position.max / found.extent
+
+
+@pytest.mark.parametrize("adjust", ["none", "full"])
+def test_models_are_joined_in_the_world_of_the_first(tmp_path, adjust):
+    models = written(tmp_path, piece(IDS[:4]), piece(IDS[4:], moved=True))
+    before = [*map(fingerprint, models), DATABASE.read_bytes()]
+    out = tmp_path / "out"
+    shown = run("join", *models, out, "--database", DATABASE, "--adjust", adjust, code=0).output
+    assert before == [*map(fingerprint, models), DATABASE.read_bytes()]
+    facts = json.loads((out / "locate.json").read_text())
+    assert problems(facts, "joined") == []
+    (told,) = facts["joins"]
+    assert told["joined"]
+    assert (told["model"], told["to"]) == (str(models[1]), str(models[0]))
+    assert " ".join(told["statement"].split()[:3]) == f"{models[1]} is joined"
+    assert "joined" in shown
+    assert told["agreeing_pairs"] >= 3
+    assert (told["folder"], facts["models"]) == (".", [*map(str, models)])
+    assert ("image_undistorter" in shown) == (adjust == "full")
+    assert told["similarity"]["scale"] == pytest.approx(2.5, rel=1e-4)
+    assert 0.0 < told["scale_sigma"] < 0.01
+    assert errors_of(out) == (8, pytest.approx(0.0, abs=1e-4))
+    joined = pycolmap.Reconstruction(out)
+    first = pycolmap.Reconstruction(models[0])
+    if adjust == "none":  # the world is that of the first
+        for i in first.reg_image_ids():
+            np.testing.assert_array_equal(
+                joined.image(i).cam_from_world().matrix(), first.image(i).cam_from_world().matrix()
+            )
+    # Points that both see are one, so that there are no more than in the whole scene.
+    assert joined.num_points3D() <= 1.02 * WHOLE.num_points3D()
+    assert joined.compute_mean_reprojection_error() < 0.1
+    assert (out / "report.html").is_file()
+
+
+def test_models_that_share_images_are_joined_without_a_database_and_whatever_their_ids():
+    second = piece([*IDS[:1], *IDS[3:]], moved=True, renumbered=True)
+    found = sfm_shapefit.join([piece(IDS[:5]), second])
+    assert found.joins[0].statement.startswith("model 1 is joined to model 0 by 3 of 3 pairs of images")
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-5))
+    names = [image.name for image in found.reconstruction.images.values()]
+    assert sorted(names) == sorted(image.name for image in WHOLE.images.values())
+    assert found.reconstruction.num_points3D() <= 1.02 * WHOLE.num_points3D()
+
+
+def test_keypoints_of_another_program_are_found_in_the_database_by_their_pixels():
+    second = piece(IDS[4:], moved=True, compact=True)
+    firsts = [model.find_image_with_name("0006.jpg").points2D[0].xy for model in (second, WHOLE)]
+    assert not np.allclose(*firsts)  # in another order
+    known = []
+    for other in (second, piece(IDS[4:], moved=True)):
+        pieces = [ModelPiece(label="", model=read_model(model)) for model in (piece(IDS[:4]), other)]
+        with closing(
+            open_database(DATABASE, sorted(image.name for image in WHOLE.images.values()))
+        ) as matches:
+            tied = tie_pieces(pieces, matches, frozenset())
+        known.append(np.isfinite(tied.ties.points).all(axis=2).sum(axis=0).tolist())
+    assert known[0] == known[1]
+    assert min(known[0]) > 100
+    found = sfm_shapefit.join([piece(IDS[:4]), second], DATABASE)
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
+
+
+def test_three_models_are_joined_at_once():
+    parts = [piece(IDS[:3]), piece(IDS[3:6], moved=True), piece(IDS[6:] + IDS[:1], moved=True)]
+    found = sfm_shapefit.join(parts, DATABASE)
+    assert [join.join is not None for join in found.joins] == [True, True]
+    assert found.models == (0, 1, 2)
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
+
+
+def test_what_ties_too_little_is_refused_with_its_reason(tmp_path):
+    models = written(tmp_path, piece(IDS[:4]), piece([IDS[3], *IDS[5:]], moved=True))
+    told = run_refused("join", *models, tmp_path / "out", code=4)
+    assert f"{models[1]} is not joined to {models[0]}: no more than 1 of 1 pair of images" in told
+    assert "it needs 3" in told
+    assert not (tmp_path / "out").exists()
+    across = tmp_path / "without.txt"
+    names = [WHOLE.image(i).name for i in IDS]
+    across.write_text("\n".join(f"{a} {b}" for a in names[:4] for b in names[4:]))
+    with pytest.raises(UnsolvableError, match="no pair of images ties it to another"):
+        sfm_shapefit.join([piece(IDS[:4]), piece(IDS[4:])], DATABASE, without=str(across))
+
+
+def test_bad_input_is_one_sentence(tmp_path):
+    first, second, same = written(tmp_path, piece(IDS[:4]), piece(IDS[4:]), piece(IDS[1:3]))
+    out = tmp_path / "out"
+    assert "share no image, and there is no database" in run_refused("join", first, second, out)
+    assert f"every image of {same} is in {first} too" in run_refused("join", first, same, out)
+    other = COURTYARD / "images"
+    assert "images" in run_refused("join", first, second, out, "--database", other)
+    with pytest.raises(sfm_shapefit.InputError, match="needs two models or more"):
+        sfm_shapefit.join([first], DATABASE)
+    assert run("join", first, out, code=2).exit_code == 2
+    assert not out.exists()
+
+
+def test_a_database_that_knows_no_image_of_one_model_is_refused():
+    foreign = piece(IDS[4:])
+    renamed = {i: f"other{i}.jpg" for i in foreign.images}
+    for i, name in renamed.items():
+        foreign.image(i).name = name
+    with pytest.raises(sfm_shapefit.InputError, match=r"has no image of model 1, such as other\d"):
+        sfm_shapefit.join([RING / "sparse" / "0", foreign], DATABASE)
