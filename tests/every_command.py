@@ -1,4 +1,4 @@
-"""Run every command once; end with 1 if a kernel was compiled, and name it.
+"""Run every command once; end with 1 if one fails or a kernel was compiled, and name it.
 
     python -m tests.every_command OUT
 
@@ -21,7 +21,7 @@ COMMANDS = """
     solve data_synthetic/graph40.txt {out}/split --config {admm} -q
     map data_synthetic/ring8/database.db {out}/mapped -q
     map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --adjust full -q
-    locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
+    locate data_synthetic/ring8/sparse/0 {out}/fixed --fix data_synthetic/names.txt -q
     map data_synthetic/ring8/database.db {out}/halves --without data_synthetic/across.txt -q
     join {out}/halves/0 {out}/halves/1 {out}/whole --database data_synthetic/ring8/database.db -q
     check {out}/located --report {out}/check.html
@@ -52,6 +52,7 @@ if __name__ == "__main__":
     admm.write_text('solver = "admm"', encoding="utf-8")
     with events.install_listener("numba:compile", names):
         for command in COMMANDS.format(out=sys.argv[1], admm=admm).strip().splitlines():
-            app(command.split(), standalone_mode=False)
-    print("compiled:", *names.compiled, file=sys.stderr)  # noqa: T201
-    sys.exit(bool(names.compiled))
+            if app(command.split(), standalone_mode=False):
+                sys.exit(f"failed: {command}")
+    if names.compiled:
+        sys.exit(f"compiled: {' '.join(names.compiled)}")

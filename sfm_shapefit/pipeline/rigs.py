@@ -161,19 +161,31 @@ def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
     """Return which images (n,) are to stay where they are.
 
     Raises:
-        InputError: if the file of their names cannot be read, or a name is unknown.
+        InputError: if the file of their names cannot be read, a name is unknown, or nothing is left to place.
     """
     if not fix:
         return np.zeros(model.images.num_images, dtype=np.bool_)
-    if fix == FIX_SOLVED:
-        images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
-        solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
-        if not solved.any():
-            raise InputError(
-                "no image of the model observes a 3D point, so none is solved; name those to fix"
-            )
-        return solved
-    path, index = Path(fix), {name: k for k, name in enumerate(model.images.names)}
+    fixed = _solved_images(model) if fix == FIX_SOLVED else _named_images(model, Path(fix))
+    if fixed.all():
+        raise InputError(
+            "every posed image of the model would be fixed, so that none is left to place; name fewer, "
+            "or give the new images rotations first"
+        )
+    return fixed
+
+
+def _solved_images(model: ColmapModel) -> BoolArray:
+    """Return which images (n,) observe a 3D point."""
+    images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
+    solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
+    if not solved.any():
+        raise InputError("no image of the model observes a 3D point, so none is solved; name those to fix")
+    return solved
+
+
+def _named_images(model: ColmapModel, path: Path) -> BoolArray:
+    """Return which images (n,) a file names, one a line."""
+    index = {name: k for k, name in enumerate(model.images.names)}
     fixed = np.zeros(model.images.num_images, dtype=np.bool_)
     for number, line in enumerate(text_of(path).splitlines(), start=1):
         name = line.strip()

@@ -83,18 +83,16 @@ def solve_pieces(
     seen = np.concatenate([directions.directions[between], looks])
     sigmas = np.hypot(directions.sigma_deg()[between], 0.1)
     weights = _halved(np.concatenate([directions.weights()[between], rays.weights]), len(between))
-    locations = np.zeros((0, 3))
-    for solve in range(2):
-        if solve:
-            lengths = np.linalg.norm(differences(locations, renumbered.reshape(-1, 2)), axis=1)
-            lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
-            weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
-        graph = ViewGraph(len(nodes), renumbered.reshape(-1, 2), seen, weights)
-        try:
-            locations = solve_groups(graph, groups, certified=False).locations
-        except UnsolvableError as error:
-            number = counted(len(usable), "pair")
-            raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error
+    graph = ViewGraph(len(nodes), renumbered.reshape(-1, 2), seen, weights)
+    try:
+        locations = solve_groups(graph, groups, certified=False).locations
+        lengths = np.linalg.norm(differences(locations, graph.edges), axis=1)
+        lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
+        weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
+        locations = solve_groups(graph.with_weights(weights), groups, certified=False).locations
+    except UnsolvableError as error:
+        number = counted(len(usable), "pair")
+        raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error
     centers, scales = groups.split(groups.fit(locations)[0])
     scales = scales[units]
     if not scales.min() > 0.0:

@@ -287,6 +287,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     [
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
+        ("".join(f"000{k}.jpg\n" for k in range(1, 9)), "every posed image of the model would be fixed"),
         (None, "does not exist"),
         ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
