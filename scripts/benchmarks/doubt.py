@@ -1,4 +1,4 @@
-"""Doubt: are cameras with wrong rotations or focal lengths found, and right ones kept?
+"""Doubt: are cameras with wrong rotations found, and right ones kept?
 
 Cameras of scenes are turned by 2, 5, 20 and 180 degrees about random axes: one by one, and where a scene
 has 15 cameras or more, in groups of five that agree among themselves (a camera and those it shares most
@@ -8,14 +8,8 @@ it with a rotation that is off by more than half of the turn: the adjustment may
 is also run as it is; there a camera is right if its rotation is within 5 degrees of the truth, after the best
 common rotation, and a right camera is blamed if it was placed and is left out for want of trust.
 
-Focal lengths: a third of the images of a scene, or those of one of its cameras, get a camera of their own
-whose focal length is off by 10, 30 or 140 %. It is named if it is the first that is doubted; any other that
-is named is named falsely. Each scene is asked without an error, too.
-
 The scenes at hand were used for choosing the constants of `judgement.turns`; the drawn ones, of whose houses
-half look the same, were not. Those of `judgement.focal_lengths` were chosen on fountain-P11, Herz-Jesus-P8,
-castle-P19, lego100, brighton-beach, robots-1 and photographed; Herz-Jesus-P25, castle-P30, kerry-park and
-courtyard chose nothing there.
+half look the same, were not.
 """
 
 import argparse
@@ -32,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from harness.driver import ROOT, Benchmark, Case, if_there
-from harness.record import Check, Row, at_least, at_most
+from harness.record import Row, at_least, at_most
 from harness.scenes import WRONG_DEG, rotation_errors_deg, set_rotation, temporary_scene
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
@@ -41,7 +35,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.judged import judge as judge_placement
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras, question_focal_lengths
+from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.measure import Measured, Wanted, add_evidence, build_graph, measure, wants_points
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
@@ -58,12 +52,10 @@ SETS = {
     "kerry-park (global)": ("global", "global"),
 }
 """The model that gives rotations, and the truth."""
-WITHOUT_FOCAL_LENGTHS = {"kitti-turn", "kerry-park (global)", "lego100 (gt)"}
 BUNDLED = ("courtyard", "photographed")
 DRAWN = {"drawn ring": ("ring", 1), "drawn facade": ("facade", 2), "drawn courtyard": ("courtyard", 3)}
 """Shape and seed; half of the houses look the same."""
 ANGLES_DEG = (2.0, 5.0, 20.0, 180.0)
-FACTORS = (1.1, 0.9, 1.3, 0.7, 2.4, 1.0 / 2.4)
 TRUSTED = 0.6
 GROUP, LARGE_ENOUGH = 5, 15
 """Cameras of a group that is turned, and of the least scene in which groups are."""
@@ -81,7 +73,7 @@ class Scene(NamedTuple):
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
-    """Return the scenes, each once for rotations and once for focal lengths."""
+    """Return the scenes."""
     folders = {name: (args.data / name.split(" ")[0], *models) for name, models in SETS.items()}
     folders |= {name: (ROOT / "data_synthetic" / name, "sparse/0", "truth") for name in BUNDLED}
     if args.quick:
@@ -90,8 +82,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     for name, (folder, given, truth) in folders.items():
         scene = Scene(name, folder / given, folder / "database.db", folder / truth)
         found[name] = if_there(folder, partial(turn_cameras, scene, args.repeats))
-        if name not in WITHOUT_FOCAL_LENGTHS:
-            found[f"{name}, focal length"] = if_there(folder, partial(change_focal_lengths, scene))
     return found if args.quick else found | {name: partial(draw, name, args.repeats) for name in DRAWN}
 
 
@@ -227,42 +217,6 @@ def turn(
     return turned, np.flatnonzero(np.isin(images.frame_of, frames))
 
 
-def change_focal_lengths(scene: Scene) -> Row:
-    """Ask for focal lengths, where one camera has a wrong one and where none has."""
-    model = read_model(scene.model)
-    images = [np.flatnonzero(model.images.lens_of == k) for k in range(len(model.images.lenses))]
-    if len(images) == 1:
-        images = [np.arange(model.images.num_images)[::3], np.arange(model.images.num_images // 3)]
-    asked, named, false = 0, 0, 0
-    for chosen in images:
-        for factor in (1.0, *FACTORS):
-            changed, camera = change_camera(model, chosen, factor)
-            with measured(changed, scene) as (source, told):
-                found = question_focal_lengths(source, told.directions, THREADS)
-            right = factor != 1.0 and [doubt.camera for doubt in found[:1]] == [camera]
-            asked += factor != 1.0
-            named += right
-            false += len(found) - right
-    cells = {"scene": scene.name, "named": f"{named} of {asked}", "falsely": false}
-    checks = [Check("named", named / asked, 1.0, "higher"), Check("false", false, 0)]
-    return Row(cells, checks, "Focal lengths")
-
-
-def change_camera(model: ColmapModel, images: IntArray, factor: float) -> tuple[ColmapModel, int]:
-    """Return a model some of whose images have another camera, of another focal length, and its row."""
-    own, rotations = model.images.apart(), model.images.rotations
-    first = own.lenses[own.lens_of[images[0]]]
-    params = list(first.parameters)
-    for k in range(1 if first.model.startswith(("SIMPLE", "RADIAL")) else 2):
-        params[k] *= factor
-    lens_of, new_id = own.lens_of.copy(), own.lenses[-1].id + 1
-    lens_of[images] = len(own.lenses)
-    lenses = (*own.lenses, replace(first, parameters=tuple(params), id=new_id))
-    alone = replace(own, lenses=lenses, lens_of=lens_of, sensors=own.sensors.part(np.zeros(len(lenses), int)))
-    used = alone.part(np.arange(own.num_images))  # only lenses that an image looks through
-    return replace(model, images=used.turned_to(rotations)), len(used.lenses) - 1
-
-
 BENCHMARK = Benchmark(
     name="doubt",
     title="Doubt",
@@ -274,7 +228,5 @@ BENCHMARK = Benchmark(
         "right ones left out": "cameras; in the scene as it is",
         "kept": "cameras that are turned, trusted and delivered off",
         "others left out": "1; share of the right cameras, while others are turned",
-        "named": "runs in which the camera with the wrong focal length is named",
-        "falsely": "cameras with a right focal length, and named",
     },
 )

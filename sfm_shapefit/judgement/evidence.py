@@ -20,6 +20,7 @@ from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.scene.points import Points
 
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
 _EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
@@ -49,12 +50,21 @@ class PairFits:
         pairs, directions = measured.pairs[rows], measured.directions[rows]
         return find_other_places(self.centers, pairs, directions, self.agrees[rows], self.level_deg)
 
-    def count_held(self) -> int:
-        """Return the number of cameras in the largest rigid piece of the pairs that agree."""
-        pairs = self.directions.pairs[self.agrees]
-        if not len(pairs):
+    def count_held(self, points: Points | None = None) -> int:
+        """Return the number of cameras in the largest rigid piece of the pairs that agree.
+
+        Points of three images or more tie them too, as on a chain of neighbors, whose pairs tell no lengths.
+        """
+        n, edges = len(self.centers), self.directions.pairs[self.agrees]
+        if not len(edges):
             return 0
-        return len(np.unique(pairs[parallel_rigid_pieces(len(self.centers), pairs, 3) == 0]))
+        if points is not None:
+            ties = points.taken(np.isin(points.images, edges))
+            ties = ties.taken((ties.lengths() > 2)[ties.points_seen()])
+            edges = np.concatenate([edges, np.stack([ties.images, n + ties.points_seen()], axis=1)])
+            n += ties.num_points
+        held = np.unique(edges[parallel_rigid_pieces(n, edges, 3) == 0])
+        return int(np.searchsorted(held, len(self.centers)))
 
     def cuts(self) -> tuple[Cut, ...]:
         """Return the groups that contradictions cut off."""
@@ -117,6 +127,6 @@ class ModelEvidence:
     seams: tuple[Seam, ...] = ()
     """By rows of the images."""
     num_held: int | None = None
-    """Cameras in the largest rigid piece of the pairs that agree; None without pairs."""
+    """Cameras of the largest rigid piece of pairs that agree, and points that fit; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""

@@ -2,8 +2,8 @@
 
 Do not use, if any of these holds:
 
-    the pairs that agree hold less than half of the cameras in one rigid piece, however many contradict; of a
-    bare graph, the residuals of its directions have a level above 5 degrees
+    the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
+    however many contradict; of a bare graph, the residuals of its directions have a level above 5 degrees
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of the cameras that were placed are in the output, or of all images
@@ -50,7 +50,7 @@ MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model i
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
 _LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
-_LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
+LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
 _MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
 _MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
 _LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
@@ -132,7 +132,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     if apart:
         clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
         (reasons if len(apart) > _MOST_APART * count else suspicions).append(clause)
-    if evidence.num_held is not None and evidence.num_held < _LEAST_HELD * count:
+    if evidence.num_held is not None and evidence.num_held < LEAST_HELD * count:
         reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
     if len(named) > _MOST_NAMED * count:
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")

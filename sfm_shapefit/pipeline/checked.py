@@ -52,7 +52,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
+from sfm_shapefit.pipeline.evidence import Structure, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -160,13 +160,11 @@ def _measure(
 
 def _question(model: ColmapModel, matches: MatchSource, fits: PairFits | None, clock: Clock) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use."""
-    images, evidence = model.images, ModelEvidence()
+    images = model.images
     with clock("evidence"):
-        if fits is not None:
-            evidence = question_pairs(matches, fits, clock.threads)
         points = points_of(model.reconstruction, images)
         pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
-        return gather_evidence(images, points, pictures, evidence, clock.threads)
+        return gather_evidence(matches, fits, Structure(points, images, pictures), clock.threads)
 
 
 def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:

@@ -1,51 +1,59 @@
 """Ask for evidence that the fit did not use: of our own models, and of any that is looked at."""
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
+from sfm_shapefit.judgement.grade import LEAST_HELD
 from sfm_shapefit.judgement.seams import Cut, Seam, find_seams
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
+from sfm_shapefit.tracks.filter import keypoint_errors_px
+
+_FITTING_PX = 4.0  # pixels, reprojection error of an observation that holds its camera, as COLMAP has it
+_MOST_POINTS = 40  # points per image that are asked what they hold; a few of each suffice
+
+
+class Structure(NamedTuple):
+    """The points of a model, and what they are seen with."""
+
+    points: Points
+    """Of the images."""
+    images: Images
+    """Where the model has them; NaN where it does not."""
+    pictures: Pictures
+    """Keypoints and lenses of the images."""
+    among: BoolArray | None = None
+    """(i,) images that make the points; all if None."""
 
 
 def gather_evidence(
-    images: Images,
-    points: Points,
-    pictures: Pictures,
-    pairs: ModelEvidence,
-    threads: int,
-    among: BoolArray | None = None,
+    source: MatchSource, fits: PairFits | None, structure: Structure, threads: int
 ) -> ModelEvidence:
-    """Return the evidence of a model's pairs, and that of its points.
-
-    Args:
-        images: where the model has them; NaN where it does not.
-        points: of the images.
-        pictures: keypoints and lenses of the images.
-        pairs: evidence of its pairs.
-        threads: number of threads to use.
-        among: (i,) images that make the points; all if None.
-    """
-    _, lenses = question_lenses(points, images, pictures, threads, among)
-    return replace(pairs, lenses=lenses)
-
-
-def question_pairs(source: MatchSource, fits: PairFits, threads: int) -> ModelEvidence:
-    """Return what the pairs of a source say against where its images stand.
+    """Return the evidence against a model that its fit did not use.
 
     Args:
         source: the images, at the rotations of the model, and their matches.
-        fits: of all pairs, their directions measured at these rotations.
+        fits: of all pairs, their directions measured at these rotations; None if there are none.
+        structure: the points of the model.
         threads: number of threads to use.
     """
+    points, images, pictures, among = structure
+    _, lenses = question_lenses(points, images, pictures, threads, among)
+    if fits is None:
+        return ModelEvidence(lenses=lenses)
     seams = _question_cuts(source, fits.cuts(), threads)
-    return ModelEvidence(places=fits.other_places(), seams=seams, num_held=fits.count_held())
+    held = fits.count_held()
+    if held < LEAST_HELD * images.num_images:
+        step = max(points.num_points // (_MOST_POINTS * images.num_images), 1)
+        fitting = keypoint_errors_px(points, images, pictures) <= _FITTING_PX
+        held = max(held, fits.count_held(points.taken(fitting & (points.points_seen() % step == 0))))
+    return ModelEvidence(lenses=lenses, places=fits.other_places(), seams=seams, num_held=held)
 
 
 def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:

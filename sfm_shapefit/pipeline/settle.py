@@ -46,7 +46,7 @@ from sfm_shapefit.pipeline.adjustment import (
 )
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import gather_evidence, question_pairs
+from sfm_shapefit.pipeline.evidence import Structure, gather_evidence
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
 from sfm_shapefit.pipeline.given import Given
@@ -231,14 +231,15 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     placement, source = stand.placement, stand.source
     centers = np.full((source.images.num_images, 3), np.nan)
     centers[placement.cameras[kept]] = placement.locations[kept]
-    pairs = question_pairs(source, fit_pairs(centers, stand.directions), clock.threads)
+    fits = fit_pairs(centers, stand.directions)
     images, points, among = seeded.images, seeded.points, seeded.images.is_posed
     if placement.piece == 0 and source.has_database:
         images = _place_all(stand, images)
     if (others := images.is_posed & ~among).any():
         points = points.seen_by(others, source.view.num_keypoints, source.view.links())
     pictures = ModelPictures(images, source.view.keypoints)
-    return gather_evidence(images, points, pictures, pairs, clock.threads, among)
+    structure = Structure(points, images, pictures, among)
+    return gather_evidence(source, fits, structure, clock.threads)
 
 
 def _place_all(stand: Stand, images: Images) -> Images:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
 from sfm_shapefit.base.wording import counted
@@ -83,13 +83,15 @@ def solve_pieces(
     seen = np.concatenate([directions.directions[between], looks])
     sigmas = np.hypot(directions.sigma_deg()[between], 0.1)
     weights = _halved(np.concatenate([directions.weights()[between], rays.weights]), len(between))
-    graph = ViewGraph(len(nodes), renumbered.reshape(-1, 2), seen, weights)
+    pairs = frozen(renumbered.reshape(-1, 2))
     try:
+        graph = ViewGraph(len(nodes), pairs, seen, weights)
         locations = solve_groups(graph, groups, certified=False).locations
-        lengths = np.linalg.norm(differences(locations, graph.edges), axis=1)
+        lengths = np.linalg.norm(differences(locations, pairs), axis=1)
         lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
         weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
-        locations = solve_groups(graph.with_weights(weights), groups, certified=False).locations
+        graph = ViewGraph(len(nodes), pairs, seen, weights)
+        locations = solve_groups(graph, groups, certified=False).locations
     except UnsolvableError as error:
         number = counted(len(usable), "pair")
         raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error

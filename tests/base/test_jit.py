@@ -83,7 +83,6 @@ def test_a_second_process_compiles_nothing(tmp_path):
     if done.returncode:  # it had to compile: the next one must not
         done = run_python("-m", "tests.every_command", tmp_path / "second")
     assert done.returncode == 0, done.stderr[-500:]
-    assert done.stderr.splitlines()[-1] == "compiled:"
 
 
 COMPILE = """

@@ -6,6 +6,7 @@ import pytest
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.scene.points import Points
 from tests.judgement.test_seams import EVERY, GROUP, N
 
 
@@ -68,6 +69,25 @@ def test_the_cameras_that_agreeing_pairs_hold_are_counted(centers):
     moved[GROUP] += [0.0, 3.0, 0.0]
     assert fit_pairs(moved, measured(centers)).count_held() == N - len(GROUP)
     assert fit_pairs(-centers, measured(centers)).count_held() == 0
+
+
+def test_points_of_three_images_hold_a_chain_whose_pairs_tell_no_lengths(centers):
+    off_deg = np.where(EVERY[:, 1] - EVERY[:, 0] == 1, 0.0, 30.0)
+    fits = fit_pairs(centers, measured(centers, off_deg=off_deg))
+    assert fits.count_held() == 2
+    seen = np.array([[k, k + 1, k + 2] for k in range(4, N - 2) for _ in range(2)])
+    of_three = points_seen_by(seen)
+    assert fits.count_held(of_three) == N - 4
+    assert fits.count_held(of_three.taken(np.arange(seen.size) % 3 < 2)) == 2  # points of two tell no length
+
+
+def points_seen_by(images):
+    """Points, each seen by a row of images."""
+    (x, many), none = images.shape, np.zeros(images.size, dtype=np.int64)
+    offsets = many * np.arange(x + 1)
+    return Points(
+        xyz=np.zeros((x, 3)), offsets=offsets, images=images.ravel(), keypoints=none, ids=np.arange(x)
+    )
 
 
 def test_pairs_whose_matches_contradict_the_rotations_count_and_others_without_direction_do_not(centers):
