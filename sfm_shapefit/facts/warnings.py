@@ -23,7 +23,7 @@ again and again, where half of the cameras were shifted by a house without a con
 _FEWEST_TWOFOLD = 3  # pairs on two directions; fewer prove nothing
 
 _GROSS = 4.0  # standard deviations about each axis; of 1,000 rotations, one is off by more by chance
-_MEDIAN_TURN = 1.538  # median angle of turns that are normal about each axis, in their standard deviations
+_MEDIAN_TURN = 1.538  # standard deviations; median angle of turns that are normal about each axis
 
 
 def wrong_rotations(turned_deg: FloatArray) -> IntArray:

@@ -5,8 +5,8 @@
 so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
-for instant-ngp and the original NeRF. Of what is read only poses and focal lengths count: other programs
-shrink images, and have distortions of their own.
+for instant-ngp and the original NeRF. Only poses and focal lengths are read: other programs shrink images, and have
+distortions of their own.
 
 Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
@@ -50,7 +50,10 @@ def read_nerf(file: Path) -> ListedPoses:
     """
     content = JsonNode(file, "", read_json(file))
     if not content.has("frames"):
-        raise content.error("has no key 'frames': give a transforms.json of NeRF's kind")
+        raise InputError(
+            f"{file} has no key 'frames'; give a transforms.json of NeRF's kind, or a COLMAP folder "
+            "(`convert` makes one of OpenSfM's reconstruction.json)"
+        )
     names, rotations, centers, focals = [], [], [], []
     for frame in content.get("frames").elements():
         node = frame.get("transform_matrix")

@@ -45,7 +45,7 @@ missed: scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's 
 """
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
-_ROUGH_WIDTH = 2.0  # standard deviations of an image's rotation by which rough ones make rays miss
+_ROUGH_WIDTH = 2.0  # standard deviations of an image's rotation; by as much rough ones make rays miss
 _PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
 _STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
 
