@@ -5,8 +5,8 @@
 so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
-for instant-ngp and the original NeRF. Only poses and focal lengths are read: other programs shrink images, and have
-distortions of their own.
+for instant-ngp and the original NeRF. Only poses and focal lengths are read: other programs shrink images,
+and have distortions of their own.
 
 Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 """

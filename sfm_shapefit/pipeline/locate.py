@@ -5,6 +5,7 @@ Each stage is one function from values to a new value; the input is never change
 
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,7 @@ def locate(
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
+            source = replace(source, fixed=rigid.fixed if rigid.fixed.any() else None)
         told = Given(
             template,
             images,
