@@ -348,9 +348,7 @@ def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
     names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
     arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
     done = run(*arguments, names, code=0)
-    assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
-        done.output.replace("│", " ").split()
-    )
+    assert "3 cameras fixed" in " ".join(done.output.replace("│", " ").split())
     given, after = (poses_of(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
     for k in (1, 2, 3):
         np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
