@@ -8,7 +8,8 @@ from scipy.sparse.linalg import spilu, splu
 from sfm_shapefit.laplacian import superlu
 from tests.program import run_python
 
-HEAVY = {"scipy.special", "scipy.linalg", "scipy.sparse", "scipy.spatial", "pydantic", "rich", "cvxpy"}
+SCIPY = {"scipy.special", "scipy.linalg", "scipy.sparse", "scipy.spatial"}
+HEAVY = SCIPY | {"pydantic", "rich", "cvxpy", "multiprocessing.connection", "sfm_shapefit.report"}
 LOCATE = ["locate", "data_synthetic/courtyard/sparse/0", "{out}", "--quiet", "--no-report"]
 
 
