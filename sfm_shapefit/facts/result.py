@@ -44,7 +44,6 @@ from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, wit
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
-from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
@@ -439,10 +438,6 @@ class GraphResult(Written):
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
-    geometries: EpipolarGeometries | None = None
-    """The relative poses that the directions came from, if it has any."""
-    rotations: FloatArray | None = None
-    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
     @cached_property
     def facts(self) -> GraphFacts:

@@ -21,9 +21,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.placement.piece_program import (
     Standing,

@@ -21,6 +21,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.rotation_vectors import rotations_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -303,12 +304,10 @@ def _covariances(hessian: FloatArray, held: BoolArray) -> FloatArray:
 
 def _moved(standing: Standing, step: FloatArray, sizes: FloatArray) -> Standing:
     """Return the pieces after a step (7 G,): turned about their middles, scaled, and shifted."""
-    from scipy.spatial.transform import Rotation  # here, since it takes long to import
-
     by_piece = step.reshape(-1, 7)
     return Standing(
         standing.scales * np.exp(by_piece[:, 3]),
-        Rotation.from_rotvec(by_piece[:, :3]).as_matrix() @ standing.turns,
+        rotations_of(by_piece[:, :3]) @ standing.turns,
         standing.middles + (standing.scales * sizes)[:, None] * by_piece[:, 4:],
     )
 
