@@ -9,7 +9,7 @@ import numpy as np
 from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
