@@ -82,7 +82,7 @@ class JoinedModel(Written):
     def told(self) -> Telling:
         """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
         told = self.facts.told(self.cameras, self.pairs)
-        joins = [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        joins = [row("join", one.statement) for one in self.joins]
         return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
 
     def _headline(self) -> str:
@@ -163,7 +163,7 @@ class MapResult(Written):
             lines += [title, *told.lines] if several else told.lines
             rows += told.rows
             details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
-        rows += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        rows += [row("join", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
         rows += [Row("warning", self.warnings)]

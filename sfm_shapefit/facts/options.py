@@ -119,8 +119,8 @@ class MapOptions(Composed):
 
     join: Join = option(
         "safe",
-        'Models that stand apart: "safe" joins those that position priors or points seen by both tie '
-        'together beyond doubt, with a standard deviation, into a further folder; "never" joins none.',
+        'Whether several models are joined: "safe", into a further folder, those that position priors or '
+        'points seen by both tie together beyond doubt; "never", none.',
     )
     averaging: AveragingOptions = group(AveragingOptions)
     directions: DirectionOptions = group(DirectionOptions)

@@ -35,6 +35,7 @@ import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
@@ -248,7 +249,7 @@ def _grade(
     right = {model.images.names[k] for k in confirmed}
     weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
     named = tuple(dict.fromkeys([*against.cameras, *weak]))
-    if bad := (*_reasons_against(model.images, fits), *against.reasons):
+    if bad := (*_reasons_against(model.images, fits),) or against.reasons:
         return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
     pointless = model.reconstruction.num_points3D() == 0
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
@@ -261,7 +262,10 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
     if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
         yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
     elif fits is None or not np.isfinite(fits.residuals_deg).any():
-        yield "no two of its images have matches that say in which direction they stand from each other"
+        against = 0 if fits is None else int(fits.contradicts.sum())
+        none = "no two of its images have matches that say in which direction they stand from each other"
+        wrong = f"{counted(against, 'pair')} contradict its rotations, and none agrees: is this its database?"
+        yield wrong if against else none
 
 
 def _tell(

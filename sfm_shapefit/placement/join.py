@@ -354,6 +354,6 @@ def _reason_of_few(join: PieceJoin, *, has_rival: bool) -> str:
             "image, which may be taken for another; match others"
         )
     return (
-        f"no more than {agreeing} of {counted(total, 'pair')} of images between them agree on one join, and "
-        f"it needs {FEWEST_PAIRS}; match more of their images with one another"
+        f"{agreeing or 'none'} of {counted(total, 'pair')} of images between them agree on one join, and it "
+        f"needs {FEWEST_PAIRS}; match more of their images with one another, if they show one scene"
     )

@@ -10,7 +10,7 @@ import pytest
 from sfm_shapefit.report.page import write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
 from tests.drawings import make_drawing
-from tests.report.test_report_page import HOSTILE
+from tests.report.test_report_page import HOSTILE, doubted
 
 SCENE = "const scene = document.getElementById('scene').scene;"
 LABELS = "return [...document.querySelectorAll('#overlay .label')].map((one) => one.textContent);"
@@ -89,7 +89,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
 
 
 def test_a_click_on_a_row_chooses_its_camera_flies_there_and_the_scene_stays_in_view(driver, report):
-    row = driver.find_element("css selector", "#cameras tbody tr:nth-child(3)")
+    row = driver.find_element("css selector", "#cameras tbody tr[data-row='2']")
     k = int(row.get_attribute("data-row"))
     driver.execute_script("arguments[0].scrollIntoView({block: 'end'}); arguments[0].click()", row)
     assert driver.execute_script(SELECTED) == f"camera:{k}"
@@ -112,7 +112,7 @@ def test_a_click_in_the_scene_takes_the_camera_and_not_a_pair_drawn_over_it(driv
     ActionChains(driver).click().perform()
     assert driver.execute_script(SELECTED) == "camera:9"
     row = driver.find_element("css selector", "#cameras tr[aria-selected=true]")
-    assert row.find_element("css selector", "td span").text == name
+    assert row.find_element("css selector", "td.name").text == name
     assert driver.find_element("css selector", "#details h3").text == name
     assert complaints(driver) == []
 
@@ -138,16 +138,14 @@ def test_a_click_on_a_line_takes_the_pair_and_shows_its_two_cameras(driver, repo
     ActionChains(driver).move_to_element_with_offset(canvas, *shift).pause(0.2).click().perform()
     assert driver.execute_script(SELECTED).startswith("pair:")
     shown = [button.text for button in driver.find_elements("css selector", "#details .link")]
-    names = [
-        c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name span")
-    ]
+    names = [c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name")]
     assert shown == names
     assert driver.execute_script(LABELS) == shown
 
 
 def test_tables_sort_filter_and_turn_pages(driver, report):
     def first():
-        return driver.find_element("css selector", "#cameras tbody td span").text
+        return driver.find_element("css selector", "#cameras tbody td.name").text
 
     heading = driver.find_element("css selector", "#cameras th button")
     driver.execute_script("arguments[0].click()", heading)
@@ -160,7 +158,7 @@ def test_tables_sort_filter_and_turn_pages(driver, report):
         "const box = document.querySelector('#cameras input'); box.value = 'img_00007';"
         "box.dispatchEvent(new Event('input'));"
     )
-    shown = driver.find_elements("css selector", "#cameras tbody td.name span")
+    shown = driver.find_elements("css selector", "#cameras tbody td.name")
     assert [name.text for name in shown] == ["images/IMG_00007.jpg"]
 
 
@@ -220,7 +218,7 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     for row in range(len(HOSTILE)):
-        driver.execute_script(f"document.querySelectorAll('#cameras tbody tr')[{row}].click()")
+        driver.execute_script(f"document.querySelector(\"#cameras tr[data-row='{row}']\").click()")
     driver.execute_script("document.querySelector('#pairs tbody tr').click()")
     assert "owned" not in driver.title
     made = "return document.querySelectorAll('main img, main b:not(.tile b), main a').length"
@@ -228,6 +226,29 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     assert driver.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     assert complaints(driver) == []
     assert requests(driver) == []
+
+
+def test_groups_that_stand_apart_have_colors_and_another_place_is_a_ghost(driver, tmp_path):
+    path = tmp_path / "report.html"
+    write_report(*doubted(), path)
+    opened(driver, path)
+    assert driver.find_element("id", "legend").text.split("\n") == ["the rest", "group 1", "group 2"]
+    layer = f"{SCENE} return scene.layers.find((one) => one.name === 'elsewhere').ghosts.instances;"
+    assert driver.execute_script(layer) == 1
+    seen = []
+    for shown in (True, False):
+        only = f"one.shown = {str(shown).lower()} && one.name === 'elsewhere'"
+        driver.execute_script(f"{SCENE} scene.layers.forEach((one) => {{ {only}; }});")
+        seen.append(driver.execute_script(COLORS)["count"])
+    assert seen[0] > seen[1] == 1
+    name = doubted()[0].cameras.names[9]
+    rows = driver.execute_script("return [...document.querySelectorAll('#cameras tr[data-row]')].length")
+    assert rows == 10
+    search = driver.find_element("css selector", "#cameras input")
+    search.send_keys(name)
+    click(driver, "#cameras tbody tr")
+    assert "2.29 units away, by 5 pairs; 2 for where it is" in driver.find_element("id", "details").text
+    assert complaints(driver) == []
 
 
 def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_out_is_a_ghost(
