@@ -59,6 +59,8 @@ from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from sfm_shapefit.report.drawing import Drawing
 
 # The header says what set these limits.
@@ -83,6 +85,11 @@ class CheckResult(Reported):
     quality: ImageQuality
     facts: CheckedFacts
     """The figures, as `check --json` prints them."""
+
+    @property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """The model as read, so that the result serves as a model."""
+        return self.model.reconstruction
 
     @property
     def verdict(self) -> ModelVerdict:
@@ -227,12 +234,12 @@ def _weaknesses(quality: ImageQuality, k: int, usual: _Usual, pairs: tuple[int, 
     if len(quality.point_errors_px) == 0:
         pass  # said of the whole model
     elif quality.num_points[k] < _FEWEST_POINTS:
-        yield f"it sees only {quality.num_points[k]} 3D points"
+        yield f"it sees {f'only {quality.num_points[k]}' if quality.num_points[k] else 'no'} 3D points"
     elif quality.coverage[k] < _LEAST_COVERAGE:
         yield f"its points cover only {quality.coverage[k]:.0%} of the picture"
     if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual.error_px):
-        error_px, usual_px = quality.errors_px[k], usual.error_px
-        yield f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
+        error_px = f"{quality.errors_px[k]:.1f} px, where {usual.error_px:.1f} px is usual"
+        yield f"its reprojection error is {error_px}"
     if total >= _FEWEST_PAIRS and wrong > total * max(_LARGE_SHARE, _SHARE_OF_USUAL * usual.share):
         yield f"{wrong} of its {total} pairs contradict where it stands"
 
@@ -263,9 +270,8 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
         yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
     elif fits is None or not np.isfinite(fits.residuals_deg).any():
         against = 0 if fits is None else int(fits.contradicts.sum())
-        none = "no two of its images have matches that say in which direction they stand from each other"
-        wrong = f"{counted(against, 'pair')} contradict its rotations, and none agrees: is this its database?"
-        yield wrong if against else none
+        wrong = f"{counted(against, 'pair')} contradict its rotations and none agrees: is this its database?"
+        yield wrong if against else "no two of its images have matches that say how they stand to each other"
 
 
 def _tell(

@@ -324,7 +324,7 @@ def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
     agreeing, against = own & joint.agrees, own & ~joint.agrees
     shared = int(np.sum(evidence.ties.is_shared & agreeing))
     pairs = f"{int(agreeing.sum())} of {counted(int(own.sum()), 'pair')} of images between them"
-    same = f", {shared} of which {'is' if shared == 1 else 'are'} one image in both" if shared else ""
+    same = f", {shared} by {'an image' if shared == 1 else 'images'} that both have" if shared else ""
     return PieceJoin(
         piece=int(evidence.numbers[k]),
         to=int(evidence.numbers[0]),

@@ -547,6 +547,15 @@ def test_json_in_the_place_of_a_model_or_graph_is_told_what_is_wanted(tmp_path):
     assert "is a file; give the folder that holds cameras" in run_refused("locate", path, tmp_path / "out")
 
 
+def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):
+    path = tmp_path / "transforms.json"
+    path.write_text("{}\n")
+    said = run_refused("join", RING_MODEL, RING_MODEL, path)
+    assert said.endswith("is a file, but OUT is a folder to be made; the order is MODEL MODEL... OUT\n")
+    database = RING / "database.db"
+    assert f"so give {database} first" in run_refused("map", ring_run[1], database)
+
+
 def test_the_values_that_flags_take_are_named_in_words():
     text = run("locate", "--help-all").stdout
     assert "--known-distance NAME NAME DISTANCE" in text

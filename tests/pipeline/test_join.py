@@ -132,6 +132,10 @@ def test_three_models_are_joined_at_once():
     found = sfm_shapefit.join(parts, DATABASE)
     assert [join.join is not None for join in found.joins] == [True, True]
     assert found.models == (0, 1, 2)
+    assert repr(found).startswith("<JoinedModel: 8 images of 3 models, ")
+    assert found.warnings == []
+    assert list(found.table("cameras")["name"]) == [camera.name for camera in found.cameras]
+    assert errors_of(sfm_shapefit.check(found, DATABASE)) == errors_of(found)
     assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
 
 
@@ -157,6 +161,8 @@ def test_bad_input_is_one_sentence(tmp_path):
     assert "images" in run_refused("join", first, second, out, "--database", other)
     with pytest.raises(sfm_shapefit.InputError, match="needs two models or more"):
         sfm_shapefit.join([first], DATABASE)
+    with pytest.raises(sfm_shapefit.InputError, match="needs two models or more"):
+        sfm_shapefit.join(str(first), DATABASE)
     assert run("join", first, out, code=2).exit_code == 2
     assert not out.exists()
 

@@ -9,7 +9,7 @@ const makeTable = (id, kind, total, columns, text, why, onChoice) => {
   let chosen = null;
   const search = element("input");
   search.type = "search";
-  search.placeholder = "Filter by name";
+  search.placeholder = "Filter";
   search.setAttribute("aria-label", `Filter ${kind}s by name`);
   const back = button("Back", "quiet", () => { page -= 1; draw(); });
   const next = button("Next", "quiet", () => { page += 1; draw(); });
