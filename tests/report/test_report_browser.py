@@ -36,6 +36,30 @@ COLORS = """
 """
 
 
+DATA = "document.getElementById('data').textContent"
+# Where a camera is seen, and the box of the ghosts at other places alone, in pixels.
+GHOST_BOX = """
+    const scene = document.getElementById('scene').scene, canvas = document.getElementById('canvas');
+    const ghosts = scene.layers.find((one) => one.name === 'elsewhere');
+    ghosts.segments = null;
+    ghosts.shown = true;
+    scene.draw();
+    const copy = document.createElement('canvas');
+    [copy.width, copy.height] = [canvas.width, canvas.height];
+    const pen = copy.getContext('2d');
+    pen.drawImage(canvas, 0, 0);
+    const {data} = pen.getImageData(0, 0, copy.width, copy.height), ratio = copy.width / canvas.clientWidth;
+    const [xs, ys] = [[], []];
+    for (let k = 0; k < data.length; k += 4) {
+        if (data[k] === data[0] && data[k + 1] === data[1] && data[k + 2] === data[2]) continue;
+        xs.push((k / 4) % copy.width / ratio);
+        ys.push(Math.floor(k / 4 / copy.width) / ratio);
+    }
+    const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+    return [...scene.project(row).slice(0, 2), ...box];
+"""
+
+
 @pytest.fixture(scope="module")
 def driver():
     with chromium() as found:
@@ -242,6 +266,11 @@ def test_groups_that_stand_apart_have_colors_and_another_place_is_a_ghost(driver
         seen.append(driver.execute_script(COLORS)["count"])
     assert seen[0] > seen[1] == 1
     name = doubted()[0].cameras.names[9]
+    # The ghost, drawn without the line that leads to it, is not where the camera is.
+    names = driver.execute_script(f"return JSON.parse({DATA}).cameras.names")
+    x, y, left, top, right, bottom = driver.execute_script(f"const row = {names.index(name)};{GHOST_BOX}")
+    assert right - left > 5
+    assert not (left <= x <= right and top <= y <= bottom)
     rows = driver.execute_script("return [...document.querySelectorAll('#cameras tr[data-row]')].length")
     assert rows == 10
     search = driver.find_element("css selector", "#cameras input")
