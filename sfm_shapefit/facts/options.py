@@ -106,8 +106,8 @@ class JoinOptions(Composed):
 
     adjust: Literal["none", "full"] = option(
         "none",
-        'What follows the join: "none", each model keeps its shape; "full", poses and points of all are '
-        "bundle adjusted together.",
+        'Whether the whole is bundle adjusted after the join: "none", each model keeps its shape; "full", '
+        "poses and points of all are adjusted together.",
     )
     directions: DirectionOptions = group(DirectionOptions)
 

@@ -560,5 +560,6 @@ def test_the_values_that_flags_take_are_named_in_words():
     text = run("locate", "--help-all").stdout
     assert "--known-distance NAME NAME DISTANCE" in text
     assert "--fix FILE|solved" in text
-    for word in ("<str>", "<int>", "<float>", "str,str"):
+    text += run("join", "--help").stdout
+    for word in ("<str>", "<int>", "<float>", "str,str", "list["):
         assert word not in text
