@@ -383,3 +383,16 @@ def test_the_first_view_holds_the_ring_and_not_the_few_cameras_far_away(driver, 
     assert (seen < sides).all()
     spans = np.ptp(seen, axis=0) / sides
     assert spans.max() > 0.8  # of 1/1.1, which the margin leaves
+
+
+def test_points_far_behind_the_scene_do_not_make_a_dot_of_the_cameras(driver, tmp_path):
+    drawing, facts = make_drawing()
+    positions = drawing.points.positions.copy()
+    positions[::3] *= 20.0  # a third of the points
+    drawing = replace(drawing, points=replace(drawing.points, positions=3.0 * positions))
+    write_report(drawing, facts, tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    rows = np.flatnonzero(drawing.cameras.placed).tolist()
+    seen = np.array(driver.execute_script(f"{SCENE} return arguments[0].map(scene.project);", rows))[:, :2]
+    size = driver.find_element("id", "canvas").size
+    assert (np.ptp(seen, axis=0) / [size["width"], size["height"]]).max() > 0.5

@@ -98,15 +98,15 @@ const makeScene = (onChoice) => {
     }
     return found;
   };
-  const withoutFar = (all) => {
+  const withoutFar = (all, share) => {
     if (!all.length) return all;
     const center = [0, 1, 2].map((c) => quantile(all.map((p) => p[c]), 0.5));
     const away = all.map((p) => Math.hypot(...p.map((part, c) => part - center[c])));
-    const limit = 3 * quantile(away, 0.75);
+    const limit = 3 * quantile(away, share);
     return all.filter((_, k) => away[k] <= limit);
   };
   // Cameras and points, without the few that are far out.
-  const nearCameras = withoutFar(placed.map((k) => positionOf(k)));
+  const nearCameras = withoutFar(placed.map((k) => positionOf(k)), 0.75);
   // The first view may leave out more, so that a statue is seen although some photographs of it are from far away. On a
   // line, a ring or an area the farthest camera is at twice the median distance, or less.
   const mainCameras = (() => {
@@ -119,7 +119,7 @@ const makeScene = (onChoice) => {
     const all = [];
     const step = Math.max(Math.floor(points.positions.length / 3 / 4000), 1);
     for (let k = 0; k < points.positions.length / 3; k += step) all.push(at(points.positions, k));
-    return withoutFar(all);
+    return withoutFar(all, 0.5); // points have longer tails: what is far behind a scene would make it a dot
   })();
   const robust = [...nearCameras, ...nearPoints, ...(nearCameras.length ? [] : [[0, 0, 0]])];
   const bounds = [0, 1, 2].map((c) => {
