@@ -35,7 +35,9 @@ def convert_command(
             help=f"{_DESCRIBED}. By default that of OUT's suffix; a folder if it has none.",
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing file; folders are never replaced.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write MODEL, COLMAP's or OpenSfM's, in another format."""

@@ -66,6 +66,7 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     assert f"open {page}" in result.output
     assert "Share of the picture in which it sees points" in page.read_text(encoding="utf-8")
     assert "exists already" in run_refused("check", RING / "sparse" / "0", "--report", page)
+    assert "is a folder; give" in run_refused("check", RING / "sparse" / "0", "--report", tmp_path)
     nowhere = tmp_path / "none" / "page.html"
     assert "does not exist; make it" in run_refused("check", RING / "sparse" / "0", "--report", nowhere)
     run("check", RING / "sparse" / "0", "--report", page, "--overwrite", code=0)
