@@ -222,4 +222,4 @@ def _wanted(kind: Any) -> str:
         return f"one of {', '.join(get_args(kind))}"
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(_wanted(choice) for choice in get_args(kind) if choice is not type(None))
-    return f"of type {(get_origin(kind) or kind).__name__}"
+    return "a number" if kind is float else f"of type {(get_origin(kind) or kind).__name__}"

@@ -31,7 +31,7 @@ from sfm_shapefit.cli.root import app
 @app.command(
     "check",
     cls=GroupedCommand,
-    short_help="Judge any COLMAP model: may it be used, which cameras are weak?",
+    short_help="Judge any COLMAP model: can it be used, and which cameras are weak?",
     epilog="Example: sfm-shapefit check sparse/0 --report check.html",
 )
 def check_command(
@@ -49,7 +49,7 @@ def check_command(
         bool,
         typer.Option(
             "--second-opinion/--no-second-opinion",
-            help="Map the database anew, and judge by pairs what stands elsewhere there.",
+            help="Also make a model of the database with `map`, and compare the two.",
         ),
     ] = True,
     as_json: Json = False,
@@ -60,8 +60,8 @@ def check_command(
 ) -> None:
     """Judge the poses of MODEL as they stand, whatever program made it; MODEL is not changed.
 
-    Cameras are weak that see few points, have large errors or little of the picture covered, or that many
-    pairs contradict. Pairs come from the database or, if there is none, from the model's tracks.
+    A camera is weak if it sees few points, if its errors are large, if its points cover little of the
+    picture, or if many pairs contradict it. Pairs come from the database, else from the model's tracks.
     """
     source = one_path(model, input_path, "MODEL")
     with report_errors():

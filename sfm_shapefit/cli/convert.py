@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from sfm_shapefit.base.display import row
-from sfm_shapefit.cli.console import print_table, report_errors
+from sfm_shapefit.cli.console import print_lines, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
 from sfm_shapefit.pipeline.convert import FORMATS, convert
@@ -36,7 +35,9 @@ def convert_command(
             help=f"{_DESCRIBED}. By default that of OUT's suffix; a folder if it has none.",
         ),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing file; folders are never replaced.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Write MODEL, COLMAP's or OpenSfM's, in another format."""
@@ -47,4 +48,4 @@ def convert_command(
     with report_errors(target):
         written = convert(source, target, target_format=target_format, overwrite=overwrite)
         if not quiet:
-            print_table(str(source), [row("format", written), row("written to", str(target))])
+            print_lines([f"written to {target} ({written})"])

@@ -108,6 +108,7 @@ _FIRST_SCREEN = {
         *("priors", "control_points", "known_distance", "gravity", "without", "min_model_size", "join"),
         *("intrinsics", "adjust", "scale", "images", "overwrite", "json", "threads"),
     ),
+    "join": ("database", "adjust", "without", "images", "overwrite", "json"),
     "synth": (
         *("shape", "num_images", "num_points", "rig", "images", "pixel_noise_px", "wrong_match_fraction"),
         *("corrupted_pair_fraction", "rotation_noise_deg", "repeated_fraction", "model", "database", "seed"),
@@ -201,7 +202,7 @@ class GroupedCommand(TyperCommand):
 
 def _bare(name: str) -> str:
     """Return the name of an argument, or of a list of them, without what says that it may be left out."""
-    return name.removesuffix("]...").strip("[]")
+    return name.removesuffix("]...").strip("[]").replace("<list[Path]>", "<path>")
 
 
 def brief_help(text: str) -> str:

@@ -122,10 +122,9 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
     is_model = any((target / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
     if (is_model and not ours) or (target.is_file() and not source.is_file()):
-        what = "is a file, but OUT is a folder to be made"
-        if is_model:
-            what = "holds a model, but OUT is a folder to be made"
-        raise InputError(f"{target} {what}; the order is {order}, so give {target} first")
+        what = "holds a model" if is_model else "is a file"
+        first = "" if order.startswith("MODEL") and not is_model else f", so give {target} first"
+        raise InputError(f"{target} {what}, but OUT is a folder to be made; the order is {order}{first}")
 
 
 @contextmanager

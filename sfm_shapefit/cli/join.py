@@ -14,7 +14,7 @@ from sfm_shapefit.facts.options import JoinOptions
 @app.command(
     "join",
     cls=GroupedCommand,
-    short_help="Join models of one scene into one world, or say why not.",
+    short_help="Join models of one scene to one model, or say why not.",
     epilog="Example: sfm-shapefit join sparse/0 sparse/1 out --database database.db",
 )
 @takes(flags_of(JoinOptions, "adjust", "without"), flags_of(OutputFlags), settings=JoinOptions)

@@ -30,7 +30,7 @@ _FLAGS = (
 @app.command(
     "locate",
     cls=GroupedCommand,
-    short_help="Place the cameras of a model from its rotations and matches.",
+    short_help="Make a model where the rotations of the cameras are known.",
     epilog="Example: sfm-shapefit locate sparse/0 out",
 )
 @takes(flags_of(LocateOptions, *_FLAGS), flags_of(OutputFlags), settings=LocateOptions)
@@ -45,7 +45,10 @@ def locate_command(
     executor: ExecutorName = "serial",
     **given: Any,
 ) -> None:
-    """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
+    """Find positions and points from the rotations of MODEL and its matches; write the model to OUT.
+
+    Positions in MODEL are not used.
+    """
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with command_run(LocateOptions, given, target, [source, database, priors]) as run:

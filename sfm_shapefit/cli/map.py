@@ -30,7 +30,7 @@ _FLAGS = (
 @app.command(
     "map",
     cls=GroupedCommand,
-    short_help="From the matches of a database alone: rotations, then locate.",
+    short_help="Make models from the matches of a COLMAP database.",
     epilog="Example: sfm-shapefit map database.db out --adjust full",
 )
 @takes(flags_of(MapOptions, *_FLAGS), flags_of(OutputFlags), settings=MapOptions)
@@ -46,7 +46,7 @@ def map_command(
     executor: ExecutorName = "serial",
     **given: Any,
 ) -> None:
-    """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
+    """Make models from the matches of DATABASE; write them to OUT/0, OUT/1, ..., the largest first."""
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:

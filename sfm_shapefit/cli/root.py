@@ -21,9 +21,9 @@ from sfm_shapefit.cli.console import (
 )
 
 _GROUPS = {
-    "Place cameras": ("locate", "map", "place", "join"),
+    "Make models": ("map", "locate", "join", "place"),
     "Look at models and results": ("check", "inspect", "evaluate"),
-    "Make and convert": ("convert", "synth"),
+    "Convert, and make test scenes": ("convert", "synth"),
     "Set up": ("warm-up",),
 }
 """The commands in the help, the most used first."""
@@ -100,7 +100,7 @@ def root(
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    """Place the cameras of a COLMAP model whose rotations are known."""
+    """Make COLMAP models from matches, or from known rotations, and say whether to trust them."""
 
 
 def load_commands(words: Sequence[str] = ()) -> None:
@@ -114,7 +114,7 @@ def load_commands(words: Sequence[str] = ()) -> None:
         import_module(f"sfm_shapefit.cli.{name.replace('-', '_')}")
 
 
-def main() -> None:
+def run_command() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
     if sys.stdout is None:  # closed by whoever started this process
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115

@@ -12,6 +12,9 @@ from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 
+_UNLIKE = 2.0  # scatters of what images ask for; a mean that is nearer names no other focal length
+_ALIKE = 0.1  # share of the spread of cameras; models farther apart in the median are of different shape
+
 
 class ContradictedLens(Record):
     """A lens whose images, left out one by one, ask for another focal length."""
@@ -27,7 +30,13 @@ class ContradictedLens(Record):
     @property
     def statement(self) -> str:
         """The same in a sentence."""
-        asked = f"{self.asked_focal_px:,.0f} +- {self.asked_sigma_px:,.0f} px"
+        asked = f"{self.asked_focal_px:,.0f} ± {self.asked_sigma_px:,.0f} px"
+        if abs(self.asked_focal_px - self.focal_px) < _UNLIKE * self.asked_sigma_px:
+            return (
+                f"the focal length of camera {self.camera}, {self.focal_px:,.0f} px, is doubtful: its "
+                f"{self.num_images} images ask for unlike ones by the points that the others make ({asked}), "
+                "so that the lens or the places of images are wrong"
+            )
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (
             f"the focal length of camera {self.camera} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
@@ -47,9 +56,12 @@ class AmbiguousPlace(Record):
     @property
     def statement(self) -> str:
         """The same in a sentence."""
+        away = f"{self.num_there} put it {np.linalg.norm(self.offset):.3g} units away"
+        if not self.num_here:
+            return f"no pair puts {self.image} where it is, {away}"
+        here = f"{counted(self.num_here, 'pair')} put{'s' if self.num_here == 1 else ''}"
         return (
-            f"{counted(self.num_here, 'pair')} put {self.image} where it is, {self.num_there} put it "
-            f"{np.linalg.norm(self.offset):.3g} away: the scene repeats itself, or one of the sets is wrong"
+            f"{here} {self.image} where it is, {away}: the scene repeats itself, or one of the sets is wrong"
         )
 
 
@@ -95,8 +107,11 @@ class ToldOpinion(Record):
             )
         if self.undecided:
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
-        usual = f"{self.num_common} cameras are compared, {self.usual:.2%} apart in the median"
-        return f"{'; '.join(parts) or f'nothing speaks for another place {by}'} ({usual})"
+        usual = f"{100.0 * self.usual:.2g} % of their spread apart in the median"
+        if not parts and self.usual > _ALIKE:
+            return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
+        told = "; ".join(parts) or f"{self.num_common} cameras stand where they do {by}"
+        return f"{told} ({usual})"
 
 
 class ToldEvidence(Record):

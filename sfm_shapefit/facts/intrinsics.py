@@ -49,7 +49,7 @@ class CameraIntrinsics(Record):
         if self.decided_by == "held":
             return f"{head} kept"
         by = "by the view graph" if self.decided_by == "view graph" else "by adjustment"
-        doubt = "" if self.focal_sigma_px is None else f" +- {self.focal_sigma_px:,.1f}"
+        doubt = "" if self.focal_sigma_px is None else f" ± {self.focal_sigma_px:,.1f}"
         return f"{head} became {self.focal_px:,.1f}{doubt} px ({self.change:+.1%}) {by}{self._distortion()}"
 
     @property

@@ -18,7 +18,7 @@ from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, JoinedFacts, MapFacts
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.judgement.grade import ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
@@ -41,11 +41,11 @@ class MappedModel:
         return self.located.reconstruction
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class JoinedModel(Written):
     """Models in one world, and the evidence for them together."""
 
-    _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "timings_s")
+    _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "table", "warnings", "timings_s")
     reconstruction: "pycolmap.Reconstruction"
     models: tuple[int, ...]
     """Their numbers; the world is that of the first, scaled if known distances between them give a scale."""
@@ -79,14 +79,24 @@ class JoinedModel(Written):
         return self.facts.timings_s
 
     @property
+    def warnings(self) -> Sequence[str]:
+        """What the user should know."""
+        return self.facts.warnings
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, 3)
+
+    @property
     def told(self) -> Telling:
         """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
         told = self.facts.told(self.cameras, self.pairs)
-        joins = [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        joins = [row("join", one.statement) for one in self.joins]
         return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
 
     def _headline(self) -> str:
-        return f"{self.facts.num_placed} images of {counted(len(self.models), 'model')}"
+        models = counted(len(self.models), "model")
+        return f"{self.facts.num_placed} images of {models}, {self.verdict.statement}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -163,7 +173,7 @@ class MapResult(Written):
             lines += [title, *told.lines] if several else told.lines
             rows += told.rows
             details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
-        rows += [row("joined" if one.join else "not joined", one.statement) for one in self.joins]
+        rows += [row("join", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
         rows += [Row("warning", self.warnings)]

@@ -386,13 +386,15 @@ class CheckedFacts(FactsOfModel):
             cameras: rows of all images, with what is weak about them.
             pairs: rows of the pairs that were looked at.
         """
-        weak = [f"{row.name}: {row.reason}" for row in cameras if row.reason]
+        # One that the second opinion confirms is not told, whatever its weakness.
+        doubted = (row for row in cameras if not row.placed or row.name in self.verdict.cameras)
+        weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
         lines = self.told_lines("posed", (judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = (
             [] if self.evidence.second is None else [row("second opinion", self.evidence.second.statement)]
         )
-        return Telling(lines, [Row("weak", weak), *second], elsewhere="see --report", step=self.next_step)
+        return Telling(lines, [Row("weak", weak), *second], elsewhere="see the report", step=self.next_step)
 
 
 class JoinedFacts(CheckedFacts):

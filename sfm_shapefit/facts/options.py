@@ -107,8 +107,8 @@ class JoinOptions(Composed):
 
     adjust: Literal["none", "full"] = option(
         "none",
-        'What follows the join: "none", each model keeps its shape; "full", poses and points of all are '
-        "bundle adjusted together.",
+        'Whether the whole is bundle adjusted after the join: "none", each model keeps its shape; "full", '
+        "poses and points of all are adjusted together.",
     )
     directions: DirectionOptions = group(DirectionOptions)
 
@@ -120,8 +120,8 @@ class MapOptions(Composed):
 
     join: Join = option(
         "safe",
-        'Models that stand apart: "safe" joins those that position priors or points seen by both tie '
-        'together beyond doubt, with a standard deviation, into a further folder; "never" joins none.',
+        'Whether several models are joined: "safe", into a further folder, those that position priors or '
+        'points seen by both tie together beyond doubt; "never", none.',
     )
     averaging: AveragingOptions = group(AveragingOptions)
     directions: DirectionOptions = group(DirectionOptions)

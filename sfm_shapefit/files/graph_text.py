@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.files.lines import read_lines
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
@@ -36,7 +37,8 @@ def read_graph(path: Path | str) -> ViewGraph:
     width = len(table.rows[0])
     if width < _MIN_COLUMNS:
         raise InputError(
-            f"{file}, line {table.numbers[0]}: expected i j and a direction, got {width} columns"
+            f"{file}, line {table.numbers[0]}: expected i j and a direction, got {counted(width, 'column')}; "
+            "give the text file of a bare graph, or the folder of a COLMAP model"
         )
     values = table.values(first=2, width=width)
     with np.errstate(over="ignore"):  # a length that overflows is no unit length

@@ -35,6 +35,7 @@ import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
@@ -58,6 +59,8 @@ from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from sfm_shapefit.report.drawing import Drawing
 
 # The header says what set these limits.
@@ -82,6 +85,11 @@ class CheckResult(Reported):
     quality: ImageQuality
     facts: CheckedFacts
     """The figures, as `check --json` prints them."""
+
+    @property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """The model as read, so that the result serves as a model."""
+        return self.model.reconstruction
 
     @property
     def verdict(self) -> ModelVerdict:
@@ -226,12 +234,12 @@ def _weaknesses(quality: ImageQuality, k: int, usual: _Usual, pairs: tuple[int, 
     if len(quality.point_errors_px) == 0:
         pass  # said of the whole model
     elif quality.num_points[k] < _FEWEST_POINTS:
-        yield f"it sees only {quality.num_points[k]} 3D points"
+        yield f"it sees {f'only {quality.num_points[k]}' if quality.num_points[k] else 'no'} 3D points"
     elif quality.coverage[k] < _LEAST_COVERAGE:
         yield f"its points cover only {quality.coverage[k]:.0%} of the picture"
     if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual.error_px):
-        error_px, usual_px = quality.errors_px[k], usual.error_px
-        yield f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual"
+        error_px = f"{quality.errors_px[k]:.1f} px, where {usual.error_px:.1f} px is usual"
+        yield f"its reprojection error is {error_px}"
     if total >= _FEWEST_PAIRS and wrong > total * max(_LARGE_SHARE, _SHARE_OF_USUAL * usual.share):
         yield f"{wrong} of its {total} pairs contradict where it stands"
 
@@ -248,7 +256,7 @@ def _grade(
     right = {model.images.names[k] for k in confirmed}
     weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
     named = tuple(dict.fromkeys([*against.cameras, *weak]))
-    if bad := (*_reasons_against(model.images, fits), *against.reasons):
+    if bad := (*_reasons_against(model.images, fits),) or against.reasons:
         return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
     pointless = model.reconstruction.num_points3D() == 0
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
@@ -261,7 +269,9 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
     if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
         yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
     elif fits is None or not np.isfinite(fits.residuals_deg).any():
-        yield "no two of its images have matches that say in which direction they stand from each other"
+        against = 0 if fits is None else int(fits.contradicts.sum())
+        wrong = f"{counted(against, 'pair')} contradict its rotations and none agrees: is this its database?"
+        yield wrong if against else "no two of its images have matches that say how they stand to each other"
 
 
 def _tell(

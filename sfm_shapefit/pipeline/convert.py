@@ -87,6 +87,8 @@ def convert(
         text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(posed_model_of(model))
         _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
         return name
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")
     with atomic_folder(path, protect=protect) as folder:
         write_model(model, folder, text=name == "colmap-txt")
     return name
@@ -115,8 +117,9 @@ def _drawing_of(source: "ModelSource") -> "Drawing":
 
 def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:
     """Write a file whole or not at all."""
-    if path.is_dir() or (path.exists() and not overwrite):
-        raise InputError(f"{path} exists already; choose another name, or replace it (overwrite=True)")
+    from sfm_shapefit.pipeline.write import refuse_page
+
+    refuse_page(path, overwrite=overwrite)
     partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
     try:
         partial.write_bytes(content)

@@ -45,7 +45,7 @@ def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str],
     """
     for name in (name for one in known for name in one[:2]):
         if name not in names:
-            raise InputError(f"known_distance: {missing} {name}")
+            raise InputError(f"known distances: {missing} {name}")
 
 
 class GaugeRule(NamedTuple):
@@ -144,7 +144,7 @@ def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Seque
     there = [one for one in known if {*one[:2]} <= place_of.keys()]
     if not there:
         missing = next(name for name in known[0][:2] if name not in place_of)
-        raise UnsolvableError(f"known_distance: the image {missing} could not be placed; choose another")
+        raise UnsolvableError(f"known distances: the image {missing} could not be placed; choose another")
     places = np.array([[place_of[first], place_of[second]] for first, second, _ in there])
     said = [f"{first} and {second}" for first, second, _ in there]
     return distance_gauge(locations, places, np.array([float(distance) for *_, distance in there]), said)

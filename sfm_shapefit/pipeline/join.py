@@ -102,7 +102,7 @@ def join(
 
 def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[ModelPiece]:
     """Read the models, and refuse those that have nothing to join."""
-    if len(models) < 2:
+    if isinstance(models, Path | str) or len(models) < 2:
         raise InputError("a join needs two models or more; give their folders one after the other")
     pieces: list[ModelPiece] = []
     for number, source in enumerate(models):

@@ -130,13 +130,15 @@ def write_page(
 
 
 def refuse_page(page: Path, *, overwrite: bool) -> None:
-    """Refuse a page that exists, or whose folder does not.
+    """Refuse a file to be made that exists, or whose folder does not.
 
     Raises:
         InputError: if so.
     """
     if not page.absolute().parent.is_dir():
-        raise InputError(f"the folder of {page} does not exist; make it, or name another page")
+        raise InputError(f"the folder of {page} does not exist; make it, or name another")
+    if page.is_dir():
+        raise InputError(f"{page} is a folder; give the name of a file")
     if page.exists() and not overwrite:
         raise InputError(f"{page} exists already; choose another name, or replace it (overwrite=True)")
 

@@ -329,7 +329,7 @@ def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
     agreeing, against = own & joint.agrees, own & ~joint.agrees
     shared = int(np.sum(evidence.ties.is_shared & agreeing))
     pairs = f"{int(agreeing.sum())} of {counted(int(own.sum()), 'pair')} of images between them"
-    same = f", {shared} of which {'is' if shared == 1 else 'are'} one image in both" if shared else ""
+    same = f", {shared} by {'an image' if shared == 1 else 'images'} that both have" if shared else ""
     return PieceJoin(
         piece=int(evidence.numbers[k]),
         to=int(evidence.numbers[0]),
@@ -360,6 +360,6 @@ def _reason_of_few(join: PieceJoin, *, has_rival: bool) -> str:
             "image, which may be taken for another; match others"
         )
     return (
-        f"no more than {agreeing} of {counted(total, 'pair')} of images between them agree on one join, and "
-        f"it needs {FEWEST_PAIRS}; match more of their images with one another"
+        f"{agreeing or 'none'} of {counted(total, 'pair')} of images between them agree on one join, and it "
+        f"needs {FEWEST_PAIRS}; match more of their images with one another, if they show one scene"
     )

@@ -16,8 +16,8 @@ class GaugeOptions(Settings):
 
     scale: Scale = option(
         "auto",
-        "Scale and origin of the output where nothing that is known sets them. What does, in this order: "
-        "fixed cameras, rigs, control points, known distances, position priors; others are told as checks. "
+        "Scale and origin of the output, unless known positions or distances set them. What does, in this "
+        "order: fixed cameras, rigs, control points, known distances, priors; others are checks. "
         '"input" takes those of the input\'s centers; "unit" puts the centroid at 0 and the median distance '
         'from it at 1; "auto" is "input", or "unit" where the input has no centers.',
     )

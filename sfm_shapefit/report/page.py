@@ -24,7 +24,8 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
-from sfm_shapefit.facts.model import ModelFacts
+from sfm_shapefit.facts.evidence import ToldEvidence
+from sfm_shapefit.facts.model import FactsOfModel, ModelFacts
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.report.charts import (
@@ -112,7 +113,7 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "frustum": drawing.frustum_depth,
         "axes": drawing.axes.T.ravel().tolist(),
         "middle": display.middle.tolist(),
-        "cameras": _cameras(drawing, cameras, display, reasons),
+        "cameras": _cameras(drawing, cameras, display, reasons) | _doubts(drawing, facts, cameras, display),
         "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
         "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
@@ -192,6 +193,25 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
             {"title": column.title, "hint": column.hint, "values": _pack(column.values[order], "f4")}
             for column in drawing.further
         ],
+    }
+
+
+def _doubts(drawing: Drawing, facts: Facts, order: IntArray, display: _Display) -> dict[str, Any]:
+    """Return which groups stand apart from the rest, and where else two sets of pairs put a camera."""
+    evidence = facts.evidence if isinstance(facts, FactsOfModel) else ToldEvidence()
+    row_of = {name: k for k, name in enumerate(drawing.cameras.names)}
+    groups = np.full(len(row_of), -1)
+    for k in sorted(range(len(evidence.seams)), key=lambda k: -len(evidence.seams[k].images)):
+        groups[[row_of[name] for name in evidence.seams[k].images]] = k  # the smallest wins
+    others, counts = np.full((len(row_of), 3), np.nan), np.zeros((len(row_of), 2))
+    for place in evidence.places:
+        row = row_of[place.image]
+        others[row] = drawing.cameras.centers[row] + place.offset
+        counts[row] = place.num_here, place.num_there
+    return {
+        "group": _pack(groups[order], "i4"),
+        "other": _pack(display(others[order]), "f4"),
+        "otherCounts": _pack(counts[order], "i4"),
     }
 
 

@@ -63,7 +63,7 @@ def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:
 
 def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
-    cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing)]
+    cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing, facts)]
     return [
         *_warnings(drawing, facts, {hint.camera for hint in cameras}),
         *cameras,
@@ -114,13 +114,17 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
 
 
 def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator[Hint]:
-    """Yield warnings, but for those of a camera of which something is told anyway."""
+    """Yield warnings, but for those of a camera of which something is told anyway.
+
+    Evidence against groups, places and lenses is always told.
+    """
+    evidence = facts.evidence.statements if isinstance(facts, FactsOfModel) else []
     names = {name: row for row, name in enumerate(drawing.cameras.names) if not name.isdigit()}
     for warning in facts.warnings:
         # The longest name wins, as "11.jpg" is in "111.jpg".
         named = max((name for name in names if name in warning), key=len, default=None)
         camera = None if named is None else names[named]
-        if camera is None or camera not in told:
+        if camera is None or camera not in told or warning in evidence:
             text = shorten(warning, 2 * MAX_TEXT)
             yield Hint(text=f"{text[:1].upper()}{text[1:]}", camera=camera)
 
@@ -144,11 +148,13 @@ def _least_trusted(drawing: Drawing) -> Iterator[Hint]:
         )
 
 
-def _weak(drawing: Drawing) -> Iterator[Hint]:
+def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
     """Yield cameras that have no trust, as those of a model that is only looked at, but a weakness."""
     cameras = drawing.cameras
     rows = [
-        k for k in np.flatnonzero(cameras.placed & np.isnan(cameras.trust)).tolist() if cameras.reasons[k]
+        k
+        for k in np.flatnonzero(cameras.placed & np.isnan(cameras.trust)).tolist()
+        if cameras.reasons[k] and cameras.names[k] in facts.verdict.cameras
     ]
     for row in rows[:_MOST_WEAK]:
         yield Hint(text=f"{shorten(cameras.names[row])}: {shorten(cameras.reasons[row])}", camera=row)

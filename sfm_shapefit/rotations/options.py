@@ -29,7 +29,7 @@ class AveragingOptions(Settings):
     )
     gravity: str = option(
         "",
-        "Directions of gravity, which take part in the averaging and turn the model so that z points up: a "
+        "Directions of gravity, which help to find rotations, and turn the model so that z points up: a "
         "text file of name x y z [sigma] per line, in axes of the camera (x right, y down, z ahead; sigma in "
         'degrees, 1 if not given), or "database": those of its pose priors.',
     )

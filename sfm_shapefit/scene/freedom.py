@@ -19,10 +19,9 @@ class FreedomOptions(Settings):
 
     adjust: Adjust = option(
         "seed",
-        'What is adjusted to the pixels: "seed", the placed cameras by all tracks at once, and rotations as '
-        "far as they are doubtful, up to 2,000 cameras and not with objectives that deliver an optimum as it "
-        'is, or, of rotations that `map` averages, a first placement on few tracks; "full", poses and points '
-        'once more by bundle adjustment from the seed; "none", nothing.',
+        'How far poses and points are adjusted to the pixels: "seed", once, by all tracks, up to 2,000 '
+        'cameras, with rotations as far as they are in doubt; "full", once more, by a bundle adjustment; '
+        '"none", not at all.',
     )
     intrinsics: IntrinsicsFreedom = option(
         "auto",

@@ -99,7 +99,7 @@ class SolverOptions(Settings):
         "elsewhere: on long chains in the refinement, and for standard deviations.",
     )
     threads: int = option(
-        0, f"Threads to use, at most {MAX_THREADS}; 0 means one per core. The answer does not depend on it."
+        0, f"Threads to use, at most {MAX_THREADS}, or 0 for one per core. The answer does not depend on it."
     )
 
     def __post_init__(self) -> None:

@@ -145,7 +145,7 @@ REFUSED = [
     (LocateOptions, {"intrinsics": "focal", "adjust": "none"}, "intrinsics=focal needs an adjustment"),
     (MapOptions, {"rigs": "free", "adjust": "none"}, "rigs=free needs an adjustment"),
     (LocateOptions, {"rotations": -1.0}, "rotations must lie between"),
-    (LocateOptions, {"rotations": "exact"}, "rotations must be one of auto, held, free or of type float"),
+    (LocateOptions, {"rotations": "exact"}, "rotations must be one of auto, held, free or a number"),
     (LocateOptions, {"known_distance": ("a", "b", -1.0)}, "must be positive"),
     (LocateOptions, {"known_distance": ("a", "a", 1.0)}, "two different images"),
     (LocateOptions, {"known_distance": ("a", "b")}, "two image names and a number"),

@@ -123,9 +123,14 @@ def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_
 def test_help_lists_commands_in_groups_the_most_used_first():
     text = run("-h").stdout
     titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
-    assert titles[1:] == ["Place cameras:", "Look at models and results:", "Make and convert:", "Set up:"]
-    listed = re.findall(r"^  ([a-z][\w-]*)  ", text.partition("Place cameras:")[2], flags=re.MULTILINE)
-    assert listed[:3] == ["locate", "map", "place"]
+    assert titles[1:] == [
+        "Make models:",
+        "Look at models and results:",
+        "Convert, and make test scenes:",
+        "Set up:",
+    ]
+    listed = re.findall(r"^  ([a-z][\w-]*)  ", text.partition("Make models:")[2], flags=re.MULTILINE)
+    assert listed[:3] == ["map", "locate", "join"]
     assert set(listed) == {name for name, command in get_command(app).commands.items() if not command.hidden}
     for name in listed:
         last = run(name, "-h").stdout.splitlines()[-1]
@@ -530,9 +535,31 @@ def test_an_executor_that_does_not_exist_is_refused_as_a_value(name, tmp_path):
     assert "serial, processes, dask, dask:ADDRESS" in said
 
 
+def test_a_word_that_a_flag_does_not_take_is_refused_without_words_of_a_library(tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--intrinsics", "focl", code=2).output
+    assert "'--intrinsics': 'focl' is not one of 'auto', 'held', 'focal', 'all'" in said
+
+
+def test_json_in_the_place_of_a_model_or_graph_is_told_what_is_wanted(tmp_path):
+    path = tmp_path / "transforms.json"
+    path.write_text("{}\n")
+    assert "got 1 column; give the text file of a bare graph, or the folder" in run_refused("inspect", path)
+    assert "is a file; give the folder that holds cameras" in run_refused("locate", path, tmp_path / "out")
+
+
+def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):
+    path = tmp_path / "transforms.json"
+    path.write_text("{}\n")
+    said = run_refused("join", RING_MODEL, RING_MODEL, path)
+    assert said.endswith("is a file, but OUT is a folder to be made; the order is MODEL MODEL... OUT\n")
+    database = RING / "database.db"
+    assert f"so give {database} first" in run_refused("map", ring_run[1], database)
+
+
 def test_the_values_that_flags_take_are_named_in_words():
     text = run("locate", "--help-all").stdout
     assert "--known-distance NAME NAME DISTANCE" in text
     assert "--fix FILE|solved" in text
-    for word in ("<str>", "<int>", "<float>", "str,str"):
+    text += run("join", "--help").stdout
+    for word in ("<str>", "<int>", "<float>", "str,str", "list["):
         assert word not in text

@@ -61,6 +61,8 @@ def test_the_database_of_another_scene_gets_a_verdict():
     said = run("check", RING / "sparse/0", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: do not use" in said
     assert "courtyard/database.db; no pair says where cameras stand\n" in said
+    assert "contradict its rotations and none agrees: is this its database?\n" in said
+    assert "second opinion: 8 cameras have nothing in common with where they stand" in said
 
 
 def test_pairs_without_a_direction_do_not_contradict_a_model():
@@ -153,6 +155,20 @@ def test_a_huge_file_is_refused_at_once(tmp_path, command):
     out = [tmp_path / "out"] if command == "place" else []
     assert "more than 8 GB" in run_refused(command, tmp_path / "graph.txt", *out)
     assert time.perf_counter() - started < 5.0
+
+
+def test_an_interrupt_while_typer_is_imported_ends_without_a_traceback():
+    """The moment is exact: typer's own module sends the signal at its end."""
+    script = (
+        "import importlib.machinery, os; from sfm_shapefit.cli import main\n"
+        "load = importlib.machinery.SourceFileLoader.exec_module\n"
+        "def signalled(self, module):\n"
+        "    load(self, module)\n"
+        f"    if module.__name__ == 'typer': os.kill(os.getpid(), {int(signal.SIGINT)})\n"
+        "importlib.machinery.SourceFileLoader.exec_module = signalled\nmain()"
+    )
+    done = run_python("-c", script, "--help")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

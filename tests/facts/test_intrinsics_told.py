@@ -38,7 +38,7 @@ def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, 
     [
         (
             row(),
-            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 +- 5.0 px (+10.0%) by adjustment, "
+            "camera 1: focal length 1,000.0 px (a guess) became 1,100.0 ± 5.0 px (+10.0%) by adjustment, "
             "distortion -0.0500",
         ),
         (

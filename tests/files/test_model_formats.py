@@ -250,7 +250,11 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
         extra = ["--format", "colmap-txt"] if name == "text" else []
         run("convert", source, tmp_path / name, *extra, code=0)
         again = run("convert", source, tmp_path / name, *extra, code=3)
-        assert "exists already" in again.output
+        assert ("." in name and "exists already" in again.output) or "never replaced" in again.output
+    folder = run("convert", source, tmp_path / "bin", "--format", "csv", "--overwrite", code=3)
+    assert "is a folder; give the name of a file" in folder.output
+    nowhere = run("convert", source, tmp_path / "no" / "t.csv", code=3)
+    assert "does not exist; make it, or name another" in nowhere.output
     truth = read_model(source)
     for name in ("bin", "text"):
         copy = read_model(tmp_path / name)

@@ -66,6 +66,7 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     assert f"open {page}" in result.output
     assert "Share of the picture in which it sees points" in page.read_text(encoding="utf-8")
     assert "exists already" in run_refused("check", RING / "sparse" / "0", "--report", page)
+    assert "is a folder; give" in run_refused("check", RING / "sparse" / "0", "--report", tmp_path)
     nowhere = tmp_path / "none" / "page.html"
     assert "does not exist; make it" in run_refused("check", RING / "sparse" / "0", "--report", nowhere)
     run("check", RING / "sparse" / "0", "--report", page, "--overwrite", code=0)
@@ -75,6 +76,10 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
 def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_path):
     facts = check(COURTYARD / "truth", COURTYARD / "database.db").facts  # a quarter of its pairs is wrong
     assert len(facts.verdict.cameras) <= 1
+    told = run("check", COURTYARD / "truth", "--database", COURTYARD / "database.db", code=0).stdout
+    assert "verdict: good" in told
+    assert "weak: " not in told  # one has many false pairs, but the second opinion has it at the same place
+    assert "second opinion: 25 cameras stand where they do in the model that map made" in told
     moved = pycolmap.Reconstruction(COURTYARD / "truth")
     image = moved.image(sorted(moved.reg_image_ids())[7])
     pose = image.frame.rig_from_world

@@ -133,13 +133,17 @@ def test_three_models_are_joined_at_once():
     found = sfm_shapefit.join(parts, DATABASE)
     assert [join.join is not None for join in found.joins] == [True, True]
     assert found.models == (0, 1, 2)
+    assert repr(found).startswith("<JoinedModel: 8 images of 3 models, ")
+    assert found.warnings == []
+    assert list(found.table("cameras")["name"]) == [camera.name for camera in found.cameras]
+    assert errors_of(sfm_shapefit.check(found, DATABASE)) == errors_of(found)
     assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-4))
 
 
 def test_what_ties_too_little_is_refused_with_its_reason(tmp_path):
     models = written(tmp_path, piece(IDS[:4]), piece([IDS[3], *IDS[5:]], moved=True))
     told = run_refused("join", *models, tmp_path / "out", code=4)
-    assert f"{models[1]} is not joined to {models[0]}: no more than 1 of 1 pair of images" in told
+    assert f"{models[1]} is not joined to {models[0]}: 1 of 1 pair of images" in told
     assert "it needs 3" in told
     assert not (tmp_path / "out").exists()
     across = tmp_path / "without.txt"
@@ -158,6 +162,8 @@ def test_bad_input_is_one_sentence(tmp_path):
     assert "images" in run_refused("join", first, second, out, "--database", other)
     with pytest.raises(sfm_shapefit.InputError, match="needs two models or more"):
         sfm_shapefit.join([first], DATABASE)
+    with pytest.raises(sfm_shapefit.InputError, match="needs two models or more"):
+        sfm_shapefit.join(str(first), DATABASE)
     assert run("join", first, out, code=2).exit_code == 2
     assert not out.exists()
 

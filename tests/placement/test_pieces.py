@@ -171,7 +171,7 @@ def test_shared_images_count_as_two_pairs_each():
     drawn.share(4, 10)
     join = drawn.join()[1]
     assert is_right(drawn, join)
-    assert join.evidence.endswith("2 of which are one image in both")
+    assert join.evidence.endswith("2 by images that both have")
 
 
 def test_two_explanations_are_refused_and_named():
@@ -201,7 +201,7 @@ def test_a_rival_between_two_pieces_is_overcome_by_a_third():
     [
         (
             [(0, 6), (1, 7)],
-            "no more than 2 of 2 pairs of images between them agree on one join, and it needs 3",
+            "2 of 2 pairs of images between them agree on one join, and it needs 3",
         ),
         ([(0, 6), (0, 7), (0, 8)], "are all of one image"),
         ([], UNTIED),

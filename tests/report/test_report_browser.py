@@ -10,7 +10,7 @@ import pytest
 from sfm_shapefit.report.page import write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
 from tests.drawings import make_drawing
-from tests.report.test_report_page import HOSTILE
+from tests.report.test_report_page import HOSTILE, doubted
 
 SCENE = "const scene = document.getElementById('scene').scene;"
 LABELS = "return [...document.querySelectorAll('#overlay .label')].map((one) => one.textContent);"
@@ -33,6 +33,30 @@ COLORS = """
     }
     const sorted = [...seen].sort((a, b) => b[1] - a[1]);
     return {common: sorted[0][0], drawn: 1 - 4 * sorted[0][1] / data.length, count: seen.size, red};
+"""
+
+
+DATA = "document.getElementById('data').textContent"
+# Where a camera is seen, and the box of the ghosts at other places alone, in pixels.
+GHOST_BOX = """
+    const scene = document.getElementById('scene').scene, canvas = document.getElementById('canvas');
+    const ghosts = scene.layers.find((one) => one.name === 'elsewhere');
+    ghosts.segments = null;
+    ghosts.shown = true;
+    scene.draw();
+    const copy = document.createElement('canvas');
+    [copy.width, copy.height] = [canvas.width, canvas.height];
+    const pen = copy.getContext('2d');
+    pen.drawImage(canvas, 0, 0);
+    const {data} = pen.getImageData(0, 0, copy.width, copy.height), ratio = copy.width / canvas.clientWidth;
+    const [xs, ys] = [[], []];
+    for (let k = 0; k < data.length; k += 4) {
+        if (data[k] === data[0] && data[k + 1] === data[1] && data[k + 2] === data[2]) continue;
+        xs.push((k / 4) % copy.width / ratio);
+        ys.push(Math.floor(k / 4 / copy.width) / ratio);
+    }
+    const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+    return [...scene.project(row).slice(0, 2), ...box];
 """
 
 
@@ -89,7 +113,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
 
 
 def test_a_click_on_a_row_chooses_its_camera_flies_there_and_the_scene_stays_in_view(driver, report):
-    row = driver.find_element("css selector", "#cameras tbody tr:nth-child(3)")
+    row = driver.find_element("css selector", "#cameras tbody tr[data-row='2']")
     k = int(row.get_attribute("data-row"))
     driver.execute_script("arguments[0].scrollIntoView({block: 'end'}); arguments[0].click()", row)
     assert driver.execute_script(SELECTED) == f"camera:{k}"
@@ -112,7 +136,7 @@ def test_a_click_in_the_scene_takes_the_camera_and_not_a_pair_drawn_over_it(driv
     ActionChains(driver).click().perform()
     assert driver.execute_script(SELECTED) == "camera:9"
     row = driver.find_element("css selector", "#cameras tr[aria-selected=true]")
-    assert row.find_element("css selector", "td span").text == name
+    assert row.find_element("css selector", "td.name").text == name
     assert driver.find_element("css selector", "#details h3").text == name
     assert complaints(driver) == []
 
@@ -138,16 +162,14 @@ def test_a_click_on_a_line_takes_the_pair_and_shows_its_two_cameras(driver, repo
     ActionChains(driver).move_to_element_with_offset(canvas, *shift).pause(0.2).click().perform()
     assert driver.execute_script(SELECTED).startswith("pair:")
     shown = [button.text for button in driver.find_elements("css selector", "#details .link")]
-    names = [
-        c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name span")
-    ]
+    names = [c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name")]
     assert shown == names
     assert driver.execute_script(LABELS) == shown
 
 
 def test_tables_sort_filter_and_turn_pages(driver, report):
     def first():
-        return driver.find_element("css selector", "#cameras tbody td span").text
+        return driver.find_element("css selector", "#cameras tbody td.name").text
 
     heading = driver.find_element("css selector", "#cameras th button")
     driver.execute_script("arguments[0].click()", heading)
@@ -160,7 +182,7 @@ def test_tables_sort_filter_and_turn_pages(driver, report):
         "const box = document.querySelector('#cameras input'); box.value = 'img_00007';"
         "box.dispatchEvent(new Event('input'));"
     )
-    shown = driver.find_elements("css selector", "#cameras tbody td.name span")
+    shown = driver.find_elements("css selector", "#cameras tbody td.name")
     assert [name.text for name in shown] == ["images/IMG_00007.jpg"]
 
 
@@ -220,7 +242,7 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     for row in range(len(HOSTILE)):
-        driver.execute_script(f"document.querySelectorAll('#cameras tbody tr')[{row}].click()")
+        driver.execute_script(f"document.querySelector(\"#cameras tr[data-row='{row}']\").click()")
     driver.execute_script("document.querySelector('#pairs tbody tr').click()")
     assert "owned" not in driver.title
     made = "return document.querySelectorAll('main img, main b:not(.tile b), main a').length"
@@ -228,6 +250,34 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     assert driver.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     assert complaints(driver) == []
     assert requests(driver) == []
+
+
+def test_groups_that_stand_apart_have_colors_and_another_place_is_a_ghost(driver, tmp_path):
+    path = tmp_path / "report.html"
+    write_report(*doubted(), path)
+    opened(driver, path)
+    assert driver.find_element("id", "legend").text.split("\n") == ["the rest", "group 1", "group 2"]
+    layer = f"{SCENE} return scene.layers.find((one) => one.name === 'elsewhere').ghosts.instances;"
+    assert driver.execute_script(layer) == 1
+    seen = []
+    for shown in (True, False):
+        only = f"one.shown = {str(shown).lower()} && one.name === 'elsewhere'"
+        driver.execute_script(f"{SCENE} scene.layers.forEach((one) => {{ {only}; }});")
+        seen.append(driver.execute_script(COLORS)["count"])
+    assert seen[0] > seen[1] == 1
+    name = doubted()[0].cameras.names[9]
+    # The ghost, drawn without the line that leads to it, is not where the camera is.
+    names = driver.execute_script(f"return JSON.parse({DATA}).cameras.names")
+    x, y, left, top, right, bottom = driver.execute_script(f"const row = {names.index(name)};{GHOST_BOX}")
+    assert right - left > 5
+    assert not (left <= x <= right and top <= y <= bottom)
+    rows = driver.execute_script("return [...document.querySelectorAll('#cameras tr[data-row]')].length")
+    assert rows == 10
+    search = driver.find_element("css selector", "#cameras input")
+    search.send_keys(name)
+    click(driver, "#cameras tbody tr")
+    assert "2.29 units away, by 5 pairs; 2 for where it is" in driver.find_element("id", "details").text
+    assert complaints(driver) == []
 
 
 def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_out_is_a_ghost(
@@ -333,3 +383,16 @@ def test_the_first_view_holds_the_ring_and_not_the_few_cameras_far_away(driver, 
     assert (seen < sides).all()
     spans = np.ptp(seen, axis=0) / sides
     assert spans.max() > 0.8  # of 1/1.1, which the margin leaves
+
+
+def test_points_far_behind_the_scene_do_not_make_a_dot_of_the_cameras(driver, tmp_path):
+    drawing, facts = make_drawing()
+    positions = drawing.points.positions.copy()
+    positions[::3] *= 20.0  # a third of the points
+    drawing = replace(drawing, points=replace(drawing.points, positions=3.0 * positions))
+    write_report(drawing, facts, tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    rows = np.flatnonzero(drawing.cameras.placed).tolist()
+    seen = np.array(driver.execute_script(f"{SCENE} return arguments[0].map(scene.project);", rows))[:, :2]
+    size = driver.find_element("id", "canvas").size
+    assert (np.ptp(seen, axis=0) / [size["width"], size["height"]]).max() > 0.5

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import KeyFigures
@@ -167,6 +168,46 @@ def test_a_lens_in_doubt_is_a_row_of_the_table_and_no_sentence():
     assert not any("focal length" in sentence for sentence in summary_sentences(drawing, facts))
     held = replace(lens, decided_by="held", focal_px=1000.0, parameters=[1000.0, 0.0])
     assert held.cells[4:] == ["kept", "", ""]
+
+
+def doubted():
+    """A drawing with a group that stands apart, one within it, and a camera with another place."""
+    drawing, facts = make_drawing()
+    names = drawing.cameras.names
+
+    def apart(rows):
+        images = tuple(names[k] for k in rows)
+        return GroupApart(images=images, num_agreeing=1, num_contradicting=9, num_turned=0, turn_deg=None)
+
+    place = AmbiguousPlace(image=names[9], num_here=2, num_there=5, offset=(1.0, 2.0, -0.5))
+    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])))
+    return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
+
+
+def test_a_group_that_stands_apart_and_another_place_reach_the_scene_and_are_told():
+    drawing, facts = doubted()
+    data = page_data(drawing, facts)
+    columns, names = data["cameras"], drawing.cameras.names
+    group = dict(zip(columns["names"], unpacked(columns["group"]).tolist(), strict=True))
+    assert [group[name] for name in names[2:8]] == [-1, 1, 0, 0, 1, -1]
+    others = unpacked(columns["other"]).reshape(-1, 3)
+    row = columns["names"].index(names[9])
+    assert np.flatnonzero(np.isfinite(others).all(axis=1)).tolist() == [row]
+    world = data["middle"] + np.reshape(data["axes"], (3, 3)) @ others[row]
+    np.testing.assert_allclose(world, drawing.cameras.centers[9] + [1.0, 2.0, -0.5], atol=1e-5)
+    assert unpacked(columns["otherCounts"])[2 * row : 2 * row + 2].tolist() == [2, 5]
+    told = [look["text"].lower() for look in data["looks"]]
+    assert all(any(statement[:60].lower() in text for text in told) for statement in facts.warnings)
+
+
+def test_evidence_is_told_of_a_camera_of_which_something_else_is_told():
+    drawing, facts = doubted()
+    trust = drawing.cameras.trust.copy()
+    trust[9] = 0.1
+    drawing = replace(drawing, cameras=replace(drawing.cameras, trust=trust))
+    texts = [look["text"] for look in page_data(drawing, facts)["looks"]]
+    assert any("has trust 0.10" in text for text in texts)
+    assert any(text.startswith("2 pairs put") for text in texts)
 
 
 def test_the_banner_tells_cameras_that_are_left_out_from_those_that_may_be_wrong():

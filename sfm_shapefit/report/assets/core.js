@@ -93,6 +93,10 @@ const rgbOf = (variable) => {
 // --- what is said of a camera or a pair ------------------------------------------------------------
 
 const agreeing = (k) => `${count(cameras.agreeing[k])} of ${count(cameras.degree[k])} agree`;
+const otherPlace = (k) => {
+  const away = number(Math.hypot(...at(cameras.other, k).map((part, c) => part - cameras.center[3 * k + c])));
+  return `${away} units away, by ${counted(cameras.otherCounts[2 * k + 1], "pair")}; ${count(cameras.otherCounts[2 * k])} for where it is`;
+};
 const cameraFacts = (k) => [
   ["placed", isPlaced(k) ? "" : "no, left out"],
   ["trust", number(cameras.trust[k], 2)],
@@ -102,6 +106,8 @@ const cameraFacts = (k) => [
   ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} units` : ""],
   ...cameras.further.map(({ hint, values }) => [hint[0].toLowerCase() + hint.slice(1), number(values[k])]),
   ["why", reason(cameras.reason[k])],
+  ["stands apart", cameras.group[k] < 0 ? "" : `with group ${cameras.group[k] + 1} (colors show it)`],
+  ["another place", Number.isFinite(cameras.other[3 * k]) ? otherPlace(k) : ""],
 ];
 const pairFacts = (p) => [
   ["verdict", VERDICTS[pairs.verdict[p]]],

@@ -334,7 +334,9 @@ const steer = (canvas, eye, changed, pressed, hovered) => {
 
 const TRUST_RAMP = [[0, "#b3202c"], [0.4, "#e8743b"], [0.7, "#e9c54a"], [1, "#2a9d8f"]];
 const VALUE_RAMP = [[0, "#3b6fc9"], [0.35, "#2fa79b"], [0.7, "#e2a52e"], [1, "#d23f2f"]];
-const PIECES = ["#3b7dd8", "#e07b39", "#2a9d6f", "#b455c4", "#c9a227", "#d2455b", "#4bb3c4", "#8d7b68"];
+const PIECES = ["#e07b39", "#2a9d6f", "#b455c4", "#c9a227", "#d2455b", "#4bb3c4", "#8d7b68", "#3b7dd8"];
+const ALARMING_DEG = 1; // error of a pair; the worst of a sound model are not red
+const MOST_KEYS = 5; // numbers that the key of groups and pieces names
 const bytesOf = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
 const ramp = (stops, value) => {
   const k = Math.max(stops.findIndex(([where]) => value <= where), 1);
@@ -344,28 +346,36 @@ const ramp = (stops, value) => {
   return a.map((from, c) => Math.round(from + part * (b[c] - from)));
 };
 const gradient = (stops) => `linear-gradient(90deg, ${stops.map(([where, hex]) => `${hex} ${100 * where}%`).join(", ")})`;
-// A mode: its label, the color of a camera as three bytes (or null for gray), and what its key says.
+// A mode: its label, the color of a camera as three bytes (or null for gray), and what its key says: the ends of a
+// ramp, or a color and a text each.
 const colorModes = () => {
-  const logarithmic = (name, label, values, unit) => {
+  const logarithmic = (name, label, values, unit, alarming = 0) => {
     const shown = Array.from(values).filter((value, k) => isPlaced(k) && value > 0);
     if (!shown.length) return [];
-    const [low, high] = [quantile(shown, 0.05), quantile(shown, 0.95)];
+    const [low, high] = [quantile(shown, 0.05), Math.max(quantile(shown, 0.95), alarming)];
     const span = Math.log(high / low) || 1;
     const color = (k) => (Number.isFinite(values[k])
       ? ramp(VALUE_RAMP, Math.max(Math.min(Math.log(Math.max(values[k], low) / low) / span, 1), 0)) : null);
     return [{ name, label, color, low: `${number(low, 2)}${unit}`, high: `${number(high, 2)}${unit}`, gradient: gradient(VALUE_RAMP) }];
   };
   const trust = (k) => (Number.isFinite(cameras.trust[k]) ? ramp(TRUST_RAMP, cameras.trust[k]) : null);
+  const keyed = (name, label, values, said) => {
+    const numbers = [...new Set(values)].sort((a, b) => a - b);
+    const color = (k) => (values[k] < 0 ? null : bytesOf(PIECES[values[k] % PIECES.length]));
+    const keys = numbers.slice(0, MOST_KEYS).map((value) => (
+      [value < 0 ? "var(--nodirection)" : PIECES[value % PIECES.length], said(value)]));
+    return { name, label, color, keys };
+  };
   const modes = [];
+  if (cameras.group.some((group) => group >= 0)) modes.push(keyed("group", "groups that stand apart", cameras.group, (group) => (group < 0 ? "the rest" : `group ${group + 1}`)));
   if (isKnown(cameras.trust)) modes.push({ name: "trust", label: "trust", color: trust, low: "0", high: "1", gradient: gradient(TRUST_RAMP) });
   modes.push(...logarithmic("sigma", "uncertainty", cameras.sigma, ""));
-  modes.push(...logarithmic("residual", "error of its pairs", cameras.error, "°"));
+  modes.push(...logarithmic("residual", "error of its pairs", cameras.error, "°", ALARMING_DEG));
   if (cameras.shift) modes.push(...logarithmic("shift", "shift from the input", cameras.shift, ""));
   for (const { title, values } of cameras.further) modes.push(...logarithmic(title, title, values, ""));
-  if (!modes.length) modes.push({ name: "none", label: "none", color: () => null, low: "", high: "", gradient: "" });
+  if (!modes.length) modes.push({ name: "none", label: "none", color: () => null, keys: [] });
   if (cameras.piece.some((piece) => piece > 0)) {
-    const color = (k) => (cameras.piece[k] < 0 ? null : bytesOf(PIECES[cameras.piece[k] % PIECES.length]));
-    modes.push({ name: "piece", label: "separate piece", color, low: "", high: "", gradient: "" });
+    modes.push(keyed("piece", "separate piece", cameras.piece, (piece) => (piece < 0 ? "none" : `piece ${piece}`)));
   }
   return modes;
 };

@@ -2,14 +2,14 @@
 
 const ROWS_PER_PAGE = 10;
 
-const makeTable = (id, kind, total, columns, text, onChoice) => {
+const makeTable = (id, kind, total, columns, text, why, onChoice) => {
   let order = Array.from({ length: total }, (_, k) => k);
   let page = 0;
   let sorted = null;
   let chosen = null;
   const search = element("input");
   search.type = "search";
-  search.placeholder = "Filter by name";
+  search.placeholder = "Filter";
   search.setAttribute("aria-label", `Filter ${kind}s by name`);
   const back = button("Back", "quiet", () => { page -= 1; draw(); });
   const next = button("Next", "quiet", () => { page += 1; draw(); });
@@ -28,6 +28,7 @@ const makeTable = (id, kind, total, columns, text, onChoice) => {
     head.append(cell);
     return cell;
   });
+  // A row, and below it why it stands where it does.
   const rowOf = (k) => {
     const row = element("tr");
     row.tabIndex = 0;
@@ -42,12 +43,20 @@ const makeTable = (id, kind, total, columns, text, onChoice) => {
       choose();
       body.querySelector(`[data-row="${k}"]`)?.focus();
     };
-    return row;
+    if (!why(k)) return [row];
+    row.className = "told";
+    const told = element("tr", "", "why");
+    const cell = element("td");
+    cell.colSpan = columns.length;
+    cell.append(element("span", why(k)));
+    told.append(cell);
+    told.onclick = choose;
+    return [row, told];
   };
   const draw = () => {
     const first = page * ROWS_PER_PAGE;
     const last = Math.min(first + ROWS_PER_PAGE, order.length);
-    body.replaceChildren(...order.slice(first, last).map(rowOf));
+    body.replaceChildren(...order.slice(first, last).flatMap(rowOf));
     shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}` : "none";
     back.disabled = page === 0;
     next.disabled = last >= order.length;
@@ -104,15 +113,7 @@ const makeTable = (id, kind, total, columns, text, onChoice) => {
 const numeric = (title, value, digits, hint) => ({
   title, hint, number: true, value, cell: (k) => element("td", number(value(k), digits), "number"),
 });
-// A name, and under it why the row stands where it does.
-const named = (title, name, why) => ({
-  title, value: name, cell: (k) => {
-    const cell = element("td", "", "name");
-    cell.append(element("span", name(k)));
-    if (why(k)) cell.append(element("small", why(k)));
-    return cell;
-  },
-});
+const named = (title, name) => ({ title, value: name, cell: (k) => element("td", name(k), "name") });
 const verdictCell = (p) => {
   const cell = element("td", "", "verdict");
   const dotted = element("span", "", "dot");
@@ -126,7 +127,7 @@ const drawTables = (onChoice) => {
   const shift = cameras.shift ? [numeric("Shift", (k) => cameras.shift[k], 2, "How far it is from where the input has it, in units")] : [];
   return {
     camera: makeTable("cameras", "camera", numCameras, [
-      named(capital(data.noun), (k) => cameras.names[k], why),
+      named(capital(data.noun), (k) => cameras.names[k]),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
       ...(isKnown(cameras.sigma) ? [numeric("± units", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
       numeric("Pair error (°)", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
@@ -136,13 +137,13 @@ const drawTables = (onChoice) => {
       },
       ...shift,
       ...cameras.further.map(({ title, hint, values }) => numeric(title, (k) => values[k], 3, hint)),
-    ], (k) => cameras.names[k], onChoice),
+    ], (k) => cameras.names[k], why, onChoice),
     pair: makeTable("pairs", "pair", numPairs, [
-      named(`${capital(data.noun)} 1`, (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),
-      named(`${capital(data.noun)} 2`, (p) => cameras.names[pairs.second[p]], () => ""),
+      named(`${capital(data.noun)} 1`, (p) => cameras.names[pairs.first[p]]),
+      named(`${capital(data.noun)} 2`, (p) => cameras.names[pairs.second[p]]),
       { title: "Verdict", value: (p) => VERDICTS[pairs.verdict[p]], cell: verdictCell },
       numeric("Off by (°)", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
       ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 9)] : []),
-    ], pairTitle, onChoice),
+    ], pairTitle, (p) => reason(pairs.reason[p]), onChoice),
   };
 };

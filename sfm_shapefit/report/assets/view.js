@@ -23,6 +23,7 @@ const makeScene = (onChoice) => {
   const modes = colorModes();
   const placed = Array.from(cameras.names.keys()).filter(isPlaced);
   const ghosts = Array.from(cameras.names.keys()).filter((k) => Number.isFinite(cameras.ghost[3 * k]));
+  const elsewhere = placed.filter((k) => Number.isFinite(cameras.other[3 * k]));
   const positionOf = (k) => at(isPlaced(k) ? cameras.center : cameras.ghost, k);
   const hasPose = (k) => Number.isFinite(cameras.frusta[9 * k]);
   const hasPosition = (k) => Number.isFinite(positionOf(k)[0]);
@@ -97,15 +98,15 @@ const makeScene = (onChoice) => {
     }
     return found;
   };
-  const withoutFar = (all) => {
+  const withoutFar = (all, share) => {
     if (!all.length) return all;
     const center = [0, 1, 2].map((c) => quantile(all.map((p) => p[c]), 0.5));
     const away = all.map((p) => Math.hypot(...p.map((part, c) => part - center[c])));
-    const limit = 3 * quantile(away, 0.75);
+    const limit = 3 * quantile(away, share);
     return all.filter((_, k) => away[k] <= limit);
   };
   // Cameras and points, without the few that are far out.
-  const nearCameras = withoutFar(placed.map((k) => positionOf(k)));
+  const nearCameras = withoutFar(placed.map((k) => positionOf(k)), 0.75);
   // The first view may leave out more, so that a statue is seen although some photographs of it are from far away. On a
   // line, a ring or an area the farthest camera is at twice the median distance, or less.
   const mainCameras = (() => {
@@ -118,7 +119,7 @@ const makeScene = (onChoice) => {
     const all = [];
     const step = Math.max(Math.floor(points.positions.length / 3 / 4000), 1);
     for (let k = 0; k < points.positions.length / 3; k += step) all.push(at(points.positions, k));
-    return withoutFar(all);
+    return withoutFar(all, 0.5); // points have longer tails: what is far behind a scene would make it a dot
   })();
   const robust = [...nearCameras, ...nearPoints, ...(nearCameras.length ? [] : [[0, 0, 0]])];
   const bounds = [0, 1, 2].map((c) => {
@@ -212,6 +213,15 @@ const makeScene = (onChoice) => {
       dots: painter.cloud({ center: gather(ghosts, cameras.ghost, 3) }),
     });
   }
+  if (elsewhere.length) {
+    const columns = frustumColumns(elsewhere);
+    const [center, ends] = [columns.center, gather(elsewhere, cameras.other, 3)];
+    addLayer("elsewhere", `Another place (${count(elsewhere.length)})`, true, {
+      variable: "--ink", alpha: 0.8,
+      ghosts: painter.shapes(FRUSTUM, { ...columns, center: ends }),
+      segments: painter.shapes(SEGMENT, { center, u: ends.map((part, k) => part - center[k]) }),
+    });
+  }
   addLayer("grid", `Grid of ${number(grid.square)} units`, true, {
     variable: "--line", segments: painter.shapes(SEGMENT, grid.columns), alpha: 0.8, isGrid: true,
   });
@@ -245,7 +255,7 @@ const makeScene = (onChoice) => {
       painter.paint(one.cloud, { ...common, size, ...limits }, SHARES[detail()]);
     }
     if (one.lines && (!detail() || placed.length < 300)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
-    if (one.ghosts) painter.paint(one.ghosts, { ...common, scale: sizes.frustum, width: 1.2 * ratio, tint: [...tint, 0.55] });
+    if (one.ghosts) painter.paint(one.ghosts, { ...common, scale: sizes.frustum, width: 1.2 * ratio, tint: [...tint, one.alpha ?? 0.55] });
     if (one.dots) dots(one.dots, common, cameraSize(), one.lines ? null : [...tint, 0.8]);
     if (one.ellipsoids) painter.paint(one.ellipsoids, { ...common, scale: sizes.ellipsoid, width: 1.2 * ratio });
     if (one.segments) {
@@ -253,7 +263,7 @@ const makeScene = (onChoice) => {
       painter.paint(one.segments, { ...common, scale: 1, width: (one.isGrid ? 1 : 1.5) * ratio, tint: [...tint, one.alpha] }, one.pairs ? SHARES[detail()] : 1);
     }
   };
-  const ORDER = ["grid", "points", "cameras", "ghosts", "ellipsoids", "input", "agrees", "nodirection", "undetermined", "contradicts"];
+  const ORDER = ["grid", "points", "cameras", "ghosts", "elsewhere", "ellipsoids", "input", "agrees", "nodirection", "undetermined", "contradicts"];
   const draw = () => {
     const ratio = pixelRatio();
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(side * ratio));
@@ -507,10 +517,13 @@ const makeScene = (onChoice) => {
     redraw();
   };
   const drawLegend = () => {
-    const strip = element("span", "", "ramp");
-    strip.style.background = mode.gradient;
-    const shown = mode.gradient ? [element("span", mode.low), strip, element("span", mode.high)] : [];
-    fill("legend", ...shown);
+    const colored = (background, className) => {
+      const made = element("span", "", className);
+      made.style.background = background;
+      return made;
+    };
+    if (mode.keys) fill("legend", ...mode.keys.flatMap(([color, text]) => [colored(color, "dot"), element("span", text)]));
+    else fill("legend", element("span", mode.low), colored(mode.gradient, "ramp"), element("span", mode.high));
   };
   const drawLayerControls = () => {
     const boxes = layers.map((one) => {
