@@ -181,7 +181,11 @@ class GroupedCommand(TyperCommand):
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
         convert_plainly(self.get_params(ctx))
-        extra = super().parse_args(ctx, _gather_values(args))
+        try:
+            extra = super().parse_args(ctx, _gather_values(args))
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")  # typer has it from pydantic
+            raise
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)
         return extra

@@ -544,7 +544,7 @@ def test_json_in_the_place_of_a_model_or_graph_is_told_what_is_wanted(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text("{}\n")
     assert "got 1 column; give the text file of a bare graph, or the folder" in run_refused("inspect", path)
-    assert "is a file; give the folder that holds cameras" in run_refused("locate", path, tmp_path / "out")
+    assert "has no key 'frames'; give a transforms.json" in run_refused("locate", path, tmp_path / "out")
 
 
 def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):
