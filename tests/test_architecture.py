@@ -36,7 +36,7 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
     "adjustment": 4480,
-    "base": 2180,
+    "base": 2210,
     "cli": 1760,
     "facts": 3310,
     "files": 4540,
@@ -48,7 +48,7 @@ MOST_LINES = {
     "placement": 2650,
     "refinement": 2100,
     "report": 1680,
-    "rotations": 2270,
+    "rotations": 2290,
     "scene": 2050,
     "solver": 4360,
     "synthetic": 2650,
