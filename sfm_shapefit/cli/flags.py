@@ -21,7 +21,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
     Path | None,
-    typer.Argument(metavar="MODEL", help="COLMAP model folder, binary or text."),
+    typer.Argument(metavar="MODEL", help="COLMAP model folder, or for `locate` a list of poses."),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]

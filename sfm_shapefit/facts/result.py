@@ -135,6 +135,8 @@ class LocateResult(Written):
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
     where it was kept; None if there was none."""
+    moved: FloatArray | None = None
+    """(n,) by how much each center of the input was moved, see `CameraRow`; None but for rough rotations."""
     further: "tuple[LocateResult, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
@@ -301,6 +303,10 @@ class LocateResult(Written):
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
+        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved)):
+            if values is not None:
+                both = zip(rows, values.tolist(), strict=True)
+                rows = [replace(row, **{name: value}) for row, value in both]
         unposed = sorted(set(self.image_names) - set(self.images.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
