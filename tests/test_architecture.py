@@ -36,10 +36,10 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
     "adjustment": 4490,
-    "base": 2180,
+    "base": 2210,
     "cli": 1770,
     "facts": 3380,
-    "files": 4740,
+    "files": 4750,
     "graph": 1250,
     "judgement": 3290,
     "laplacian": 2080,
@@ -48,7 +48,7 @@ MOST_LINES = {
     "placement": 2660,
     "refinement": 2100,
     "report": 1700,
-    "rotations": 2270,
+    "rotations": 2290,
     "scene": 2070,
     "solver": 4360,
     "synthetic": 2650,

@@ -36,7 +36,7 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
-from sfm_shapefit.base.rotation_vectors import rotation_vectors
+from sfm_shapefit.base.quaternions import rotation_vectors
 
 _FEWEST_POINTS = 10  # points of a frame in each half; fewer do not determine its turn
 _FEWEST_FRAMES = 3  # frames with enough points; the medians of fewer say nothing

@@ -13,7 +13,7 @@ from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.rotation_vectors import rotation_vectors
+from sfm_shapefit.base.quaternions import rotation_vectors
 
 _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
 

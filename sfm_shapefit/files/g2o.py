@@ -13,10 +13,10 @@ optimization", ICRA 2011, and its file format.
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import TextTable, first_words, read_lines, rotations_by_name
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, geometries_of
 
@@ -75,4 +75,4 @@ def _select_tag(file: Path, tag: str) -> TextTable:
 def _rotations(table: TextTable, quaternions: FloatArray) -> FloatArray:
     """Return the transposed rotations (k, 3, 3) of quaternions x, y, z, w, which must be of length 1."""
     table.refuse_no_unit(quaternions, "has no unit quaternion qx qy qz qw")
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).swapaxes(1, 2)
+    return matrices_of(quaternions).swapaxes(1, 2)

@@ -11,8 +11,8 @@ Source: GLOMAP's relative pose files, `glomap/io/pose_io.cc` (ReadRelPose).
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import UNIT_TOLERANCE, first_numbers, read_lines
 from sfm_shapefit.files.onedsfm import EpipolarGeometries, geometries_of
 
@@ -40,5 +40,5 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     lengths = np.linalg.norm(translations, axis=1)
     table.refuse_no_unit(quaternions, "has no unit quaternion QW QX QY QZ")
     table.refuse(np.asarray(~(lengths > 0.0)), "has no translation, so no direction")
-    rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+    rotations = matrices_of(np.roll(quaternions, -1, axis=1))
     return geometries_of(table, 0, rotations, -np.einsum("kji,kj->ki", rotations, translations))

@@ -17,9 +17,9 @@ import math
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.scene.posed_model import ListedPoses, PosedModelFile
 
@@ -44,12 +44,14 @@ def read_tum(file: Path) -> ListedPoses:
             names.append(words[0])
             numbers.append(values[1:])
     rows = np.array(numbers).reshape(-1, 7)
-    turns = Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
+    turns = matrices_of(rows[:, 3:])
     return ListedPoses(tuple(names), turns.swapaxes(1, 2), rows[:, :3], np.full((len(rows), 2), np.nan))
 
 
 def tum_text(model: PosedModelFile) -> str:
     """Return the posed images as a trajectory; numbers round-trip."""
+    from scipy.spatial.transform import Rotation  # here, since it takes long to import
+
     quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
     numbers = (np.concatenate([model.centers, quaternions], axis=1) + 0.0).tolist()
     rows = sorted(zip(_timestamps(model.names), numbers, strict=True), key=lambda row: float(row[0]))
@@ -62,6 +64,8 @@ def poses_csv(model: PosedModelFile) -> str:
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z", "qw", "qx", "qy", "qz"])
+    from scipy.spatial.transform import Rotation  # here, since it takes long to import
+
     quaternions = np.roll(Rotation.from_matrix(model.rotations).as_quat(canonical=True), 1, axis=1)
     numbers = np.concatenate([model.centers, quaternions], axis=1) + 0.0
     for name, row in zip(model.names, numbers.tolist(), strict=True):

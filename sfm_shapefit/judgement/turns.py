@@ -48,7 +48,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.rotation_vectors import rotation_vectors, rotations_of
+from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable

@@ -18,7 +18,6 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.gravity import with_gravity
 from sfm_shapefit.rotations.options import AveragingOptions
 from sfm_shapefit.scene.given import Gravity
 
@@ -138,8 +137,9 @@ def refine_with_gravity(
     averaged: AveragedRotations, relative: RelativeRotations, gravity: Gravity
 ) -> AveragedRotations:
     """Return averaged rotations of frames refined on their pairs and gravities together."""
+    from sfm_shapefit.rotations.gravity import with_gravity  # it loads long
+
     supports = relative.weight_shares * relative.num_matches
-    given, _ = check_pairs(
-        relative.pairs, relative.rotations, relative.information, supports, len(averaged.registered)
-    )
+    count = len(averaged.registered)
+    given, _ = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
     return with_gravity(averaged, given, gravity)

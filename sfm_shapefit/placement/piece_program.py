@@ -21,7 +21,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
-from sfm_shapefit.base.rotation_vectors import rotations_of
+from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph

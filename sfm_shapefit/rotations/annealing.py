@@ -19,12 +19,14 @@ averaging: uncertainties and robust losses", CVPR 2023 (information of the pairs
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csgraph
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.forests import merge_sets, root_of
+from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.laplacian.operators import group_by
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.rotations.averaging_kernels import (
     close_triangles,
@@ -95,21 +97,37 @@ class Linearized(NamedTuple):
 def follow_spanning_tree(given: AveragingPairs) -> FloatArray:
     """Return the rotations (n, 4) along the maximum spanning tree, all with the root at the identity."""
     n, pairs = given.num_cameras, given.pairs
-    # Ranks instead of supports: a stored 0 would be no link, and equal ones keep the order of the pairs.
-    ranks = np.empty(len(pairs))
-    ranks[np.argsort(-given.supports, kind="stable")] = np.arange(1.0, len(pairs) + 1.0)
-    tree = csgraph.minimum_spanning_tree(coo_array((ranks, tuple(pairs.T)), shape=(n, n)).tocsr()).tocoo()
-    taken = np.argsort(ranks)[tree.data.astype(np.int64) - 1]
-    root = int(pairs[np.argmin(ranks), 0]) if len(pairs) else 0
-    links = coo_array((np.ones(len(taken)), tuple(pairs[taken].T)), shape=(n, n)).tocsr()
-    order, parents = csgraph.breadth_first_order(links, root, directed=False)
-    parents = np.where(parents < 0, -1, parents).astype(np.int64)
-    pair_of = np.full(n, -1, dtype=np.int64)
-    i, j = pairs[taken].T
-    pair_of[np.where(parents[i] == j, i, j)] = taken
+    ranked = np.argsort(-given.supports, kind="stable")
+    order, (parents, links) = np.empty(n, dtype=np.int64), np.full((2, n), -1)
+    reached = _grow_tree(pairs, ranked, int(pairs[ranked[0], 0]) if len(pairs) else 0, order, parents, links)
     turns = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    follow_tree(order.astype(np.int64), parents, pair_of, pairs, given.measured, turns)
+    follow_tree(order[:reached], parents, links, pairs, given.measured, turns)
     return turns
+
+
+@kernel
+def _grow_tree(pairs: Any, ranked: Any, root: int, order: Any, parents: Any, links: Any) -> int:
+    """Fill in the tree of the pairs that rank first, as `follow_tree` takes it; return its size."""
+    n, count = len(parents), 0
+    forest, taken, ends = np.arange(n), np.empty(n, np.int64), np.empty(2 * n, np.int64)
+    for rank in range(len(ranked)):
+        i, j = pairs[ranked[rank], 0], pairs[ranked[rank], 1]
+        if root_of(forest, i) != root_of(forest, j):
+            merge_sets(forest, i, j)
+            taken[count], ends[2 * count], ends[2 * count + 1] = ranked[rank], i, j
+            count += 1
+    pointers, entries = group_by(ends[: 2 * count], n)
+    order[0], reached = root, 1
+    for head in range(n):
+        if head == reached:
+            break
+        node = order[head]
+        for p in range(pointers[node], pointers[node + 1]):
+            other = ends[entries[p] ^ 1]
+            if other != parents[node]:
+                parents[other], links[other], order[reached] = node, taken[entries[p] // 2], other
+                reached += 1
+    return reached
 
 
 def closing_shares(given: AveragingPairs, system: AveragingSystem) -> FloatArray:

@@ -22,11 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.base.quaternions import matrices_of, quaternions_of
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
@@ -142,7 +142,7 @@ def _choose(
     n, registered = given.num_cameras, np.zeros(given.num_cameras, dtype=np.bool_)
     registered[best.members] = True
     rotations, sigmas = np.tile(np.eye(3), (n, 1, 1)), np.full(n, np.nan)
-    rotations[registered] = Rotation.from_quat(best.turns).as_matrix()
+    rotations[registered] = matrices_of(best.turns)
     sigmas[registered] = np.degrees(estimate_sigmas(best.given, best.system, best.last))
     both = registered[given.pairs].all(axis=1)
     certificate = _certify(best)
@@ -303,11 +303,10 @@ def _ordered(
     order = np.lexsort(pairs.T[::-1])
     capped = np.empty((len(order), 3, 3))
     cap_information(np.ascontiguousarray(information[order]), float(_FLOOR) ** 2, capped)
-    quaternions = Rotation.from_matrix(rotations[order]).as_quat() if len(order) else np.zeros((0, 4))
     given = AveragingPairs(
         num_cameras=num_images,
         pairs=np.ascontiguousarray(pairs[order]),
-        measured=np.ascontiguousarray(quaternions),
+        measured=quaternions_of(rotations[order]),
         information=capped,
         supports=np.ascontiguousarray(supports[order]),
     )

@@ -32,10 +32,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import angle_between
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.rotations.annealing import LONGEST_STEP
 from sfm_shapefit.rotations.averaging_kernels import fill_matrix, relative_in_world, turn_cameras
@@ -91,7 +90,7 @@ def certify_rotations(
         if affordable
         else _least_eigenvalue(pairs, blocks, diagonal) >= -shift
     )
-    moved = (Rotation.from_quat(polished).inv() * Rotation.from_quat(turns)).magnitude()
+    moved = 2.0 * np.minimum(angle_between(polished, turns), angle_between(polished, -turns))
     return DualCertificate(
         certified=certified,
         proved=certified and affordable,
@@ -118,6 +117,8 @@ def _least_eigenvalue(pairs: IntArray, blocks: FloatArray, diagonal: FloatArray)
 
     m comes out up to a hundredth too large, which the bound, asked for as a power of ten, does not feel.
     """
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh  # it loads long
+
     n = len(diagonal)
     size = float(np.trace(diagonal, axis1=1, axis2=2).max())
     out = np.empty((n, 3))

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.base.rotation_vectors import rotation_vectors, rotations_of
+from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
 
