@@ -97,7 +97,6 @@ def seed_points(
         num_keypoints, batches = source.view.num_keypoints, source.view.batches()
         counts = count_observations(points, images, num_keypoints, batches, rotations, limit_px)
         unsupported = images_without_support(counts, images, fixed)
-        unsupported &= True if sure is None else ~sure
         if options.trust.min_trust > 0.0:
             seen = np.where(unsupported, points.count_seen(len(seen)), seen)
             images, points = _leave_out(unsupported, images, points)

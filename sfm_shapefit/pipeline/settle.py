@@ -240,6 +240,7 @@ def _ask_pixels(stand: Stand, judged: Judged, kept: BoolArray, seeded: Seeded) -
     doubted = np.zeros(source.images.num_images, dtype=np.bool_)
     doubted[judged.cameras] = (judged.assessment.trust < LOW_TRUST) | ~kept
     doubted |= seeded.num_seen >= 0
+    doubted &= ~seeded.unsupported  # a wrong lens or so, of which its own points know more
     if not (doubted.any() and source.has_database):
         return np.zeros_like(doubted)
     images = _place_all(stand, seeded.images)

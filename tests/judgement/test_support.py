@@ -16,7 +16,7 @@ from sfm_shapefit.judgement.support import (
     images_of_few_points,
     images_without_support,
 )
-from sfm_shapefit.pipeline import seed, settle
+from sfm_shapefit.pipeline import seed
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from tests.scenes import RING
 
@@ -102,7 +102,6 @@ def test_it_is_named_and_can_be_kept(monkeypatch):
         return counts
 
     monkeypatch.setattr(seed, "count_observations", count)
-    monkeypatch.setattr(settle, "ask_pixels", lambda *given: np.zeros_like(given[-1]))  # which confirm it
     found = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
     name = found.images.names[2]
     row = next(row for row in found.cameras if row.name == name)
