@@ -31,6 +31,8 @@ class Structure(NamedTuple):
     """Keypoints and lenses of the images."""
     among: BoolArray | None = None
     """(i,) images that make the points; all if None."""
+    asked: BoolArray | None = None
+    """(i,) images that are asked whether they contradict their lenses; all if None."""
 
 
 def gather_evidence(
@@ -44,8 +46,8 @@ def gather_evidence(
         structure: the points of the model.
         threads: number of threads to use.
     """
-    points, images, pictures, among = structure
-    _, lenses = question_lenses(points, images, pictures, threads, among)
+    points, images, pictures, among, asked = structure
+    _, lenses = question_lenses(points, images, pictures, threads, among, asked)
     if fits is None:
         return ModelEvidence(lenses=lenses)
     held = fits.held(images)
@@ -74,7 +76,7 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) ->
 
     None is where the model has other keypoints than the matches.
     """
-    points, images, pictures, _ = structure
+    points, images, pictures = structure[:3]
     view = source.view
     counts = [pictures.count(k) for k in range(images.num_images)] if doubted.any() else []
     if not points.num_points or counts != view.num_keypoints.tolist():
