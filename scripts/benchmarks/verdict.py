@@ -3,14 +3,18 @@
 Models of known truth are spoiled: a third of the cameras, those farthest along one axis, with the points that
 mostly they see, shifted, scaled or turned as a whole; one camera moved or turned; all focal lengths wrong,
 then bundle adjusted. They are judged as models of any program (`check`), each beside one model that `map`
-made of the same database. And one image gets a wrong lens of its own, or a third of them one that they share,
-of which `locate` is not told: it may find it, and its model is right then. All are judged unspoiled, too.
+made of the same database. A ring that looks alike from two sides has a block of cameras on the wrong one,
+where false pairs put it, or a third of it is folded over; points are triangulated again. And one image gets
+a wrong lens of its own, or a third of them one that they share, of which `locate` is not told: it may find
+it, and its model is right then. All are judged unspoiled, too.
 """
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +25,11 @@ import sfm_shapefit
 from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
 from harness.record import Row, at_least, at_most, table
 from harness.scenes import temporary_scene
+from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
+from sfm_shapefit.synthetic import SceneOptions
+from sfm_shapefit.synthetic import scenes as synthetic_scenes
+from sfm_shapefit.synthetic.layouts import lay_out_scene
 
 BUNDLED = ROOT / "data_synthetic"
 REAL = ("fountain-P11", "Herz-Jesus-P25", "castle-P30")
@@ -29,6 +37,10 @@ DRAWN = {
     "drawn ring": {"shape": "ring", "num_images": 24, "num_points": 1500},
     "drawn courtyard": {"shape": "courtyard", "num_images": 24, "num_points": 1500},
 }
+TWO_SIDES = {"shape": "ring", "num_images": 40, "num_points": 2000, "max_pairs_per_image": 10, "seed": 2}
+BLOCK, FALSE_PAIRS = 8, (0, 3, 6)
+"""Cameras that are put on the other side, and false pairs that each has with cameras there, beside ten."""
+OTHER_SIDE = np.diag([-1.0, -1.0, 1.0])
 GROUPS = ("shifted 5 %", "shifted 20 %", "scaled 1.1", "turned 3 deg", "turned 10 deg", "turned 90 deg")
 SINGLES = ("one moved 5 %", "one turned 3 deg")
 ALL_LENSES = ("lenses x 0.8", "lenses x 1.1", "lenses x 1.3")
@@ -58,6 +70,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         return {"ring8": partial(judge_scene, "ring8", bundled["ring8"])}
     found: dict[str, Case] = {name: partial(judge_scene, name, scene) for name, scene in bundled.items()}
     found |= {name: partial(judge_drawn, name) for name in DRAWN}
+    found |= {f"two sides, {num} pairs": partial(judge_two_sides, num) for num in FALSE_PAIRS}
     for name in REAL:
         scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
         found[name] = partial(judge_scene, name, scene) if scene.model.is_dir() else NOT_FOUND
@@ -70,6 +83,55 @@ def judge_drawn(name: str) -> list[Row]:
     with temporary_scene(options) as (_, folder):
         model = next(folder.rglob("truth"), folder / "sparse" / "0")
         return judge_scene(name, Scene(model, folder / "database.db"))
+
+
+def judge_two_sides(num_false: int) -> list[Row]:
+    """Judge a ring that looks alike from two sides: right, with a block on the wrong one, and folded."""
+    name = f"two sides, {num_false} pairs"
+    with temporary_scene(two_sided(num_false)) as (_, folder):
+        scene = Scene(next(folder.rglob("truth"), folder / "sparse" / "0"), folder / "database.db")
+        rows = []
+        for how, num in (("nothing", 0), ("block", BLOCK), ("folded", TWO_SIDES["num_images"] // 3)):
+            model = pycolmap.Reconstruction(scene.model)
+            chosen = [model.image(k) for k in sorted(model.reg_image_ids())[:num]]
+            turned = pycolmap.Sim3d(1.0, pycolmap.Rotation3d(OTHER_SIDE), np.zeros(3))
+            names = {image.name for image in chosen}
+            move(model, chosen, turned, with_points=False)
+            if num:
+                with quiet_log(), TemporaryDirectory() as out:
+                    model = pycolmap.triangulate_points(model, scene.database, out, out, clear_points=True)
+            rows.append(tell(name, how, *look(model, scene), names))
+        return rows
+
+
+def two_sided(num_false: int) -> synthetic_scenes.Scene:
+    """Return a ring around points alike on two sides, with pairs that mistake one for the other."""
+    options = SceneOptions(**TWO_SIDES)
+    draws = np.random.default_rng(options.seed).spawn(6)
+    layout, rigs = lay_out_scene(options, draws[0])
+    half = options.num_points // 2
+    points, normals = (
+        np.concatenate([side[:half], side[:half] @ OTHER_SIDE]) for side in (layout.points, layout.normals)
+    )
+    layout = replace(layout, points=points, normals=normals)
+    made = synthetic_scenes.build_scene(layout, rigs, options, draws[1:])
+    lists = {(i, j): made.matches_of(e) for e, (i, j) in enumerate(made.pairs.tolist())}
+    for camera in range(BLOCK):
+        there = np.linalg.norm(made.centers[BLOCK:] - made.centers[camera] @ OTHER_SIDE, axis=1)
+        mistaken = (made.keypoint_points[camera] + half) % (2 * half)
+        for other in (BLOCK + np.argsort(there)[:num_false]).tolist():
+            _, own, others = np.intersect1d(mistaken, made.keypoint_points[other], return_indices=True)
+            lists[camera, other] = np.stack([own, others], axis=1)
+    pairs = sorted(lists)
+    unknown = len(pairs) - made.num_pairs
+    return replace(
+        made,
+        pairs=np.array(pairs),
+        matches=np.concatenate([lists[pair] for pair in pairs]),
+        match_offsets=np.cumsum([0, *(len(lists[pair]) for pair in pairs)]),
+        relative_rotations=np.concatenate([made.relative_rotations, np.tile(np.eye(3), (unknown, 1, 1))]),
+        relative_translations=np.concatenate([made.relative_translations, np.ones((unknown, 3))]),
+    )
 
 
 def judge_scene(name: str, scene: Scene) -> list[Row]:
@@ -252,6 +314,7 @@ def summarize(rows: Sequence[Row]) -> Iterator[str]:
     families: Mapping[str, Callable[[str], bool]] = {
         "unspoiled": lambda how: how.startswith("nothing"),
         "groups": GROUPS.__contains__,
+        "blocks and folds": ("block", "folded").__contains__,
         "one camera": SINGLES.__contains__,
         "all lenses, adjusted": ALL_LENSES.__contains__,
         "one lens, locate": lambda how: how.startswith("one lens"),

@@ -120,6 +120,7 @@ class ToldEvidence(Record):
     lenses: Annotated[tuple[ContradictedLens, ...], "Lenses whose images ask for another focal length."] = ()
     places: Annotated[tuple[AmbiguousPlace, ...], "Cameras that two sets of pairs put at two places."] = ()
     seams: Annotated[tuple[GroupApart, ...], "Groups of cameras that stand apart from the rest."] = ()
+    contradicted: Annotated[tuple[str, ...], "Images that many pairs contradict, and no points confirm."] = ()
     second: Annotated[ToldOpinion | None, "How another model of the same matches compares."] = None
 
     @property
@@ -128,7 +129,12 @@ class ToldEvidence(Record):
         seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
         lenses, second = (told.statement for told in self.lenses), self.second
         differs = second is not None and (second.wrong or second.undecided)
-        return [*seams, *places, *lenses, *([second.statement] if second is not None and differs else [])]
+        told = [*seams, *places, *lenses, *([second.statement] if second is not None and differs else [])]
+        if self.contradicted:
+            told.append(
+                f"{_cameras(self.contradicted)} where many pairs contradict, and no points confirm it"
+            )
+        return told
 
 
 def tell_evidence(
@@ -163,6 +169,7 @@ def tell_evidence(
             )
             for seam in evidence.seams
         ),
+        contradicted=tuple(images.names[one.camera] for one in evidence.contradicted),
         second=None if evidence.second is None else _tell_opinion(evidence.second, images),
     )
 

@@ -20,11 +20,25 @@ from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
+from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
 _EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
+_FEWEST_PAIRS = 2  # pairs with a direction; a single one contradicts nothing
+_LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is asked
 _OWN_SIGMAS = 3.0  # standard deviations of the pair's own direction; far points make it inexact
+
+
+class Contradicted(NamedTuple):
+    """A camera that many of its pairs contradict, with those of its frame."""
+
+    camera: int
+    """Its row."""
+    num_pairs: int
+    """Pairs with a direction."""
+    num_against: int
+    """Pairs of these that contradict where it stands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -50,26 +64,41 @@ class PairFits:
         pairs, directions = measured.pairs[rows], measured.directions[rows]
         return find_other_places(self.centers, pairs, directions, self.agrees[rows], self.level_deg)
 
-    def count_held(self, points: Points | None = None) -> int:
-        """Return the number of cameras in the largest rigid piece of the pairs that agree.
+    def contradicted(self, images: Images) -> tuple[Contradicted, ...]:
+        """Return the images whose frames are contradicted by more of their pairs than is usual."""
+        ends = images.frame_of[self.directions.pairs]
+        known = np.isfinite(self.residuals_deg) & (ends[:, 0] != ends[:, 1])
+        count = len(images.frames.ids)
+        total = np.bincount(ends[known].ravel(), minlength=count)
+        against = np.bincount(ends[known & self.contradicts].ravel(), minlength=count)
+        shares = against / np.maximum(total, 1)
+        asked = total >= _FEWEST_PAIRS
+        usual = float(np.median(shares[asked])) if asked.any() else 0.0
+        many = asked & (shares > max(_LARGE_SHARE, _SHARE_OF_USUAL * usual))
+        rows = np.flatnonzero(many[images.frame_of] & np.isfinite(self.centers).all(axis=1))
+        counts = zip(rows.tolist(), total[images.frame_of[rows]].tolist(), strict=True)
+        return tuple(Contradicted(k, all_, int(against[images.frame_of[k]])) for k, all_ in counts)
+
+    def held(self, images: Images, points: Points | None = None) -> BoolArray:
+        """Return which cameras (n,) are in the largest rigid piece of agreeing pairs, each frame one node.
 
         Points of three images or more tie them too, as on a chain of neighbors, whose pairs tell no lengths.
         """
-        n, edges = len(self.centers), self.directions.pairs[self.agrees]
-        if not len(edges):
-            return 0
-        if points is not None:
-            ties = points.taken(np.isin(points.images, edges))
+        frame_of, count, pairs = images.frame_of, len(images.frames.ids), self.directions.pairs[self.agrees]
+        edges = frame_of[pairs]
+        if points is not None and len(pairs):
+            ties = points.taken(np.isin(points.images, pairs))
             ties = ties.taken((ties.lengths() > 2)[ties.points_seen()])
-            edges = np.concatenate([edges, np.stack([ties.images, n + ties.points_seen()], axis=1)])
-            n += ties.num_points
-        held = np.unique(edges[parallel_rigid_pieces(n, edges, 3) == 0])
-        return int(np.searchsorted(held, len(self.centers)))
+            rays = np.stack([frame_of[ties.images], count + ties.points_seen()], axis=1)
+            edges, count = np.concatenate([edges, rays]), count + ties.num_points
+        edges = np.unique(np.sort(edges[edges[:, 0] != edges[:, 1]], axis=1), axis=0)
+        rows = edges[parallel_rigid_pieces(count, edges, 3) == 0] if len(edges) else edges
+        return np.asarray(np.isin(frame_of, rows) & np.isfinite(self.centers).all(axis=1))
 
-    def cuts(self) -> tuple[Cut, ...]:
-        """Return the groups that contradictions cut off."""
+    def cuts(self, held: BoolArray) -> tuple[Cut, ...]:
+        """Return the groups that contradictions cut off; `held` are the cameras (n,) of one rigid piece."""
         pairs = self.directions.pairs
-        return find_cuts(pairs[self.agrees], pairs[self.contradicts], len(self.centers))
+        return find_cuts(pairs[self.agrees], pairs[self.contradicts], held)
 
 
 def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
@@ -126,6 +155,8 @@ class ModelEvidence:
     """By rows of the images."""
     seams: tuple[Seam, ...] = ()
     """By rows of the images."""
+    contradicted: tuple[Contradicted, ...] = ()
+    """By rows of the images; those that the pixels confirm are not among them."""
     num_held: int | None = None
     """Cameras of the largest rigid piece of pairs that agree, and points that fit; None without pairs."""
     second: SecondOpinion | None = None

@@ -8,12 +8,15 @@ Do not use, if any of these holds:
     most of their matches miss the epipolar lines
     fewer than half of the cameras that were placed are in the output, or of all images
     more than a tenth of the cameras stand apart from the rest (`seams`), or elsewhere in another model of
-    the same matches, which pairs support there (`second_opinion`)
-    evidence that the fit did not use speaks against more than a third of them (`evidence`)
+    the same matches, which pairs support there (`second_opinion`); who stands where it does is to be looked
+    at only
+    evidence that the fit did not use speaks against more than a third of them (`evidence`), but for these
 
 Look at the cameras that are placed with a trust below 0.75, that are uncertain or hang loose, that were
-placed but are not in the output, that are kept though their matches make no points, or that evidence which
-the fit did not use names: another place, a seam, a wrong lens. Look also, though no camera can be named, if
+placed but are not in the output, that are kept though their matches make no points, that many pairs
+contradict and no pixels confirm (`witnesses`), or that evidence which the fit did not use names: another
+place, a seam, a wrong lens. Trust is not low where the pixels confirm a camera. Look also, though no camera
+can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
@@ -126,19 +129,22 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
     places = (place.camera for place in evidence.places)
     named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
+    confirmed = set() if second is None else set(second.confirmed.tolist())
+    doubted = [one.camera for one in evidence.contradicted if one.camera not in confirmed]
     count = int(images.is_posed.sum())
     suspicions: list[str] = []
     reasons: list[str] = []
     if apart:
         clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
-        (reasons if len(apart) > _MOST_APART * count else suspicions).append(clause)
+        (reasons if len(set(apart) - confirmed) > _MOST_APART * count else suspicions).append(clause)
     if evidence.num_held is not None and evidence.num_held < LEAST_HELD * count:
         reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
-    if len(named) > _MOST_NAMED * count:
+    if len(named.keys() - confirmed) > _MOST_NAMED * count:
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
     if lenses:
         suspicions.append(f"images contradict {counted(len(lenses), 'focal length')}")
-    return Against(tuple(images.names[camera] for camera in named), tuple(suspicions), tuple(reasons))
+    cameras = tuple(images.names[camera] for camera in dict.fromkeys([*named, *doubted]))
+    return Against(cameras, tuple(suspicions), tuple(reasons))
 
 
 def judge_graph(placement: Judged) -> ModelVerdict:
@@ -169,8 +175,9 @@ def judge_model(
     trust, cameras = placement.assessment.trust, placement.cameras
     doubtful = trust < _LOW_TRUST
     doubtful[uncertain_cameras(placement)] = True
-    for group in placement.assessment.loose_groups:
-        doubtful[group.cameras] = True
+    adjusted = placement.adjusted_covariances
+    for group in placement.assessment.loose_groups:  # by the pairs; where the pixels were asked, they say
+        doubtful[group.cameras] |= adjusted is None or bool(np.isnan(adjusted[group.cameras]).any())
     rows = np.flatnonzero(doubtful)
     names = [placement.graph.name_of(int(cameras[k])) for k in rows[np.argsort(trust[rows], kind="stable")]]
     named = tuple(dict.fromkeys([*outside, *against.cameras, *names]))

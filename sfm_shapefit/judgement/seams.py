@@ -22,17 +22,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
-from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.scene.points import Points
 
 _SMALLEST_GROUP = 2  # cameras; a single one is no group, and has tests of its own
 _FEWEST_CONTRADICTING = 5  # pairs across a cut, and pairs on one turn; fewer are chance
 _OUTNUMBERED = 2.0  # contradicting pairs over agreeing ones across a cut; it was 3 or more in wrong models
 _LEAST_ON_ONE_TURN = 0.1  # share of the contradictions with a rotation that agree on one turn; see the header
 _BY_CHANCE = 0.1  # agreeing pairs over contradicting ones across a group that is shifted; chance makes a few
+_FEWEST_POINTS = 15  # points across a cut that fit; fewer are chance
 _ALIKE_DEG = 3.0  # degrees between turns that agree; a single pair knows its rotation to about one
 _MOST_TURNS = 300  # turns across one cut that are compared, evenly taken; the time grows with the square
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
@@ -49,6 +50,8 @@ class Cut(NamedTuple):
     """(m, 2) pairs across that contradict."""
     is_tied: bool
     """Whether the agreeing pairs hold most of the group in one rigid piece with the rest."""
+    is_seen: bool = False
+    """Whether points that fit tie it to the rest."""
 
 
 class Seam(NamedTuple):
@@ -66,20 +69,18 @@ class Seam(NamedTuple):
     """Angle of that turn; NaN without any."""
 
 
-def find_cuts(agreeing: IntArray, contradicting: IntArray, count: int) -> tuple[Cut, ...]:
-    """Return the groups of so many cameras that contradictions cut off, the largest first.
+def find_cuts(agreeing: IntArray, contradicting: IntArray, held: BoolArray) -> tuple[Cut, ...]:
+    """Return the groups of cameras that contradictions cut off, the largest first.
 
     Args:
         agreeing: (k, 2) pairs of cameras that agree with the model.
         contradicting: (m, 2) pairs that contradict it, by their direction or by their rotation.
-        count: number of cameras; those without a pair are in no group.
+        held: (n,) cameras of the largest rigid piece; those without a pair are in no group.
     """
+    count = len(held)
     pairs = np.concatenate([agreeing, contradicting])
     weights = np.repeat([1.0, -1.0], [len(agreeing), len(contradicting)])
     bodies = _moved(find_bodies(count, pairs, weights), pairs, weights)
-    held = np.zeros(count, dtype=np.bool_)
-    if len(agreeing):
-        held[agreeing[parallel_rigid_pieces(count, agreeing, 3) == 0]] = True
     sizes = np.bincount(bodies, minlength=count)
     main = int(np.argmax(sizes))
     cuts = []
@@ -89,9 +90,23 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, count: int) -> tuple[
         inside = bodies == body
         across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
         if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > _OUTNUMBERED * len(across[0]):
-            is_tied = 2 * np.sum(held & inside) > sizes[body]  # piece 0 is that of most cameras
+            is_tied = 2 * np.sum(held & inside) > sizes[body]
             cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], bool(is_tied)))
     return tuple(cuts)
+
+
+def tied_by_points(cut: Cut, points: Points, fits: BoolArray, count: int) -> Cut:
+    """Return a cut of so many cameras that says whether points tie it, by observations (o,) that fit or not.
+
+    A point speaks if three images see it, some of them on either side of the cut.
+    """
+    inside = np.isin(np.arange(count), cut.cameras)[points.images]
+    inner = np.diff(np.append(0, np.cumsum(inside))[points.offsets])
+    lengths = points.lengths()
+    across = (lengths > 2) & (inner > 0) & (inner < lengths)
+    fitting = np.diff(np.append(0, np.cumsum(fits))[points.offsets]) == lengths
+    num = int(np.sum(across & fitting))
+    return cut._replace(is_seen=num >= max(_FEWEST_POINTS, _OUTNUMBERED * (int(across.sum()) - num)))
 
 
 def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: FloatArray) -> tuple[Seam, ...]:
@@ -114,8 +129,8 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         share = num_turned / max(len(rows), 1)
         num = len(cut.contradicting)
         is_turned = num_turned >= _FEWEST_CONTRADICTING and share > _LEAST_ON_ONE_TURN
-        is_turned &= turn_deg > _ALIKE_DEG or cut.num_agreeing <= _BY_CHANCE * num
-        if is_turned or not cut.is_tied:
+        is_shifted = not cut.is_seen and cut.num_agreeing <= _BY_CHANCE * num
+        if (is_turned and (turn_deg > _ALIKE_DEG or is_shifted)) or not (cut.is_tied or cut.is_seen):
             seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
     return tuple(seams)
 

@@ -21,16 +21,16 @@ _CHECKED_BY = 2  # matches of a keypoint in other images; with as many its track
 _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 
 
-def images_of_few_points(points: Points, images: Images, least: int, fixed: BoolArray) -> IntArray:
+def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
     """Return how many points images see that are to leave, -1 for those that stay, (i,).
 
-    A frame leaves if each of its images sees fewer than `least` points. It takes its observations along,
+    A frame leaves if each of its images sees too few points. It takes its observations along,
     which may leave others with too few; three frames stay.
 
     Args:
         points: of the images.
         images: some of them posed; others have no part.
-        least: points.
+        least: (f,) points.
         fixed: (f,) frames that stay whatever they see.
     """
     gone, frame_of = np.full(images.num_images, -1), images.frame_of

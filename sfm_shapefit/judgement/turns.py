@@ -26,10 +26,6 @@ Bodies are found by contraction (`bodies`) from pairs that agree and pairs that 
 relative: of all bodies the one whose turn mends most is turned first, the smallest of equals, and none that
 has more than half of all cameras; its pairs then agree, and bodies are found anew.
 
-Turns too small for a single pair are looked for at last, in all pairs together (`small_turns`). For a camera
-whose correction is larger than a degree, and than five of its standard deviations, `turned` are the pairs
-that fit better with it, `placed` those that fit only without.
-
 How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
 and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
 degrees are added for the given rotations, and where the quarter of pairs that agrees best has larger errors
@@ -48,9 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
@@ -72,8 +66,6 @@ RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
 _MOST_VOTES = 300  # turns of a body that are compared with one another; those of most weight decide
 _MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
 _AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
-_CERTAIN_SIGMAS = 5.0  # standard deviations; such a correction is no chance, however few its pairs are
-_LEAST_LEVEL = 0.2  # least level of errors for all pairs together; else that of those that agree best
 
 
 class Doubt(enum.Enum):
@@ -208,16 +200,12 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     ends = labels[pairs.pairs]
     between = ends[:, 0] != ends[:, 1]
     case = pairs.subset(between)._replace(pairs=ends[between])
-    level = _level(case)
-    inflation = max(1.0, level)
+    inflation = max(1.0, _level(case))
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
     touching, verdicts = _Touching.of(case.pairs, count), _Verdicts(count)
     case, done = _turn_bodies(case, touching, verdicts, least_rad)
     _judge_as_placed(case, touching, done, verdicts, least_rad)
-    for group, found in _judge_by_all_pairs(case, count, level, least_rad).items():
-        if verdicts.judged[group].kind is not Doubt.TURNED:
-            verdicts.note(np.array([group]), found)
     return verdicts.of_cameras(labels)
 
 
@@ -410,38 +398,6 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
         num_turned=int(turned.sum()),
         turn=turn,
     )
-
-
-def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: float) -> dict[int, _Judged]:
-    """Return the groups that all pairs say are turned, by more than `least_rad`, at an error `level`."""
-    case, level = pairs.subset(np.isfinite(pairs.sigmas_rad)), float(np.clip(level, _LEAST_LEVEL, 1.0))
-    if len(case.pairs) == 0:
-        return {}
-    turns = rotation_vectors(case.turns)
-    corrections = solve_corrections(
-        case.pairs, turns, case.sigmas_rad, count, level=level, larger_than_rad=least_rad
-    )
-    i, j = case.pairs.T
-    left, sigmas = turns - corrections.vectors[i] + corrections.vectors[j], level * case.sigmas_rad
-    found = {}
-    for camera, sigma in zip(corrections.cameras.tolist(), corrections.sigmas_rad.tolist(), strict=True):
-        own = corrections.vectors[camera]
-        rows = np.flatnonzero((i == camera) | (j == camera))
-        sides = np.where(i[rows] == camera, 1.0, -1.0)[:, None]
-        off_turned = np.linalg.norm(left[rows], axis=1) / sigmas[rows]
-        off_placed = np.linalg.norm(left[rows] + sides * own, axis=1) / sigmas[rows]
-        turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned < off_placed)
-        placed = (off_placed <= _AGREEING_SIGMAS) & (off_turned > _AGREEING_SIGMAS)
-        judged = _Judged(
-            placed=float(case.weights[rows] @ (placed * case.placed[rows])),
-            turned=float(case.weights[rows] @ turned),
-            num_turned=int(turned.sum()),
-            num_pairs=len(rows),
-            turn=rotations_of(own[None])[0],
-        )
-        if judged.kind is Doubt.TURNED and np.linalg.norm(own) > _CERTAIN_SIGMAS * sigma:
-            found[camera] = judged
-    return found
 
 
 def _common_turn(

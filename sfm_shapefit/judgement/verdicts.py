@@ -6,7 +6,7 @@ pair decides for itself, is `uncertainty`; what all pairs of a camera say togeth
 
 import enum
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
-from sfm_shapefit.judgement.trust import PairFit, judge_cameras
+from sfm_shapefit.judgement.trust import LOW_TRUST, PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
@@ -79,6 +79,12 @@ class Assessment:
     def sigmas(self) -> FloatArray:
         """(n, d) standard deviation of each location along the axes."""
         return standard_deviations(self.covariances)
+
+    def confirmed(self, sure: BoolArray) -> "Assessment":
+        """Return the same with trust in some of the cameras (k,), whatever their pairs say."""
+        reasons = ("" if is_sure else why for is_sure, why in zip(sure.tolist(), self.reasons, strict=True))
+        trust = np.where(sure, np.maximum(self.trust, LOW_TRUST), self.trust)
+        return replace(self, trust=trust, reasons=tuple(reasons))
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""

@@ -23,6 +23,7 @@ were 2.4 times the usual or more, but for one at facade9 and one at liberty (2.0
 whose wide lenses show it little. If a camera is moved by 1 %, 35 % or more of its pairs contradict it.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -42,7 +43,7 @@ from sfm_shapefit.facts.placed import KeyFigures
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, fit_pairs
+from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import (
     Grade,
     ModelVerdict,
@@ -53,7 +54,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.evidence import Structure, gather_evidence
+from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.scene.images import Images
@@ -68,8 +69,6 @@ _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
 _LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _LEAST_COVERAGE = 0.15  # share of the picture with points; an image with less is weak
 _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart stand at the same place
-_FEWEST_PAIRS = 3  # pairs with a direction; the share of fewer that contradict says nothing
-_LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is weak
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -138,10 +137,11 @@ def check_source(
     """
     quality, fits = _measure(model, matches, options, clock)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
-    cameras = _judge_cameras(model, quality, pairs)
     evidence = _question(model, matches, fits, clock)
+    cameras = _judge_cameras(model, quality, pairs, evidence)
     if fits is not None and other is not None:
-        evidence = replace(evidence, second=compare_models(model.images, fits, *other))
+        with clock("evidence"):
+            evidence = replace(evidence, second=_compare(model, matches, fits, other))
     verdict = _grade(model, cameras, fits, evidence)
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
@@ -155,24 +155,37 @@ def _measure(
     model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
 ) -> tuple[ImageQuality, PairFits | None]:
     """Return how well points hold the images, and how pairs fit; None where no pair shares matches."""
-    images = model.images
     with clock("points"):
-        pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
-        quality = image_quality(points_of(model.reconstruction, images), images, pictures)
+        quality = image_quality(*_structure(model)[:3])
     with clock("directions"):
         try:
-            return quality, fit_pairs(images.centers, measure(matches, options, clock).directions)
+            return quality, fit_pairs(model.images.centers, measure(matches, options, clock).directions)
         except UnsolvableError:
             return quality, None
 
 
 def _question(model: ColmapModel, matches: MatchSource, fits: PairFits | None, clock: Clock) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use."""
-    images = model.images
     with clock("evidence"):
-        points = points_of(model.reconstruction, images)
-        pictures = ModelPictures(images, points2d_of(model.reconstruction, images))
-        return gather_evidence(matches, fits, Structure(points, images, pictures), clock.threads)
+        return gather_evidence(matches, fits, _structure(model), clock.threads)
+
+
+def _compare(
+    model: ColmapModel, matches: MatchSource, fits: PairFits, other: OtherModel
+) -> SecondOpinion | None:
+    """Return how another model compares; a single camera elsewhere is not, if the pixels confirm it here."""
+    second = compare_models(model.images, fits, *other)
+    elsewhere = [] if second is None else [*second.wrong, *second.undecided]
+    if second is None or len(elsewhere) != 1:  # several that are wrong together see false points together
+        return second
+    sure = ask_pixels(matches, _structure(model), np.isin(np.arange(model.images.num_images), elsewhere))
+    return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
+
+
+def _structure(model: ColmapModel) -> Structure:
+    """Return the points of a model, and its images with their keypoints."""
+    pictures = ModelPictures(model.images, points2d_of(model.reconstruction, model.images))
+    return Structure(points_of(model.reconstruction, model.images), model.images, pictures)
 
 
 def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
@@ -195,53 +208,39 @@ def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:
     return rows
 
 
-def _judge_cameras(model: ColmapModel, quality: ImageQuality, pairs: list[PairRow]) -> list[CameraRow]:
+def _judge_cameras(
+    model: ColmapModel, quality: ImageQuality, pairs: list[PairRow], evidence: ModelEvidence
+) -> list[CameraRow]:
     """Return a row per image, those with a pose first."""
     names = model.images.names
-    degrees, wrong = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
-    for pair in pairs:
-        for name in (pair.name1, pair.name2):
-            degrees[name] += bool(pair.direction)
-            wrong[name] += bool(pair.direction) and pair.verdict == Verdict.OUTLIER.value
-    shares = [wrong[name] / degrees[name] for name in names if degrees[name] >= _FEWEST_PAIRS]
-    usual = _Usual(_median(quality.errors_px[np.isfinite(quality.errors_px)].tolist()), _median(shares))
-    rows = [
-        CameraRow(
-            name=name,
-            placed=True,
-            reason="; ".join(_weaknesses(quality, k, usual, (wrong[name], degrees[name]))),
-            piece=0,
-            center=tuple(model.images.centers[k].tolist()),
-            degree=degrees[name],
+    degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
+    contradicted = {one.camera: one for one in evidence.contradicted}
+    rows = []
+    for k, name in enumerate(names):
+        weak = list(_weaknesses(model.images, quality, k))
+        if one := contradicted.get(k):
+            weak.append(f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands")
+        center = tuple(model.images.centers[k].tolist())
+        reason = "; ".join(weak)
+        rows.append(
+            CameraRow(name=name, placed=True, reason=reason, piece=0, center=center, degree=degrees[name])
         )
-        for k, name in enumerate(names)
-    ]
     others = set(model.image_names) - set(names)
     return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
 
 
-class _Usual(NamedTuple):
-    """Medians over the images of a model; NaN where there are no values."""
-
-    error_px: float
-    share: float
-    """Share of the pairs that contradict an image."""
-
-
-def _weaknesses(quality: ImageQuality, k: int, usual: _Usual, pairs: tuple[int, int]) -> Iterator[str]:
-    """Yield what is weak about an image, in words; `pairs` counts those that contradict it, and all of it."""
-    wrong, total = pairs
+def _weaknesses(images: Images, quality: ImageQuality, k: int) -> Iterator[str]:
+    """Yield what is weak about how points hold an image, in words; a frame is held by one of its images."""
+    frame = images.frame_of == images.frame_of[k]
+    usual_px = _median(quality.errors_px[np.isfinite(quality.errors_px)].tolist())
     if len(quality.point_errors_px) == 0:
         pass  # said of the whole model
-    elif quality.num_points[k] < _FEWEST_POINTS:
+    elif quality.num_points[frame].max() < _FEWEST_POINTS:
         yield f"it sees {f'only {quality.num_points[k]}' if quality.num_points[k] else 'no'} 3D points"
-    elif quality.coverage[k] < _LEAST_COVERAGE:
+    elif quality.coverage[frame].max() < _LEAST_COVERAGE:
         yield f"its points cover only {quality.coverage[k]:.0%} of the picture"
-    if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual.error_px):
-        error_px = f"{quality.errors_px[k]:.1f} px, where {usual.error_px:.1f} px is usual"
-        yield f"its reprojection error is {error_px}"
-    if total >= _FEWEST_PAIRS and wrong > total * max(_LARGE_SHARE, _SHARE_OF_USUAL * usual.share):
-        yield f"{wrong} of its {total} pairs contradict where it stands"
+    if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
+        yield f"its reprojection error is {quality.errors_px[k]:.1f} px, where {usual_px:.1f} px is usual"
 
 
 def _grade(

@@ -7,7 +7,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.grade import LEAST_HELD
-from sfm_shapefit.judgement.seams import Cut, Seam, find_seams
+from sfm_shapefit.judgement.seams import Cut, Seam, find_seams, tied_by_points
+from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -49,13 +50,39 @@ def gather_evidence(
     _, lenses = question_lenses(points, images, pictures, threads, among, asked)
     if fits is None:
         return ModelEvidence(lenses=lenses)
-    seams = _question_cuts(source, fits.cuts(), threads)
-    held = fits.count_held()
-    if held < LEAST_HELD * images.num_images:
-        step = max(points.num_points // (_MOST_POINTS * images.num_images), 1)
+    held = fits.held(images)
+    cuts, num_held = fits.cuts(held), int(held.sum())
+    if cuts or num_held < LEAST_HELD * images.num_images:
         fitting = keypoint_errors_px(points, images, pictures) <= _FITTING_PX
-        held = max(held, fits.count_held(points.taken(fitting & (points.points_seen() % step == 0))))
-    return ModelEvidence(lenses=lenses, places=fits.other_places(), seams=seams, num_held=held)
+        cuts = tuple(tied_by_points(cut, points, fitting, images.num_images) for cut in cuts)
+        if num_held < LEAST_HELD * images.num_images:
+            step = max(points.num_points // (_MOST_POINTS * images.num_images), 1)
+            some = points.taken(fitting & (points.points_seen() % step == 0))
+            num_held = max(num_held, int(fits.held(images, some).sum()))
+    contradicted = fits.contradicted(images)
+    doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
+    sure = ask_pixels(source, structure, doubted)
+    return ModelEvidence(
+        lenses=lenses,
+        places=fits.other_places(),
+        seams=_question_cuts(source, cuts, threads),
+        contradicted=tuple(one for one in contradicted if not sure[one.camera]),
+        num_held=num_held,
+    )
+
+
+def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) -> BoolArray:
+    """Return which doubted images (i,) stand where their pixels see the points that the others make.
+
+    None is where the model has other keypoints than the matches.
+    """
+    points, images, pictures = structure[:3]
+    view = source.view
+    counts = [pictures.count(k) for k in range(images.num_images)] if doubted.any() else []
+    if not points.num_points or counts != view.num_keypoints.tolist():
+        return np.zeros_like(doubted)
+    links = list(view.links(without=view.pairs[~doubted[view.pairs].any(axis=1)]))
+    return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
 
 
 def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:

@@ -68,7 +68,9 @@ def select_trusted(placement: Judged, min_trust: float) -> BoolArray:
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
 
 
-def seed_points(stand: Stand, kept: BoolArray, options: PlacingOptions, clock: Clock) -> Seeded:
+def seed_points(
+    stand: Stand, kept: BoolArray, options: PlacingOptions, clock: Clock, sure: BoolArray | None = None
+) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
@@ -79,11 +81,15 @@ def seed_points(stand: Stand, kept: BoolArray, options: PlacingOptions, clock: C
         kept: (k,) which of the placement's cameras are in the output.
         options: settings.
         clock: of the run.
+        sure: (i,) images that the pixels confirm, so that half of the points suffice; none if None.
     """
     source, fixed = stand.source, stand.given.fixed_frames
     images, points, adjusted = _make_points(stand, kept, options, clock)
     hand_back_memory()  # the links are gone, and their matches are read again
-    seen = images_of_few_points(points, images, options.structure.min_points_per_image, fixed)
+    least = np.full(len(fixed), options.structure.min_points_per_image)
+    if sure is not None:
+        least[images.frame_of[sure]] = (least[images.frame_of[sure]] + 1) // 2
+    seen = images_of_few_points(points, images, least, fixed)
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:

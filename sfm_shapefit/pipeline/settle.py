@@ -38,6 +38,7 @@ from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.pipeline.adjustment import (
     adjust_placed,
     pull_cameras,
@@ -46,7 +47,7 @@ from sfm_shapefit.pipeline.adjustment import (
 )
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import Structure, gather_evidence
+from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
 from sfm_shapefit.pipeline.given import Given
@@ -130,6 +131,13 @@ def finish_piece(
         kept, stand = _choose(stand, judged, options.trust.min_trust)
     del placed, started  # with their samples of errors
     seeded = seed_points(stand, kept, options, clock)
+    with clock("trust"):
+        sure = _ask_pixels(stand, judged, kept, seeded)
+        if sure.any():
+            judged = replace(judged, assessment=judged.assessment.confirmed(sure[judged.cameras]))
+            kept, stand = _choose(stand, judged, options.trust.min_trust)
+    if (sure & ~seeded.images.is_posed).any():
+        seeded = seed_points(stand, kept, options, clock, sure)
     moves = judged.unit is None and not given.rigid.fixed.any()
     brought = bring_to_known(seeded, given.known, options.structure, moves=moves)
     seeded = brought.seeded
@@ -224,6 +232,20 @@ def _choose(stand: Stand, judged: Judged, min_trust: float) -> tuple[BoolArray, 
         kept |= stand.given.rigid.fixed[judged.cameras]
         gauge = stand.given.rule.choose(judged.cameras[kept], judged.locations[kept], judged.unit)
     return kept, stand._replace(placement=judged, gauge=gauge)
+
+
+def _ask_pixels(stand: Stand, judged: Judged, kept: BoolArray, seeded: Seeded) -> BoolArray:
+    """Return the doubted images (i,) that stand where their pixels see the points of the others."""
+    source = stand.source
+    doubted = np.zeros(source.images.num_images, dtype=np.bool_)
+    doubted[judged.cameras] = (judged.assessment.trust < LOW_TRUST) | ~kept
+    doubted |= seeded.num_seen >= 0
+    doubted &= ~seeded.unsupported  # a wrong lens or so, of which its own points know more
+    if not (doubted.any() and source.has_database):
+        return np.zeros_like(doubted)
+    images = _place_all(stand, seeded.images)
+    pictures = ModelPictures(images, source.view.keypoints)
+    return ask_pixels(source, Structure(seeded.points, images, pictures), doubted)
 
 
 def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> ModelEvidence:

@@ -67,14 +67,15 @@ class Points:
         )
 
     def seen_by(
-        self, others: BoolArray, num_keypoints: IntArray, links: Iterable[KeypointMatches]
+        self, others: BoolArray, num_keypoints: IntArray, links: Iterable[KeypointMatches], least: int = 1
     ) -> "Points":
-        """Return the points with the keypoints of other images (i,) that match one of their observations.
+        """Return the points with the keypoints of other images (i,) that match their observations.
 
         Args:
             others: images that see none of the points yet.
             num_keypoints: (i,) of all images.
             links: matches of all pairs of images.
+            least: observations of a point that a keypoint is to match.
         """
         begins = np.append(0, np.cumsum(num_keypoints))
         point_of = np.full(begins[-1], -1)
@@ -86,8 +87,11 @@ class Points:
                 points = point_of[begins[ends[:, 1 - own]] + batch.keypoints[:, 1 - own]]
                 rows = np.flatnonzero(others[ends[:, own]] & (points >= 0))
                 found.append(np.column_stack([points[rows], ends[rows, own], batch.keypoints[rows, own]]))
-        # A keypoint sees one point, and a point is seen once in an image.
         new = np.concatenate(found)
+        if least > 1:
+            new, counts = np.unique(new, axis=0, return_counts=True)
+            new = new[counts >= least]
+        # A keypoint sees one point, and a point is seen once in an image.
         new = new[np.unique(begins[new[:, 1]] + new[:, 2], return_index=True)[1]]
         new = new[np.unique(new[:, :2], axis=0, return_index=True)[1]]
         points = np.append(self.points_seen(), new[:, 0])

@@ -53,7 +53,7 @@ class StructureOptions(Settings):
     min_points_per_image: int = option(
         0,
         "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
-        "keeps all. Even a wrong pose finds a few points.",
+        "keeps all. A wrong pose finds a few; where 15 keypoints see points of two others, half suffice.",
     )
     ignore_two_view_tracks: bool = option(
         True,

@@ -1,12 +1,16 @@
 """Which pairs agree with where cameras stand: limits that no model can set for itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.scene.images import Frames
 from sfm_shapefit.scene.points import Points
+from tests.judgement.test_left_out import Scene
 from tests.judgement.test_seams import EVERY, GROUP, N
 
 
@@ -32,6 +36,13 @@ def measured(centers, *, off_deg=0.0, sigma_deg=0.01, status=None):
         parallax_deg=np.ones(k),
         covariance=np.tile(np.radians(sigma_deg) ** 2 * np.eye(2), (k, 1, 1)),
     )
+
+
+def each_alone(centers):
+    """Images, each in a frame of its own."""
+    images, turns = Scene().images.part(np.zeros(N, dtype=int)), np.tile(np.eye(3), (N, 1, 1))
+    frames = Frames(ids=np.arange(N), rotations=turns, centers=centers)
+    return replace(images, frame_of=np.arange(N), frames=frames)
 
 
 @pytest.fixture
@@ -64,21 +75,33 @@ def test_a_pair_that_knows_its_direction_badly_agrees_within_three_of_its_deviat
 
 
 def test_the_cameras_that_agreeing_pairs_hold_are_counted(centers):
-    assert fit_pairs(centers, measured(centers)).count_held() == N
+    assert fit_pairs(centers, measured(centers)).held(each_alone(centers)).sum() == N
     moved = centers.copy()
     moved[GROUP] += [0.0, 3.0, 0.0]
-    assert fit_pairs(moved, measured(centers)).count_held() == N - len(GROUP)
-    assert fit_pairs(-centers, measured(centers)).count_held() == 0
+    assert fit_pairs(moved, measured(centers)).held(each_alone(centers)).sum() == N - len(GROUP)
+    assert fit_pairs(-centers, measured(centers)).held(each_alone(centers)).sum() == 0
 
 
 def test_points_of_three_images_hold_a_chain_whose_pairs_tell_no_lengths(centers):
     off_deg = np.where(EVERY[:, 1] - EVERY[:, 0] == 1, 0.0, 30.0)
     fits = fit_pairs(centers, measured(centers, off_deg=off_deg))
-    assert fits.count_held() == 2
+    assert fits.held(each_alone(centers)).sum() == 2
     seen = np.array([[k, k + 1, k + 2] for k in range(4, N - 2) for _ in range(2)])
     of_three = points_seen_by(seen)
-    assert fits.count_held(of_three) == N - 4
-    assert fits.count_held(of_three.taken(np.arange(seen.size) % 3 < 2)) == 2  # points of two tell no length
+    assert fits.held(each_alone(centers), of_three).sum() == N - 4
+    assert (
+        fits.held(each_alone(centers), of_three.taken(np.arange(seen.size) % 3 < 2)).sum() == 2
+    )  # points of two tell no length
+
+
+def test_images_of_one_frame_are_held_together(centers):
+    apart = np.isin(EVERY, [4, 5]).any(axis=1) & ~(EVERY == [2, 4]).all(axis=1)
+    fits = fit_pairs(centers, measured(centers, off_deg=np.where(apart, 30.0, 0.0)))
+    images = each_alone(centers)
+    assert np.flatnonzero(~fits.held(images)).tolist() == [4, 5]
+    frame_of = np.arange(N)
+    frame_of[[4, 5]] = 3
+    assert fits.held(replace(images, frame_of=frame_of)).all()
 
 
 def points_seen_by(images):
@@ -104,10 +127,31 @@ def test_pairs_whose_matches_contradict_the_rotations_count_and_others_without_d
 def test_a_shifted_group_is_cut_and_a_moved_camera_has_its_other_place(centers):
     moved = centers.copy()
     moved[GROUP] += [0.0, 3.0, 0.0]
-    (cut,) = fit_pairs(moved, measured(centers)).cuts()
+    fits = fit_pairs(moved, measured(centers))
+    (cut,) = fits.cuts(fits.held(each_alone(moved)))
     assert cut.cameras.tolist() == GROUP.tolist()
     moved = centers.copy()
     moved[5] += [0.0, 3.0, 0.0]
     (place,) = [place for place in fit_pairs(moved, measured(centers)).other_places() if place.camera == 5]
     assert place.offset == pytest.approx([0.0, -3.0, 0.0], abs=1e-6)
     assert (place.num_here, place.num_there) == (0, N - 1)
+
+
+def test_a_camera_is_asked_if_more_of_its_pairs_contradict_it_than_is_usual(centers):
+
+    def contradicted(wrong, frame_of):
+        own = replace(each_alone(centers), frame_of=np.array(frame_of))
+        fits = fit_pairs(centers, measured(centers, off_deg=np.where(wrong, 30.0, 0.0)))
+        return fits.contradicted(own)
+
+    each = list(range(N))
+    of_first = (EVERY == 0).any(axis=1)
+    assert contradicted(of_first & (EVERY[:, 1] <= (N - 1) // 3), each) == ()
+    assert contradicted(of_first & (EVERY[:, 1] <= 6), each) == ((0, N - 1, 6),)
+    everywhere = EVERY.sum(axis=1) % 4 == 0  # a fourth of all
+    assert contradicted(everywhere | (of_first & (EVERY[:, 1] <= 4)), each) == ()
+    assert [one.camera for one in contradicted(everywhere | (of_first & (EVERY[:, 1] <= 12)), each)] == [0]
+    with_last = [*each[:-1], 0]  # of one frame, whose pairs count together; those inside do not
+    assert contradicted(of_first & (EVERY[:, 1] <= 6), with_last) == ()
+    both = contradicted(of_first & (EVERY[:, 1] <= 12), with_last)
+    assert both == ((0, 2 * (N - 2), 12), (N - 1, 2 * (N - 2), 12))

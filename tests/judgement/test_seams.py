@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.judgement.seams import find_cuts, find_seams
+from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
+from sfm_shapefit.judgement.seams import find_cuts, find_seams, tied_by_points
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.scene.points import Points
 
 N, GROUP = 18, np.array([0, 3, 8, 11, 14, 17])
 EVERY = np.array([(i, j) for i in range(N) for j in range(i + 1, N)])
@@ -22,6 +24,14 @@ def split(num_tied=0):
     apart = across(EVERY)
     apart[np.random.default_rng(2).permutation(np.flatnonzero(apart))[:num_tied]] = False
     return EVERY[~apart], EVERY[apart]
+
+
+def cut_of(agreeing, contradicting):
+    """The cuts where the pairs that agree alone hold the cameras."""
+    held = np.zeros(N, dtype=bool)
+    if len(agreeing):
+        held[agreeing[parallel_rigid_pieces(N, agreeing, 3) == 0]] = True
+    return find_cuts(agreeing, contradicting, held)
 
 
 def rotations_of(pairs, rotations, turn=None, at_random=False):
@@ -51,13 +61,13 @@ def rotations():
 
 
 def test_what_agrees_has_no_cut_and_nor_have_wrong_pairs_at_random():
-    assert find_cuts(EVERY, EVERY[:0], N) == ()
+    assert cut_of(EVERY, EVERY[:0]) == ()
     wrong = np.random.default_rng(0).random(len(EVERY)) < 0.3
-    assert find_cuts(EVERY[~wrong], EVERY[wrong], N) == ()
+    assert cut_of(EVERY[~wrong], EVERY[wrong]) == ()
 
 
 def test_a_group_that_nothing_ties_is_a_seam_whatever_rotations_say(rotations):
-    (cut,) = find_cuts(*split(), N)
+    (cut,) = cut_of(*split())
     assert cut.cameras.tolist() == GROUP.tolist()
     assert (cut.num_agreeing, len(cut.contradicting), cut.is_tied) == (0, 72, False)
     (seam,) = find_seams((cut,), rotations_of(EVERY[:0], rotations), rotations)
@@ -66,7 +76,7 @@ def test_a_group_that_nothing_ties_is_a_seam_whatever_rotations_say(rotations):
 
 
 def test_a_tied_group_is_a_seam_if_contradictions_agree_on_one_turn(rotations):
-    (cut,) = find_cuts(*split(12), N)
+    (cut,) = cut_of(*split(12))
     assert (cut.num_agreeing, len(cut.contradicting), cut.is_tied) == (12, 60, True)
     turn = Rotation.from_rotvec([0.0, 0.0, np.radians(90.0)]).as_matrix()
     (seam,) = find_seams((cut,), rotations_of(EVERY, rotations, turn), rotations)
@@ -81,26 +91,49 @@ def test_a_tied_group_is_a_seam_if_contradictions_agree_on_one_turn(rotations):
 
 def test_a_shifted_group_that_more_than_chance_ties_is_none(rotations):
     for num_tied, found in ((4, 1), (12, 0)):
-        cuts = find_cuts(*split(num_tied), N)
+        cuts = cut_of(*split(num_tied))
         assert [cut.is_tied for cut in cuts] == [True]
         assert len(find_seams(cuts, rotations_of(EVERY, rotations), rotations)) == found
 
 
 def test_a_group_is_cut_off_only_by_twice_as_many_contradictions_as_agree():
-    assert len(find_cuts(*split(22), N)) == 1
-    assert find_cuts(*split(26), N) == ()
+    assert len(cut_of(*split(22))) == 1
+    assert cut_of(*split(26)) == ()
 
 
 def test_few_contradictions_and_single_cameras_are_no_seam():
     agreeing, contradicting = split()
-    assert find_cuts(agreeing, contradicting[:4], N) == ()
+    assert cut_of(agreeing, contradicting[:4]) == ()
     single = (EVERY == 17).any(axis=1)
-    assert find_cuts(EVERY[~single], EVERY[single], N) == ()
+    assert cut_of(EVERY[~single], EVERY[single]) == ()
 
 
 def test_a_camera_moves_to_where_its_pairs_agree():
     # Ties of one pair draw a camera of the group to the rest first; most of its pairs agree with the group.
     agreeing, contradicting = split()
     extra = np.tile([[12, 14]], (3, 1))
-    (cut,) = find_cuts(np.concatenate([agreeing, extra]), contradicting, N)
+    (cut,) = cut_of(np.concatenate([agreeing, extra]), contradicting)
     assert cut.cameras.tolist() == GROUP.tolist()
+
+
+@pytest.mark.parametrize(
+    ("num_fitting", "num_missing", "is_seen"), [(15, 7, True), (14, 0, False), (15, 8, False)]
+)
+def test_a_group_that_points_of_three_images_tie_is_no_seam(rotations, num_fitting, num_missing, is_seen):
+    (cut,) = cut_of(*split())
+    relative = rotations_of(cut.contradicting, rotations)
+    num = num_fitting + num_missing
+    seen = np.tile([GROUP[0], 1, 2], num + 20)
+    seen[3 * num + 2 :: 3] = -1  # points of two images tell no lengths
+    offsets = np.append(0, np.cumsum(np.repeat([3, 2], [num, 20])))
+    fits = np.ones(3 * num + 40, dtype=bool)
+    fits[3 * num_fitting : 3 * num : 3] = False
+    seen = seen[seen >= 0]
+    points = Points(
+        xyz=np.zeros((num + 20, 3)), offsets=offsets, images=seen, keypoints=seen, ids=np.arange(num + 20)
+    )
+    tied = tied_by_points(cut, points, fits, N)
+    assert tied.is_seen == is_seen
+    assert len(find_seams((tied,), relative, rotations)) == (not is_seen)
+    turned = rotations_of(cut.contradicting, rotations, Rotation.from_rotvec([0, 0, 0.2]).as_matrix())
+    assert len(find_seams((tied,), turned, rotations)) == 1

@@ -83,13 +83,13 @@ def test_frames_that_are_fixed_stay_and_so_do_all_where_hardly_any_is_left(found
 def test_images_of_few_points_take_theirs_along_and_three_frames_stay(found):
     images, points = arrays_of(found)
     seen, none = points.count_seen(8), np.zeros(8, dtype=bool)
-    assert (images_of_few_points(points, images, int(seen.min()), none) == -1).all()
+    assert (images_of_few_points(points, images, np.full(8, int(seen.min())), none) == -1).all()
     poorest = int(np.argmin(seen))
     fixed = np.arange(8) == images.frame_of[poorest]
-    gone = images_of_few_points(points, images, int(seen.min()) + 1, none)
+    gone = images_of_few_points(points, images, np.full(8, int(seen.min()) + 1), none)
     assert gone[poorest] == seen.min()
-    assert images_of_few_points(points, images, int(seen.min()) + 1, fixed)[poorest] == -1
-    assert np.sum(images_of_few_points(points, images, 10**6, none) == -1) == 8
+    assert images_of_few_points(points, images, np.full(8, int(seen.min()) + 1), fixed)[poorest] == -1
+    assert np.sum(images_of_few_points(points, images, np.full(8, 10**6), none) == -1) == 8
     without = points.taken(points.paired((gone < 0)[points.images]))
     assert (without.lengths() >= 2).all()
     assert not without.count_seen(8)[gone >= 0].any()

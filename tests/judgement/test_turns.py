@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.judgement.turns import Doubt, PairTurns, find_turned, weigh_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -49,69 +48,6 @@ def test_cameras_turned_each_its_own_way_are_all_found():
     turns[:5] = random_rotations(rng, 5)
     found = find_turned(measured_turns(turns, 2), np.arange(15))
     assert [kind is Doubt.TURNED for kind in found.kinds] == [True] * 5 + [False] * 10
-
-
-@pytest.mark.parametrize("turned", [[4], [2, 3, 5, 7, 9]])
-def test_a_turn_that_no_pair_can_tell_alone_is_found_by_all_of_them_together(turned):
-    """2 degrees contradict no pair that is known to 1.2; the pairs of a camera know them to 0.25."""
-    turns = np.tile(np.eye(3), (40, 1, 1))
-    turns[turned] = turn(np.array([0.6, 0.0, 0.8]), 2.0)
-    pairs = measured_turns(turns, 10, sigma_rad=np.radians(1.2))
-    # One pair of five is false, and they agree on nothing; the others fit as placed, as far as matches tell.
-    rng = np.random.default_rng(10)
-    false = rng.random(len(pairs.pairs)) < 0.2
-    pairs.turns[false] = random_rotations(rng, int(false.sum()))
-    pairs.placed[:] = ~false
-    found = find_turned(pairs, np.arange(40))
-    assert [k for k, kind in enumerate(found.kinds) if kind is Doubt.TURNED] == turned
-    np.testing.assert_allclose(found.angles_deg[turned], 2.0, atol=3 * 0.25)
-
-
-def test_a_turn_between_what_a_pair_can_be_sure_of_and_what_it_shows_is_found():
-    """Pairs could be sure of 2 degrees and are right to 0.4, so that 5 degrees lie between 3.5 of each."""
-    turns = np.tile(np.eye(3), (30, 1, 1))
-    turns[4] = turn(np.array([0.6, 0.0, 0.8]), 5.0)
-    pairs = measured_turns(turns, 12, sigma_rad=np.radians(0.4))
-    pairs.placed[:] = 1.0
-    found = find_turned(pairs._replace(sigmas_rad=5.0 * pairs.sigmas_rad), np.arange(30))
-    assert [k for k, kind in enumerate(found.kinds) if kind is Doubt.TURNED] == [4]
-    assert found.angles_deg[4] == pytest.approx(5.0, abs=0.3)
-
-
-def test_a_correction_of_less_than_five_standard_deviations_blames_nobody():
-    """Ten pairs, each of which knows 1.7 degrees, speak for 1.04, which is 4.87 standard deviations."""
-    turns = np.tile(np.eye(3), (20, 1, 1))
-    turns[0] = turn(np.array([0.6, 0.0, 0.8]), 1.8)
-    others = [(i, j) for i, j in all_pairs(20) if i > 0]
-    pairs = measured_turns(turns, 2, others + [(0, j) for j in range(1, 11)], sigma_rad=np.radians(1.7))
-    pairs.placed[:] = 1.0
-    assert set(find_turned(pairs, np.arange(20)).kinds) == {Doubt.RIGHT}
-
-
-def test_a_turn_is_found_among_pairs_that_agree_exactly():
-    """Five pairs that each know 2 degrees tell of 2; to be as exact as the others is not asked of them."""
-    turns = np.tile(np.eye(3), (12, 1, 1))
-    turns[0] = turn(np.array([0.6, 0.0, 0.8]), 2.0)
-    others = [(i, j) for i, j in all_pairs(12) if i > 0]
-    pairs = measured_turns(turns, 13, others + [(0, j) for j in range(1, 6)], sigma_rad=0.0)
-    found = find_turned(pairs._replace(sigmas_rad=np.full(len(pairs.pairs), np.radians(2.0))), np.arange(12))
-    assert [k for k, kind in enumerate(found.kinds) if kind is Doubt.TURNED] == [0]
-
-
-def test_corrections_are_those_of_the_exact_least_squares_where_all_pairs_fit():
-    rng = np.random.default_rng(11)
-    pairs = np.array(all_pairs(6))
-    sigma = np.radians(0.5)
-    own = np.radians(0.01) * rng.standard_normal((6, 3))
-    turns = own[pairs[:, 0]] - own[pairs[:, 1]]
-    found = solve_corrections(pairs, turns, np.full(len(pairs), sigma), 6)
-    # Such small corrections leave all weights at 1: (L / sigma^2 + 1 / tau^2) x = L own / sigma^2.
-    laplacian = 6.0 * np.eye(6) - np.ones((6, 6))
-    information = laplacian / sigma**2 + np.eye(6) / np.radians(0.2) ** 2
-    np.testing.assert_allclose(
-        found.vectors, np.linalg.solve(information, laplacian @ own / sigma**2), rtol=1e-3
-    )
-    np.testing.assert_allclose(found.sigmas_rad**2, np.diag(np.linalg.inv(information)), rtol=1e-3)
 
 
 def test_false_pairs_that_agree_on_nothing_blame_nobody():
