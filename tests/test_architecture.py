@@ -35,16 +35,16 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4480,
+    "adjustment": 4650,
     "base": 1990,
     "cli": 1730,
-    "facts": 3370,
+    "facts": 3390,
     "files": 4600,
     "graph": 1290,
-    "judgement": 3270,
+    "judgement": 3280,
     "laplacian": 2060,
     "pairs": 1580,
-    "pipeline": 6080,
+    "pipeline": 6100,
     "placement": 2650,
     "refinement": 2100,
     "report": 1680,

@@ -83,6 +83,7 @@ _FINE_TIMES = 3
 _FINE = 0.9
 # Solves repeated with lenses held that were left open; each takes as long as the first.
 _MOST_REPETITIONS = 2
+_FEW = 0.1  # share of the images; the points of the others do not depend on so few
 MOST_FRAMES = 2_000  # frames; the standard deviations of more would take longer than all the rest
 
 
@@ -231,8 +232,12 @@ class AdjustmentRun:
         old = self.images.lenses
         lenses = [lens.as_given() if held[k] else lens for k, lens in enumerate(old)]
         run = self.moved(self.images.with_lenses(lenses))
-        freedom = run.freedom.holding(held, old)
-        return replace(run, freedom=freedom, undetermined=run.undetermined | held)
+        return replace(
+            run,
+            freedom=run.freedom.holding(held, old),
+            undetermined=run.undetermined | held,
+            focal_sigmas=np.where(held, np.nan, run.focal_sigmas),
+        )
 
     def estimate(
         self,
@@ -240,10 +245,17 @@ class AdjustmentRun:
         *,
         errors: RotationErrors | None = None,
         initial_error_px: float = math.nan,
-        with_sensors: bool = True,
+        judged: bool = True,
     ) -> Estimate:
-        """Return where the images stand, and how well that is known at the optimum last solved for."""
-        known, free = self._center_errors(last), self.freedom.sensors(self.images) & with_sensors
+        """Return where the images stand, and how well that is known at the optimum last solved for.
+
+        Args:
+            last: the problem there.
+            errors, initial_error_px: see `Estimate`.
+            judged: whether it is asked how well centers and sensors are known, which takes as long as steps.
+        """
+        known = self._center_errors(last) if judged else None
+        free = self.freedom.sensors(self.images) & judged
         covariances = None
         if known is not None:
             image_of = views_of(self.images).images[last.cameras_seeing]
@@ -254,6 +266,7 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
+            lens_errors=None if known is None else known.lens_errors(),
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=self.focal_sigmas,
             undetermined=self.undetermined,
@@ -320,13 +333,23 @@ def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem) -> Solved:
     return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING)
 
 
-def solve_twice_thinly(run: AdjustmentRun) -> Solved:
+def solve_poses_coarsely(run: AdjustmentRun) -> Solved:
+    """Return what `solve_coarsely` does with all lenses held; they may move again afterwards."""
+    moved, last = solve_coarsely(replace(run, freedom=run.freedom.without_lenses()))
+    return replace(moved, freedom=run.freedom), last
+
+
+def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Solved:
     """Return the run after coarse frames were moved at the wide limit, then finely at the threshold.
 
     Finely: by more points, with the loss that their errors call for. All tracks are given back before either
     is solved.
+
+    Args:
+        run: at poses that may be coarse.
+        lenses_known: whether the first solve holds them; it then takes a tenth of the time if there are many.
     """
-    run, last = solve_coarsely(run)
+    run, last = solve_poses_coarsely(run) if lenses_known else solve_coarsely(run)
     problem = fine_problem(run)
     if problem is None:
         return run, last
@@ -334,17 +357,27 @@ def solve_twice_thinly(run: AdjustmentRun) -> Solved:
     return solve_finely(run, problem)
 
 
-def repeat_with_known_lenses(run: AdjustmentRun, solve: Callable[[AdjustmentRun], Solved]) -> Solved:
+def repeat_with_known_lenses(
+    run: AdjustmentRun, solve: Callable[..., Solved], *, is_followed: bool = False
+) -> Solved:
     """Solve, and where focal lengths are left open, hold what was given of them and solve again.
 
     What is still open after a few times keeps what it has, with its standard deviation.
+
+    Args:
+        run: before the solve.
+        solve: takes a run, and whether `lenses_known` so well by now that a coarse solve may hold them.
+        is_followed: whether a solve by all points follows, before which few images need not be solved again.
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
         run, is_open = run.judge_lenses(last)
         if not is_open.any():
             return run, last
-        run, last = solve(run.holding(is_open))
+        run = run.holding(is_open)
+        if is_followed and np.mean(is_open[run.images.lens_of]) <= _FEW:
+            return solve_poses_coarsely(run)
+        run, last = solve(run, lenses_known=True)
     return run.judge_lenses(last)[0], last
 
 
@@ -363,7 +396,7 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
 
 def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
     """Return the run after two solves by all points, those that a model may have, and the last problem."""
-    run, last = repeat_with_known_lenses(run, lambda run: run.solve(run.problem_of_all()[2], FIRST_FALL))
+    run, last = repeat_with_known_lenses(run, lambda run, **_: run.solve(run.problem_of_all()[2], FIRST_FALL))
     joined, found, problem = run.problem_of_all()
     run, last = run.solve(problem, LAST_FALL)
     found = replace(found, points=last.points).of_length(run.checked_length)
