@@ -15,7 +15,7 @@ from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
-_FITTING_PX = 4.0  # pixels, reprojection error of an observation that holds its camera, as COLMAP has it
+_FITTING_PX = 4.0  # pixels, largest reprojection error of a point that ties; COLMAP keeps as large ones
 _MOST_POINTS = 40  # points per image that are asked what they hold; a few of each suffice
 
 
@@ -23,9 +23,9 @@ class Structure(NamedTuple):
     """The points of a model, and what they are seen with."""
 
     points: Points
-    """Of the images."""
+    """Points that the images see."""
     images: Images
-    """Where the model has them; NaN where it does not."""
+    """Images where the model has them; NaN where it does not."""
     pictures: Pictures
     """Keypoints and lenses of the images."""
     among: BoolArray | None = None
