@@ -89,7 +89,8 @@ def adjust_thinly(
     if run.frees_more_than_poses:
         by_all = lenses != "wanted" and len(images.frames.ids) <= MOST_FRAMES
         solve = partial(steps.solve_twice_thinly, lenses_known=lenses == "known")
-        run, last = steps.repeat_with_known_lenses(run, solve, is_followed=by_all or lenses == "wanted")
+        again = steps.solve_thinly_again
+        run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=lenses == "wanted")
         if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run)
         return run.estimate(last, judged=lenses != "wanted")
@@ -122,7 +123,8 @@ def adjust_placement(
     """
     run, errors = steps.begin(images, links, options, replace(freedom, pull_rad=np.inf), given), None
     if run.frees_more_than_poses:  # points are found, and rotations judged, with what comes out
-        run, _ = steps.repeat_with_known_lenses(run, steps.solve_twice_thinly, is_followed=True)
+        solve, again = steps.solve_twice_thinly, steps.solve_thinly_again
+        run, _ = steps.repeat_with_known_lenses(run, solve, again)
         run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
     _, _, problem = run.problem_of_all(checked=True)
     decided = replace(run.freedom, pull_rad=freedom.pull_rad)

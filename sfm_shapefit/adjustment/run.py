@@ -83,7 +83,7 @@ _FINE_TIMES = 3
 _FINE = 0.9
 # Solves repeated with lenses held that were left open; each takes as long as the first.
 _MOST_REPETITIONS = 2
-_FEW = 0.1  # share of the images; the points of the others do not depend on so few
+_FEW = 0.1  # share of the images; the lenses of the others do not depend on so few
 MOST_FRAMES = 2_000  # frames; the standard deviations of more would take longer than all the rest
 
 
@@ -333,12 +333,6 @@ def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem) -> Solved:
     return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING)
 
 
-def solve_poses_coarsely(run: AdjustmentRun) -> Solved:
-    """Return what `solve_coarsely` does with all lenses held; they may move again afterwards."""
-    moved, last = solve_coarsely(replace(run, freedom=run.freedom.without_lenses()))
-    return replace(moved, freedom=run.freedom), last
-
-
 def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Solved:
     """Return the run after coarse frames were moved at the wide limit, then finely at the threshold.
 
@@ -349,7 +343,9 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
         run: at poses that may be coarse.
         lenses_known: whether the first solve holds them; it then takes a tenth of the time if there are many.
     """
-    run, last = solve_poses_coarsely(run) if lenses_known else solve_coarsely(run)
+    free = run.freedom
+    run, last = solve_coarsely(replace(run, freedom=free.without_lenses()) if lenses_known else run)
+    run = replace(run, freedom=free)
     problem = fine_problem(run)
     if problem is None:
         return run, last
@@ -357,8 +353,24 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
     return solve_finely(run, problem)
 
 
+def solve_thinly_again(run: AdjustmentRun) -> Solved:
+    """Return the run after a fine solve, where poses are fine but for a few, else after two as at first."""
+    fine, loose = (run.triangulate(limit, checked=True)[1] for limit in (1.0, _THIN_LIMIT))
+    problem = None if _are_coarse(fine, loose) else fine_problem(run)
+    return solve_twice_thinly(run) if problem is None else solve_finely(run, problem)
+
+
+def _are_coarse(fine: TriangulatedPoints, loose: TriangulatedPoints) -> bool:
+    """Return whether poses are coarse, by the points found at the threshold and at the wide limit."""
+    return bool(np.sum(fine.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0))
+
+
 def repeat_with_known_lenses(
-    run: AdjustmentRun, solve: Callable[..., Solved], *, is_followed: bool = False
+    run: AdjustmentRun,
+    solve: Callable[[AdjustmentRun], Solved],
+    again: Callable[[AdjustmentRun], Solved],
+    *,
+    for_lenses: bool = False,
 ) -> Solved:
     """Solve, and where focal lengths are left open, hold what was given of them and solve again.
 
@@ -366,8 +378,8 @@ def repeat_with_known_lenses(
 
     Args:
         run: before the solve.
-        solve: takes a run, and whether `lenses_known` so well by now that a coarse solve may hold them.
-        is_followed: whether a solve by all points follows, before which few images need not be solved again.
+        solve, again: the first solve, and those after it.
+        for_lenses: whether lenses alone are wanted: those of few images are then held, and nothing follows.
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
@@ -375,9 +387,9 @@ def repeat_with_known_lenses(
         if not is_open.any():
             return run, last
         run = run.holding(is_open)
-        if is_followed and np.mean(is_open[run.images.lens_of]) <= _FEW:
-            return solve_poses_coarsely(run)
-        run, last = solve(run, lenses_known=True)
+        if for_lenses and np.mean(is_open[run.images.lens_of]) <= _FEW:
+            return run, last
+        run, last = again(run)
     return run.judge_lenses(last)[0], last
 
 
@@ -394,9 +406,14 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
     )
 
 
+def _solve_all(run: AdjustmentRun) -> Solved:
+    """Return the run after a first solve by all points."""
+    return run.solve(run.problem_of_all()[2], FIRST_FALL)
+
+
 def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
     """Return the run after two solves by all points, those that a model may have, and the last problem."""
-    run, last = repeat_with_known_lenses(run, lambda run, **_: run.solve(run.problem_of_all()[2], FIRST_FALL))
+    run, last = repeat_with_known_lenses(run, _solve_all, _solve_all)
     joined, found, problem = run.problem_of_all()
     run, last = run.solve(problem, LAST_FALL)
     found = replace(found, points=last.points).of_length(run.checked_length)
@@ -409,7 +426,7 @@ def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, Adjustme
     loosely, loose = run.triangulate(_THIN_LIMIT, checked=True)
     refuse_without_points(len(loose.points))
     initial_error_px = mean_error_px(run.problem(joined, found))
-    if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
+    if _are_coarse(found, loose):
         run, _ = run.solve(run.thin_problem(loosely, loose), _THIN_FALL, _THIN_SCALE)
     del joined, found, loosely, loose
     return *solve_by_all_points(run), initial_error_px
