@@ -29,6 +29,7 @@ GROUPS = {
         "docs/tutorial.md",
         "docs/commands.md",
         "docs/options.md",
+        "docs/rough_poses.md",
         "docs/troubleshooting.md",
     ),
     "Understand": ("docs/report.md", "docs/glossary.md", "docs/method.md", "docs/formats.md", "docs/json.md"),

@@ -27,6 +27,7 @@ COMMANDS = """
     check {out}/located --report {out}/check.html
     convert {out}/located {out}/scene.glb -q
     convert {out}/located {out}/transforms.json -q
+    locate {out}/transforms.json {out}/exact --database data_synthetic/courtyard/database.db --rotations 2 -q
     synth {out}/drive --shape drive --num-images 6 --num-points 300
     inspect data_synthetic/ring8/sparse/0
     place data_synthetic/graph40.txt {out}/lud --objective lud -q

@@ -19,6 +19,7 @@ INDEX = {
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
     "real": "Real scenes against their ground truth, before and after bundle adjustment.",
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
+    "rough": "Rough poses of other programs made exact, beside map from scratch; wrong ones named.",
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
     "start": "The first run of each command in a fresh environment, as a clone and from the wheel.",

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import bsr_array, coo_array, csc_array, eye_array, kron
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.synthetic.graphs import GraphProblem
 
 SEED = 1
@@ -59,3 +60,12 @@ def to_unit_norm(locations: FloatArray) -> FloatArray:
     centered = locations - locations.mean(axis=0)
     unit: FloatArray = centered / np.linalg.norm(centered)
     return unit
+
+
+def laplacian_matrix(num_nodes: int, edges: IntArray, weights: FloatArray) -> csc_array:
+    """Return the Laplacian of edge weights (m,), (n, n), or of symmetric blocks (m, b, b), (nb, nb)."""
+    blocks = weights.reshape(len(edges), 1, 1) if weights.ndim == 1 else weights
+    m, b = blocks.shape[:2]
+    signs = (np.repeat([1.0, -1.0], m), (np.tile(np.arange(m), 2), edges.T.ravel()))
+    differences = kron(coo_array(signs, shape=(m, num_nodes)), eye_array(b), format="csr")
+    return csc_array(differences.T @ bsr_array((blocks, np.arange(m), np.arange(m + 1))) @ differences)

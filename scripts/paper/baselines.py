@@ -15,13 +15,14 @@ Sources
 """
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import splu
 
+from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.operators import adjacency, laplacian_matrix
+from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.solver.program import differences, projected_length
 from sfm_shapefit.solver.splitting.lud import solve_lud
@@ -67,7 +68,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
 def _smallest_eigenvector(graph: ViewGraph, blocks: FloatArray) -> FloatArray:
     """Return the eigenvector (n, d) of the smallest eigenvalue of the block Laplacian, shifts aside."""
     n, d = graph.num_nodes, graph.dimension
-    matrix = csc_array(laplacian_matrix(n, graph.edges, blocks))
+    matrix = laplacian_matrix(n, graph.edges, blocks)
     shifts = np.tile(np.eye(d), (n, 1)) / np.sqrt(n)
     size = float(matrix.diagonal().mean())
     if n * d <= _DENSE_UNKNOWNS:

@@ -29,7 +29,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.base.forests import connected_components
 
 _ANY_DIMENSION = 3 * 256 * 64 * 32
 _THREE_DIMENSIONS = 32 * 3 * 64 * 1024

@@ -19,7 +19,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.linalg import qr
 
 from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
 from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
@@ -30,6 +29,7 @@ from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.scipy_parts import dgeqp3
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import FOCAL_LENGTHS
@@ -202,8 +202,8 @@ def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None
     if count == 0:
         return
     seen_there = motions[nodes].reshape(-1, count)
-    _, _, order = qr((seen_there / np.abs(motions).max(axis=(0, 1))).T, mode="economic", pivoting=True)
-    rows, slots = np.divmod(order[:count], SLOTS)
+    _, order, *_ = dgeqp3((seen_there / np.abs(motions).max(axis=(0, 1))).T)  # it counts from 1
+    rows, slots = np.divmod(order[:count] - 1, SLOTS)
     system.diagonal[nodes[rows], slots, slots] *= 2.0
 
 

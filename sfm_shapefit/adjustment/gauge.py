@@ -9,10 +9,10 @@ scaling; priors forbid what they inform about, however weakly. What is left is f
 so that the centers' best similarity to the start has no such part: the gauge stays the start's.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import expm
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import cross_matrices
@@ -25,6 +25,7 @@ from sfm_shapefit.laplacian.dense import one_blas_thread
 _DIMENSION = 7  # motions of a similarity; three shifts, three turns, one scaling
 _NONE = 1e-10  # share of the largest singular value; what holds less holds nothing
 _MAX_ROUNDS = 100  # Gauss-Newton steps; each solves for seven unknowns
+_SERIES_TERMS = 14  # terms of exp(A) for |A| <= 1/4; the first left out is 1e-19
 _ROUNDING = 1e-12  # relative rise of a sum of squares; so little is its rounding
 
 
@@ -128,7 +129,18 @@ def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
     generator = np.zeros((4, 4))
     generator[:3, :3] = cross_matrices(step[None, 3:6])[0] + step[6] * np.eye(3)
     generator[:3, 3] = step[:3] - generator[:3, :3] @ origin
-    return np.asarray(expm(generator))
+    return _exponential(generator)
+
+
+def _exponential(generator: FloatArray) -> FloatArray:
+    """Return exp(A) of a small square matrix, by its series for A / 2^k and k squarings."""
+    squarings = max(0, math.ceil(math.log2(max(float(np.abs(generator).sum()), 0.25))) + 2)
+    scaled = generator / 2.0**squarings
+    power = total = np.eye(len(generator))
+    for k in range(1, _SERIES_TERMS):
+        power = power @ scaled / k
+        total = total + power
+    return np.asarray(np.linalg.matrix_power(total, 2**squarings))
 
 
 def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, turned: bool) -> Values:

@@ -32,11 +32,11 @@ import numpy as np
 
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.priors import rotation_vectors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
+from sfm_shapefit.base.rotation_vectors import rotation_vectors
 
 _FEWEST_POINTS = 10  # points of a frame in each half; fewer do not determine its turn
 _FEWEST_FRAMES = 3  # frames with enough points; the medians of fewer say nothing

@@ -1,12 +1,10 @@
-"""Priors on rotations, centers and lenses: their cost, gradient and curvature, and small rotations.
+"""Priors on rotations, centers and lenses: their cost, gradient and curvature.
 
 With d = log(R R_prior^T) and R <- exp(w) R, the derivative of d by w is the inverse left Jacobian of SO(3),
 
     J^-1 = I - [d]/2 + (1/t^2 - (1 + cos t) / (2 t sin t)) [d]^2,      t = |d|
 
 (Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", eq. 146).
-
-What scipy has of rotations takes long to import, so only what turns any does that.
 """
 
 import numpy as np
@@ -15,23 +13,9 @@ from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.rotation_vectors import rotation_vectors
 
 _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
-
-
-def turn(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return exp(w) R for rotations (n, 3, 3) and rotation vectors (n, 3) in their camera axes."""
-    from scipy.spatial.transform import Rotation
-
-    turned: FloatArray = Rotation.from_rotvec(vectors).as_matrix() @ rotations
-    return turned
-
-
-def rotation_vectors(rotations: FloatArray) -> FloatArray:
-    """Return the vectors (n, 3) in radians whose exponentials are the rotations (n, 3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
 
 
 def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> float:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.options import AdjustmentOptions
@@ -16,6 +15,7 @@ from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.scipy_parts import dpotrf, dpotri, dpotrs
 from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,

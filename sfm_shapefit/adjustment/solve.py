@@ -16,7 +16,6 @@ from sfm_shapefit.adjustment.priors import (
     add_lens_prior,
     add_rotation_prior,
     sum_priors,
-    turn,
 )
 from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
@@ -31,6 +30,7 @@ from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.rotation_vectors import rotations_of
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
 
@@ -368,7 +368,7 @@ def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatAr
     centers[frames] += own[:, :3]
     if layout.turns:
         rotations = rotations.copy()
-        rotations[frames] = turn(rotations[frames], own[:, 3:])
+        rotations[frames] = rotations_of(own[:, 3:]) @ rotations[frames]
     lens, value = np.nonzero(layout.lens_slots >= 0)
     lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
     if (lenses[:, :2] <= 0.0).any():
@@ -400,7 +400,9 @@ def _move_sensors(layout: Layout, values: Values, steps: FloatArray) -> tuple[Fl
     )
     rotations, translations = rotations.copy(), translations.copy()
     # R exp(w) = (exp(-w) R^T)^T
-    rotations[cameras] = turn(rotations[cameras].transpose(0, 2, 1), -own[:, 3:]).transpose(0, 2, 1)
+    rotations[cameras] = (rotations_of(-own[:, 3:]) @ rotations[cameras].transpose(0, 2, 1)).transpose(
+        0, 2, 1
+    )
     translations[cameras] = -np.einsum("cab,cb->ca", rotations[cameras], after)
     return rotations, translations
 

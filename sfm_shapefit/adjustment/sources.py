@@ -9,6 +9,7 @@ import numpy as np
 from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
@@ -97,6 +98,18 @@ def collect_tracks(images: Images, pictures: Pictures, points: Points) -> Observ
         ids=points.ids,
         may_split=False,
     )
+
+
+def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
+    """Return what some of the images (i,) see, and everything that is matched with it, however far."""
+    own = chosen[views_of(images).images[links.cameras]]
+    if isinstance(links, ObservedTracks):
+        track_of = np.repeat(np.arange(len(links.offsets) - 1), links.lengths())
+        return links.subset(np.unique(track_of[own]))
+    joined = connected_components(len(own), links.matches.astype(np.int64))
+    touched = np.zeros(len(own), dtype=np.bool_)
+    touched[joined[own]] = True
+    return links.among(touched[joined])
 
 
 def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:

@@ -29,6 +29,7 @@ from numba.core.event import install_listener
 from numba.extending import get_cython_function_address, intrinsic, register_jitable
 
 from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
+from sfm_shapefit.base.scipy_parts import compiled_module
 
 choose_target()
 
@@ -85,6 +86,7 @@ def function_address(module: str, name: str) -> int:
         module: such as "scipy.linalg.cython_blas".
         name: such as "dsyrk".
     """
+    compiled_module(*module.rsplit(".", 1))  # alone; numba would load its package too
     return int(get_cython_function_address(module, name))
 
 

@@ -31,6 +31,9 @@ from typing import (
 _SIMPLE = {int: "integer", float: "number", str: "string", bool: "boolean", type(None): "null"}
 
 
+_ABSENT = object()  # value of an attribute that a source does not have
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Record:
     """A frozen dataclass by inheritance, with keyword arguments. Numbers that are not finite become None."""
@@ -49,8 +52,9 @@ class Record:
     @classmethod
     def taken_from(cls, source: object, **others: Any) -> Self:
         """Return the record of other values, and a source's attributes that bear the names of its fields."""
-        named = (item.name for item in fields(cls) if item.name not in others and hasattr(source, item.name))
-        return cls(**others, **{name: getattr(source, name) for name in named})
+        names = (item.name for item in fields(cls) if item.name not in others)
+        taken = ((name, getattr(source, name, _ABSENT)) for name in names)  # once; it may be computed
+        return cls(**others, **{name: value for name, value in taken if value is not _ABSENT})
 
     @classmethod
     def of(cls, source: object) -> Self | None:

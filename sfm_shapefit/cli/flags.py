@@ -14,13 +14,14 @@ from typer.core import TyperCommand
 
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
 from sfm_shapefit.cli.console import flag_names
+from sfm_shapefit.cli.root import convert_plainly
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
     Path | None,
-    typer.Argument(metavar="MODEL", help="COLMAP model folder, binary or text."),
+    typer.Argument(metavar="MODEL", help="COLMAP model folder, or for `locate` a list of poses."),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
@@ -178,6 +179,7 @@ class GroupedCommand(TyperCommand):
             self._refuse_unknown(ctx, args, known)
         if "--database" in known:
             ctx.allow_extra_args = True  # so that they can be looked at
+        convert_plainly(self.get_params(ctx))
         extra = super().parse_args(ctx, _gather_values(args))
         if extra and "--database" in known and not ctx.resilient_parsing:
             _refuse_extra(ctx, extra)

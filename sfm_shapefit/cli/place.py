@@ -55,11 +55,6 @@ def place_command(
     reverse: Annotated[
         bool, typer.Option("--reverse", help="Directions point from i to j, as in 1DSfM's prob.txt.")
     ] = False,
-    g2o: Annotated[bool, typer.Option("--g2o", help="Also write the placed nodes to positions.g2o.")] = False,
-    onedsfm: Annotated[
-        bool,
-        typer.Option("--1dsfm", help="Also write 1dsfm/: the pairs that agree, rotations and locations."),
-    ] = False,
     **given: Any,
 ) -> None:
     """Place the nodes of a bare view GRAPH of directions, or of relative poses; write tables to OUT."""
@@ -68,7 +63,6 @@ def place_command(
     if any((source / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
         raise typer.BadParameter(f"{source} is a COLMAP model, which sfm-shapefit locate takes")
     with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
-        from sfm_shapefit.facts.exports import export_files
         from sfm_shapefit.pipeline.place import place_graph_file
         from sfm_shapefit.pipeline.write import write_result
 
@@ -80,6 +74,5 @@ def place_command(
             reverse=reverse,
             progress=run.progress,
         )
-        files = export_files(found, g2o=g2o, onedsfm=onedsfm)
-        write_result(found, target, further_files=files, **run.writing)
+        write_result(found, target, **run.writing)
         run.show(found, source, target)

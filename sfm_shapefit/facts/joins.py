@@ -6,6 +6,7 @@ from typing import Annotated
 from sfm_shapefit.base.geometry import Alignment
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.facts.placed import Solve
 from sfm_shapefit.placement.join import PieceJoin
 
 
@@ -26,6 +27,10 @@ class JoinFacts(Record):
     similarity: Annotated[
         Alignment | None,
         "From its world to that of the model that it is joined to; of a refused join what most pairs want.",
+    ]
+    solve: Annotated[
+        Solve | None,
+        "Last solve of the convex program over the pieces, from which the refinement started; null without.",
     ]
     agreeing_pairs: Annotated[int, "Pairs of images between it and the models joined with it that agree."]
     contradicting_pairs: Annotated[int, "Those that do not."]
@@ -81,6 +86,7 @@ class Joined:
             turn_sigma_deg=None if found is None else found.turn_sigma_deg,
             center_sigma=None if found is None else found.center_sigma,
             similarity=None if found is None else found.to_from_piece.facts,
+            solve=None if found is None or found.solved is None else Solve(**found.solved.summary()),
             agreeing_pairs=0 if found is None else len(found.agreeing),
             contradicting_pairs=0 if found is None else len(found.contradicting),
             rival_pairs=list(self.rivals),

@@ -176,7 +176,9 @@ class GroupFacts(Record):
     num_groups: Annotated[int, "Groups of the input."]
     num_placed: Annotated[int, "Groups with a camera in the output."]
     num_fixed: Annotated[int, "Cameras that stay where the input has them."]
-    num_inner_pairs: Annotated[int, "Pairs inside one group, which say nothing."]
+    num_inner_pairs: Annotated[
+        int, "Pairs inside one frame, which say nothing; those of fixed cameras are not measured."
+    ]
 
     @classmethod
     def of_placement(cls, placement: Placement, kept: BoolArray, fixed: BoolArray | None) -> Self | None:
@@ -202,7 +204,8 @@ class GroupFacts(Record):
     def statement(self) -> str:
         """The same in words."""
         fixed = f", {counted(self.num_fixed, 'camera')} fixed" if self.num_fixed else ""
-        inner = f"; {self.num_inner_pairs} pairs inside them give no constraint"
+        count = self.num_inner_pairs
+        inner = f"; {count} pairs inside them give no constraint" if count else ""
         return f"{self.num_placed} of {self.num_groups} placed{fixed}{inner}"
 
 

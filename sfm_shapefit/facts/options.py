@@ -79,7 +79,8 @@ class LocateOptions(Composed):
         "auto",
         'What to make of the given rotations: "held", as measured by instruments, and not doubted; "free", '
         "forgotten by the adjustment; a number, pulled to by that standard deviation about each axis in "
-        'degrees; "auto" asks the matches how far off they are, and which cameras are turned.',
+        "degrees or, from 0.3 on, taken for rough and first corrected by the relative rotations of pairs; "
+        '"auto" asks the matches how far off they are, and which cameras are turned.',
     )
     source: SourceOptions = group(SourceOptions)
     directions: DirectionOptions = group(DirectionOptions)

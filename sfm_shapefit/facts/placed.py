@@ -227,7 +227,7 @@ class Delivered(Record):
 
 
 class Solve(Record):
-    """The certified ShapeFit solve of the largest piece."""
+    """A certified ShapeFit solve: of the largest piece, or over pieces that are joined."""
 
     status: Annotated[str, "converged, inaccurate, max_iterations or cancelled."]
     objective: Annotated[float | None, "R(T) / L(T) of the paper at the ShapeFit optimum, dimensionless."]

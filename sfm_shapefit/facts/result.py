@@ -45,7 +45,6 @@ from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, wit
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
-from sfm_shapefit.files.onedsfm import EpipolarGeometries
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
@@ -137,6 +136,8 @@ class LocateResult(Written):
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
     where it was kept; None if there was none."""
+    moved: FloatArray | None = None
+    """(n,) by how much each center of the input was moved, see `CameraRow`; None but for rough rotations."""
     further: "tuple[LocateResult, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
@@ -304,6 +305,10 @@ class LocateResult(Written):
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
+        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved)):
+            if values is not None:
+                both = zip(rows, values.tolist(), strict=True)
+                rows = [replace(row, **{name: value}) for row, value in both]
         unposed = sorted(set(self.image_names) - set(self.images.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
@@ -435,10 +440,6 @@ class GraphResult(Written):
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
-    geometries: EpipolarGeometries | None = None
-    """The relative poses that the directions came from, if it has any."""
-    rotations: FloatArray | None = None
-    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
     @cached_property
     def facts(self) -> GraphFacts:

@@ -49,6 +49,11 @@ class CameraRow:
     correlation: tuple[float, ...] = ()
     """Correlations of the errors along two axes each, d (d - 1) / 2 numbers in [-1, 1], which with `sigma`
     make the covariance of the center. Columns rho_xy, rho_xz, rho_yz, empty where `sigma` is."""
+    turned_deg: float = math.nan
+    """Angle by which its given rotation was turned; empty where none was adjusted."""
+    moved: float = math.nan
+    """Distance of its center from the given one, in the output's units, after the similarity that brings most
+    given centers near; only with rough rotations."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

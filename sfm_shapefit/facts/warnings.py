@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
@@ -21,6 +21,23 @@ _TWOFOLD_SHARE = 0.05
 real scenes and 0.04 in drawn courtyards, which are placed well, and 0.31 before drawn facades of one house
 again and again, where half of the cameras were shifted by a house without a contradiction."""
 _FEWEST_TWOFOLD = 3  # pairs on two directions; fewer prove nothing
+
+_GROSS = 4.0  # standard deviations about each axis; of 1,000 rotations, one is off by more by chance
+_MEDIAN_TURN = 1.538  # standard deviations; median angle of turns that are normal about each axis
+
+
+def wrong_rotations(turned_deg: FloatArray) -> IntArray:
+    """Return the images (k,) that turned (n,) by more than the scatter of most explains, the worst first."""
+    rows = np.flatnonzero(turned_deg > _GROSS / _MEDIAN_TURN * np.median(turned_deg))
+    return rows[np.argsort(-turned_deg[rows], kind="stable")]
+
+
+def rotation_warnings(turned_deg: FloatArray, names: Sequence[str]) -> Iterator[str]:
+    """Yield which given rotations of `names` (n,) are wrong."""
+    wrong = [f"{names[k]} (turned by {turned_deg[k]:.3g} deg)" for k in wrong_rotations(turned_deg).tolist()]
+    if wrong:
+        most = f"the others are off by {np.median(turned_deg):.2g} deg; see turned_deg in cameras.csv"
+        yield f"{counted(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 
 def quality_warnings(placement: Judged) -> Iterator[str]:

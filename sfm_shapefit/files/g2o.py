@@ -1,19 +1,15 @@
-"""g2o files, those of pose-graph tools (g2o, GTSAM): relative poses are read, placed nodes are written.
+"""g2o files, those of pose-graph tools (g2o, GTSAM): relative poses, and rotations of cameras.
 
     VERTEX_SE3:QUAT    id x y z qx qy qz qw        center and rotation world_from_cam
     EDGE_SE3:QUAT      i j x y z qx qy qz qw [21]  cam_i_from_cam_j, whose x y z is camera j seen from i
-    VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
-    VERTEX_XY          id x y                      the same in the plane
 
 The rotation of an edge and the direction of its x y z are read; its length and the 21 numbers of its
-information matrix are not used. Ids are whole numbers: the nodes' own where all of these are, else 0, 1, ...
-with the names in comments.
+information matrix are not used.
 
 Source: Kuemmerle, Grisetti, Strasdat, Konolige, Burgard, "g2o: a general framework for graph
 optimization", ICRA 2011, and its file format.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,34 +59,6 @@ def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatA
     table = _select_tag(Path(path), _POSE)
     values = table.values(first=2, width=_POSE_COLUMNS)
     return rotations_by_name(table, 1, _rotations(table, values[:, 3:]), names)
-
-
-def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray | None = None) -> str:
-    """Return the vertices of named nodes; numbers round-trip.
-
-    Args:
-        names: (k,) of the nodes.
-        locations: (k, 3), or (k, 2) without rotations.
-        rotations: (k, 3, 3) cam_from_world; points are written without.
-
-    Raises:
-        InputError: if the dimension is neither 2 nor 3.
-    """
-    dimension = locations.shape[1]
-    if dimension not in (2, 3):
-        raise InputError(f"g2o has no vertices in {dimension} dimensions; leave out its file")
-    numbered = all(name.isascii() and name.isdigit() for name in names)
-    tag, values = ("VERTEX_XY" if dimension == 2 else "VERTEX_TRACKXYZ"), locations
-    if rotations is not None:
-        tag = "VERTEX_SE3:QUAT"
-        quaternions = Rotation.from_matrix(rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
-        values = np.concatenate([locations, quaternions], axis=1)
-    lines = []
-    for k, (name, row) in enumerate(zip(names, values.tolist(), strict=True)):
-        if not numbered:
-            lines.append(f"# {k} {''.join(c if c.isprintable() else '?' for c in name)}")
-        lines.append(" ".join([tag, name if numbered else str(k), *map(repr, row)]))
-    return "\n".join(lines) + "\n"
 
 
 def _select_tag(file: Path, tag: str) -> TextTable:

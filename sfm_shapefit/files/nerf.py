@@ -1,23 +1,26 @@
-"""NeRF's transforms.json, written as nerfstudio and instant-ngp read it.
+"""NeRF's transforms.json, read as many programs write it, written as nerfstudio and instant-ngp read it.
 
     transform_matrix  world_from_camera, 4 x 4, in OpenGL's camera axes: x right, y up, looking along -z
 
 so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
-for instant-ngp and the original NeRF.
+for instant-ngp and the original NeRF. Only poses and focal lengths are read: other programs shrink images,
+and have distortions of their own.
 
 Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import FLIP_YZ
-from sfm_shapefit.scene.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.files.json_node import JsonNode, read_json
+from sfm_shapefit.scene.posed_model import Intrinsics, ListedPoses, PosedModelFile
 
 _MODELS = {
     "SIMPLE_PINHOLE": ("OPENCV", 1, ()),
@@ -35,6 +38,51 @@ _MODELS = {
 """By COLMAP's name of a camera model: nerfstudio's, the number of focal lengths, keys of the distortion."""
 _DENOMINATOR = ("k4", "k5", "k6")
 """Terms of FULL_OPENCV that nerfstudio does not have."""
+
+_ORTHOGONAL = 0.01  # entries of M^T M / s^2 - I; a rotation written with three digits is nearer
+
+
+def read_nerf(file: Path) -> ListedPoses:
+    """Read the poses of a transforms.json.
+
+    Raises:
+        InputError: if it is none, or a matrix is no pose; the message names the key.
+    """
+    content = JsonNode(file, "", read_json(file))
+    if not content.has("frames"):
+        raise InputError(
+            f"{file} has no key 'frames'; give a transforms.json of NeRF's kind, or a COLMAP folder "
+            "(`convert` makes one of OpenSfM's reconstruction.json)"
+        )
+    names, rotations, centers, focals = [], [], [], []
+    for frame in content.get("frames").elements():
+        node = frame.get("transform_matrix")
+        rows = np.array([row.numbers(4) for row in node.elements()[:3]])
+        turn = rows[:, :3] if len(rows) == 3 else np.zeros((3, 3))
+        scale = np.cbrt(np.linalg.det(turn))  # one of the world, in some files
+        off = np.abs(turn.T @ turn - scale**2 * np.eye(3)).max()
+        if not (scale > 0.0 and off <= _ORTHOGONAL * scale**2):
+            raise node.error("is no pose: its first three columns are no rotation")
+        u, _, vt = np.linalg.svd(turn)
+        names.append(frame.get("file_path").text())
+        rotations.append((u @ vt @ FLIP_YZ).T)
+        centers.append(rows[:, 3])
+        focals.append(_focal_shares(frame, content))
+    return ListedPoses(tuple(names), *(np.array(x) for x in (rotations, centers, focals)))
+
+
+def _focal_shares(frame: JsonNode, content: JsonNode) -> tuple[float, float]:
+    """Return focal lengths over width and height, of a frame or else of all; NaN where there is none."""
+
+    def value(key: str) -> float:
+        node = next((node for node in (frame, content) if node.has(key)), None)
+        return np.nan if node is None else node.get(key).number()
+
+    width, height, x, y = (value(key) for key in ("w", "h", "fl_x", "fl_y"))
+    across = x / width if width > 0.0 else np.nan
+    if np.isnan(across):
+        across = 0.5 / np.tan(0.5 * value("camera_angle_x"))
+    return (across, y / height if height > 0.0 else np.nan)
 
 
 def nerf_text(scene: PosedModelFile) -> str:

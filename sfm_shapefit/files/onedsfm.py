@@ -136,34 +136,6 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
     return rotations_by_name(table, 0, FLIP_YZ @ nearest_rotations(rotations), names)
 
 
-def onedsfm_files(
-    poses: EpipolarGeometries, rotations: FloatArray, cameras: IntArray, locations: FloatArray
-) -> dict[str, str]:
-    """Return the text of EGs.txt, cc.txt, rots.txt and soln.txt, by name; numbers round-trip.
-
-    Args:
-        poses: the pairs to write.
-        rotations: (n, 3, 3) cam_from_world, of all cameras.
-        cameras: (k,) those that are placed, which alone stand in the last three files.
-        locations: (k, 3) of these.
-    """
-    relative = FLIP_YZ @ poses.rotations.swapaxes(1, 2) @ FLIP_YZ
-    pair_rows = np.concatenate([relative.reshape(-1, 9), poses.to_second @ FLIP_YZ], axis=1)
-    ids = [f"{poses.names[i]} {poses.names[j]}" for i, j in poses.pairs.tolist()]
-    placed = [poses.names[k] for k in cameras.tolist()]
-    return {
-        _PAIRS_FILE: _text(ids, pair_rows),
-        _COMPONENT_FILE: "".join(f"{name}\n" for name in placed),
-        "rots.txt": _text(placed, (FLIP_YZ @ rotations[cameras]).reshape(-1, 9)),
-        "soln.txt": _text(placed, locations),
-    }
-
-
-def _text(ids: list[str], values: FloatArray) -> str:
-    rows = zip(ids, values.tolist(), strict=True)
-    return "".join(f"{name} {' '.join(map(repr, row))}\n" for name, row in rows)
-
-
 def _restrict(poses: EpipolarGeometries, component: Path) -> EpipolarGeometries:
     """Return the cameras of a cc.txt and the pairs between them."""
     table = read_lines(component, "i")

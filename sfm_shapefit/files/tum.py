@@ -14,12 +14,38 @@ Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IR
 import csv
 import io
 import math
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.scene.posed_model import PosedModelFile
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.lines import text_of
+from sfm_shapefit.scene.posed_model import ListedPoses, PosedModelFile
+
+
+def read_tum(file: Path) -> ListedPoses:
+    """Read a trajectory; its images go by their timestamps.
+
+    Raises:
+        InputError: if a line is none of a trajectory.
+    """
+    names, numbers = [], []
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        norm = float(np.linalg.norm(values[4:]))
+        if words and not (len(values) == 8 and np.isfinite(values).all() and norm > 0.0):
+            raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
+        if words:
+            names.append(words[0])
+            numbers.append(values[1:])
+    rows = np.array(numbers).reshape(-1, 7)
+    turns = Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else np.zeros((0, 3, 3))
+    return ListedPoses(tuple(names), turns.swapaxes(1, 2), rows[:, :3], np.full((len(rows), 2), np.nan))
 
 
 def tum_text(model: PosedModelFile) -> str:

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csgraph
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.forests import connected_components
 
 _UNIT_NORM_TOLERANCE = 1e-6  # absolute; a direction printed with 7 digits passes, a wrong one does not
 _ROUNDING = (
@@ -117,14 +117,6 @@ class ViewGraph:
             names,
         )
         return graph, cameras.astype(np.int64)
-
-
-def connected_components(num_nodes: int, edges: IntArray) -> IntArray:
-    """Return the connected component of each of n nodes under edges (m, 2), numbered from 0 by first node."""
-    links = coo_array(
-        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(num_nodes, num_nodes)
-    )
-    return np.asarray(csgraph.connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 def _check_arrays(

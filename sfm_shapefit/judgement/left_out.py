@@ -82,6 +82,7 @@ def leave_one_out(
     pictures: Pictures,
     threads: int = 1,
     believed: BoolArray | None = None,
+    asked: BoolArray | None = None,
 ) -> LeftOut:
     """Return pose and focal length of each image by the points as the others make them.
 
@@ -93,6 +94,7 @@ def leave_one_out(
         pictures: keypoints and lenses of the images.
         threads: number of threads to share the images among.
         believed: (i,) images whose rays make the points of others; all if None.
+        asked: (i,) images that are left out; all if None. Nothing is known of the others.
     """
     n = images.num_images
     believed = np.ones(n, dtype=np.bool_) if believed is None else believed
@@ -109,7 +111,10 @@ def leave_one_out(
     def run(begin: int, end: int) -> None:
         fit_images(begin, end, *arrays)
 
-    if threads <= 1:
+    if asked is not None:
+        for k in np.flatnonzero(asked).tolist():
+            run(k, k + 1)
+    elif threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
         run(0, n)
     else:

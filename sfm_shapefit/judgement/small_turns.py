@@ -27,10 +27,9 @@ Turns of 2 degrees are corrected by 1.7 to 3.3 degrees and 15 standard deviation
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.laplacian.superlu import superlu
 
 _ROBUST_SIGMAS = 3.5  # standard deviations at which a weight is a quarter; beyond, a pair hardly counts
 _PRIOR_RAD, _PRIOR_WIDTH_RAD = np.radians(0.2), np.radians(0.6)  # radians, tau and width; see the header
@@ -68,19 +67,20 @@ def solve_corrections(
         level: factor on the standard deviations, at most 1.
         larger_than_rad: size of the corrections whose standard deviations are returned.
     """
-    x, k = np.zeros((count, 3)), len(pairs)
-    rows, signs = np.tile(np.arange(k), 2), np.repeat([1.0, -1.0], k)
-    differences = coo_array((signs, (rows, pairs.T.ravel())), shape=(k, count)).tocsr()
+    x, (i, j), ends = np.zeros((count, 3)), pairs.T, pairs.ravel()
+    nodes = np.arange(count)
+    places = np.concatenate([j, i, nodes]), np.concatenate([i, j, nodes])
     for round_ in range(_MOST_ROUNDS):
         scale = max(level, _COOLING**round_)
         sigmas = scale * sigmas_rad
-        off = np.linalg.norm(turns - differences @ x, axis=1) / sigmas
+        off = np.linalg.norm(turns - (x[i] - x[j]), axis=1) / sigmas
         weights = 1.0 / (sigmas * (1.0 + (off / _ROBUST_SIGMAS) ** 2)) ** 2
         prior = 1.0 / (_PRIOR_RAD**2 * (1.0 + (np.linalg.norm(x, axis=1) / _PRIOR_WIDTH_RAD) ** 2))
-        weighted = differences.T * weights
-        information = csc_array(weighted @ differences + diags_array(prior))
-        factor = splu(information)
-        previous, x = x, factor.solve(np.asarray(weighted @ turns))
+        diagonal = np.bincount(ends, np.repeat(weights, 2), count) + prior
+        factor = superlu(count, places, np.concatenate([-weights, -weights, diagonal]))
+        pulls = (weights[:, None] * turns)[:, None] * np.array([[1.0], [-1.0]])
+        right = np.column_stack([np.bincount(ends, pulls[:, :, c].ravel(), count) for c in range(3)])
+        previous, x = x, factor.solve(right)
         if scale == level and np.abs(x - previous).max(initial=0.0) < _SETTLED_RAD:
             break
     large = np.flatnonzero(np.linalg.norm(x, axis=1) > larger_than_rad)

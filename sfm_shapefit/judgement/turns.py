@@ -48,6 +48,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.rotation_vectors import rotation_vectors, rotations_of
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.small_turns import solve_corrections
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
@@ -413,13 +414,10 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
 
 def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: float) -> dict[int, _Judged]:
     """Return the groups that all pairs say are turned, by more than `least_rad`, at an error `level`."""
-    # Here, since it takes long to import, and where no pair is asked it is not used.
-    from scipy.spatial.transform import Rotation
-
     case, level = pairs.subset(np.isfinite(pairs.sigmas_rad)), float(np.clip(level, _LEAST_LEVEL, 1.0))
     if len(case.pairs) == 0:
         return {}
-    turns = Rotation.from_matrix(case.turns).as_rotvec()
+    turns = rotation_vectors(case.turns)
     corrections = solve_corrections(
         case.pairs, turns, case.sigmas_rad, count, level=level, larger_than_rad=least_rad
     )
@@ -439,7 +437,7 @@ def _judge_by_all_pairs(pairs: PairTurns, count: int, level: float, least_rad: f
             turned=float(case.weights[rows] @ turned),
             num_turned=int(turned.sum()),
             num_pairs=len(rows),
-            turn=np.asarray(Rotation.from_rotvec(own).as_matrix()),
+            turn=rotations_of(own[None])[0],
         )
         if judged.kind is Doubt.TURNED and np.linalg.norm(own) > _CERTAIN_SIGMAS * sigma:
             found[camera] = judged

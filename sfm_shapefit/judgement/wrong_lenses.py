@@ -41,18 +41,25 @@ class WrongLens(NamedTuple):
 
 
 def question_lenses(
-    points: Points, images: Images, pictures: Pictures, threads: int = 1, among: BoolArray | None = None
+    points: Points,
+    images: Images,
+    pictures: Pictures,
+    threads: int = 1,
+    among: BoolArray | None = None,
+    asked: BoolArray | None = None,
 ) -> tuple[LeftOut, tuple[WrongLens, ...]]:
     """Return what images say when they are left out, and the lenses that they contradict, the worst first.
 
     The rays of a wrong lens pull at the points of right ones. So what is named most clearly is taken out of
     the points of all, unless it took half of the images or more, until no other lens is named. Images not
     `among` those that make points (i,) are asked too, if their pixels fit about as well; None: all make them.
+    Only those `asked` (i,) are left out; None: all.
     """
     make = np.ones(images.num_images, dtype=np.bool_) if among is None else among
     believed = make.copy()
     while True:
-        left_out = leave_one_out(points, images, pictures, threads, believed).of_little_noise(make)
+        found = leave_one_out(points, images, pictures, threads, believed, asked)
+        left_out = found.of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
         fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
         gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= _RIVAL * fresh[0].score])

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import bsr_array
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
@@ -74,28 +73,6 @@ def group_by(labels: Any, count: int) -> Any:
         pointers[labels[k]] -= 1
         items[pointers[labels[k]]] = k
     return pointers, items
-
-
-def block_matrix(diagonal: FloatArray, coupling: FloatArray, edges: IntArray) -> bsr_array:
-    """Return the symmetric matrix (nb, nb) of blocks.
-
-    Nodes have the blocks `diagonal` (n, b, b); edge (i, j) of `edges` (m, 2) has `coupling` (m, b, b) as its
-    block (i, j), and the transpose as block (j, i).
-    """
-    n, b, (i, j) = len(diagonal), diagonal.shape[1], edges.T
-    rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
-    blocks = np.concatenate([coupling, coupling.transpose(0, 2, 1), diagonal])
-    order = np.lexsort((columns, rows))
-    pointers = np.searchsorted(rows[order], np.arange(n + 1))
-    return bsr_array((blocks[order], columns[order], pointers), shape=(b * n, b * n))
-
-
-def laplacian_matrix(num_nodes: int, edges: IntArray, weights: FloatArray) -> bsr_array:
-    """Return the Laplacian of edge weights (m,), (n, n), or of symmetric blocks (m, b, b), (nb, nb)."""
-    blocks = weights.reshape(len(edges), 1, 1) if weights.ndim == 1 else weights
-    diagonal = np.zeros((num_nodes, *blocks.shape[1:]))
-    np.add.at(diagonal, edges.ravel(), np.repeat(blocks, 2, axis=0))
-    return block_matrix(diagonal, -blocks, edges)
 
 
 class Workers:

@@ -12,12 +12,11 @@ it can win, and keeps the order with the least work. Both are deterministic.
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import spilu
 
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency
+from sfm_shapefit.laplacian.superlu import superlu
 from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 
 Ordering = Literal["auto", "metis", "minimum-degree"]
@@ -50,10 +49,10 @@ def metis_order(graph: Adjacency) -> IntArray:
 
     if graph.num_nodes == 0 or len(graph.neighbors) == 0:
         return np.arange(graph.num_nodes)
-    entries = (np.ones(len(graph.neighbors), np.int8), graph.neighbors, graph.pointers)
-    matrix = csc_array(entries, shape=(graph.num_nodes, graph.num_nodes), copy=True)
-    matrix.sum_duplicates()  # METIS demands each neighbor once
-    csr = pymetis.CSRAdjacency(matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32))
+    rows = np.repeat(np.arange(graph.num_nodes), np.diff(graph.pointers))
+    rows, neighbors = np.divmod(np.unique(rows * graph.num_nodes + graph.neighbors), graph.num_nodes)
+    pointers = np.searchsorted(rows, np.arange(graph.num_nodes + 1))  # METIS demands each neighbor once
+    csr = pymetis.CSRAdjacency(pointers.astype(np.int32), neighbors.astype(np.int32))
     options = pymetis.Options(niter=_METIS_REFINEMENTS)
     return np.asarray(pymetis.nested_dissection(adjacency=csr, options=options)[0], dtype=np.int64)
 
@@ -67,13 +66,12 @@ def minimum_degree_order(graph: Adjacency) -> IntArray:
     n = graph.num_nodes
     if n <= 1 or len(graph.neighbors) == 0:
         return np.arange(n)
-    columns = np.repeat(np.arange(n), np.diff(graph.pointers))
-    rows = np.concatenate([graph.neighbors, np.arange(n)])
+    nodes = np.arange(n)
+    columns = np.repeat(nodes, np.diff(graph.pointers))
+    places = np.concatenate([graph.neighbors, nodes]), np.concatenate([columns, nodes])
     # The diagonal dominates so that no pivoting or breakdown interferes.
-    values = np.concatenate([np.full(len(columns), -1.0), 2.0 * len(columns) * np.ones(n)])
-    matrix = csc_array((values, (rows, np.concatenate([columns, np.arange(n)]))), shape=(n, n))
-    dropped = spilu(matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A")
-    return np.argsort(dropped.perm_c)
+    values = np.repeat([-1.0, 2.0 * len(graph.neighbors)], [len(graph.neighbors), n])
+    return np.argsort(superlu(n, places, values, order=True).perm_c)
 
 
 def widest_level(graph: Adjacency) -> int:

@@ -15,9 +15,9 @@ factorization: it lives from the parent to the supernode, the same interval run 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.scipy_parts import dtrtri
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor

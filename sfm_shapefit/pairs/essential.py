@@ -28,7 +28,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
+from sfm_shapefit.pairs.two_view_poses import TwoViewPoses, refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches, View
 
 RelativeSource = Literal["matches", "stored"]
@@ -45,6 +45,7 @@ missed: scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's 
 """
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
+_ROUGH_WIDTH = 2.0  # standard deviations of an image's rotation; by as much rough ones make rays miss
 _PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
 _STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
 
@@ -90,6 +91,26 @@ def estimate_relative_rotations(
             if advance is not None:
                 advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
     return concatenate_rotations(parts)
+
+
+def refine_rough_rotations(
+    batch: RayMatches, rotations: FloatArray, sigma_rad: float, threads: int = 1
+) -> RelativeRotations:
+    """Return the relative rotation of every pair that fits its matches best, near a rough one.
+
+    Args:
+        batch: rays in camera axes.
+        rotations: (k, 3, 3) cam_j_from_cam_i of its pairs.
+        sigma_rad: standard deviation per axis of the rotation of each image.
+        threads: number of threads to share the pairs among.
+    """
+    turns = np.repeat(rotations, np.diff(batch.offsets), axis=0)
+    normals = np.cross(np.einsum("mab,mb->ma", turns, batch.rays_i), batch.rays_j)
+    products = np.append(normals[:, :, None] * normals[:, None, :], np.zeros((1, 3, 3)), axis=0)
+    sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
+    translations = np.linalg.eigh(sums)[1][:, :, 0]  # rays meet in planes with it
+    off_rad = _ROUGH_WIDTH * sigma_rad
+    return _relative(batch, refine_two_view_poses(batch, rotations, translations, threads, off_rad))
 
 
 def stored_relative_rotations(view: View, min_matches: int = 1) -> RelativeRotations:
@@ -156,7 +177,11 @@ def _estimate_slice(
 
 def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:
     """Return the relative rotations of pairs that fit all their matches best, near those given."""
-    poses = refine_two_view_poses(matches, rotations, translations)
+    return _relative(matches, refine_two_view_poses(matches, rotations, translations))
+
+
+def _relative(matches: RayMatches, poses: TwoViewPoses) -> RelativeRotations:
+    """Return what the poses of pairs say of their rotations."""
     return RelativeRotations(
         pairs=matches.pairs,
         rotations=poses.rotations,

@@ -14,7 +14,8 @@ moves by d orthogonally to itself,
 
 since a' moves by w x a', so that e changes by w . (a' x (b x t)), and q = 2 - (a'.t)^2 - (b.t)^2.
 Gauss-Newton steps on these five unknowns, each match weighted by Geman and McClure's (1 + (r / s)^2)^-2, lead
-from a rough start to the nearest robust optimum; s falls from 4 px, which forgives the start, to 1.5 px.
+from a rough start to the nearest robust optimum; s falls from 4 px, or from what a start is off by, which
+forgives the start, to 1.5 px.
 
 With the normal matrix of the last weights, sum w J J^T, split into translation (t) and rotation (w), the
 information of the rotation alone, the translation being unknown, is the Schur complement
@@ -42,11 +43,11 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.matches import RayMatches
 
-_FIRST_WIDTH_PX = 4.0  # pixels, s of the first step; a pose from few trials is off by as much
+_FIRST_WIDTH_PX = 4.0  # pixels, s of the first step at least; a pose from few trials is off by as much
 LAST_WIDTH_PX = 1.5
 """s of the last steps. Measured: 1 to 1.5 px are alike, 3 px is a third worse."""
-_NARROWING_STEPS = 3  # steps over which the width falls; in equal ratios
-_STEPS = 12  # steps, a bound; most pairs converge in fewer
+_NARROWING_STEPS = 3  # steps over which the width falls, in equal ratios; one more for each doubling
+_STEPS = 9  # steps after these, a bound; most pairs converge in fewer
 _LONGEST_STEP_RAD = 0.3  # radians; steps are of first order
 _CONVERGED_RAD = 1e-7  # radians; a shorter step is the last
 _LANES = 32  # matches that are linearized together; a multiple of what processors compute at once
@@ -70,7 +71,11 @@ class TwoViewPoses(NamedTuple):
 
 
 def refine_two_view_poses(
-    matches: RayMatches, rotations: FloatArray, translations: FloatArray, threads: int = 1
+    matches: RayMatches,
+    rotations: FloatArray,
+    translations: FloatArray,
+    threads: int = 1,
+    off_rad: float = 0.0,
 ) -> TwoViewPoses:
     """Return the relative poses that fit all matches best, near a start.
 
@@ -81,6 +86,7 @@ def refine_two_view_poses(
         rotations: (k, 3, 3) cam_j_from_cam_i to start from.
         translations: (k, 3) unit vectors to start from, in axes of camera j.
         threads: number of threads to share the pairs among.
+        off_rad: radians by which the start makes rays miss one another.
 
     Source: Sampson's error as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
     """
@@ -95,7 +101,7 @@ def refine_two_view_poses(
     arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
 
     def run(begin: int, end: int) -> None:
-        refine_pairs(begin, end, *arrays, *poses)
+        refine_pairs(begin, end, off_rad, *arrays, *poses)
 
     if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
@@ -109,8 +115,9 @@ def refine_two_view_poses(
 
 @kernel
 def refine_pairs(
-    begin: int, end: int, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray, pixel_angles: FloatArray,
-    rotations: FloatArray, translations: FloatArray, information: FloatArray, weight_shares: FloatArray,
+    begin: int, end: int, off_rad: float, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray,
+    pixel_angles: FloatArray, rotations: FloatArray, translations: FloatArray, information: FloatArray,
+    weight_shares: FloatArray,
 ) -> None:  # fmt: skip
     """Refine rotations and translations of the pairs begin..end-1; fill information and weight shares."""
     system, basis, step = np.empty((_UNKNOWNS + 1, _UNKNOWNS + 1)), np.empty((2, 3)), np.empty(_UNKNOWNS)
@@ -124,16 +131,18 @@ def refine_pairs(
                 ray[c * _LANES], ray[(3 + c) * _LANES] = rays_i[first + k, c], rays_j[first + k, c]
         rotation, t = rotations[p], translations[p]
         sizes = np.empty(count)
-        width_px = _FIRST_WIDTH_PX
-        for k in range(_STEPS):
+        first_px = max(_FIRST_WIDTH_PX, off_rad / pixel_angles[p])
+        narrowing = _NARROWING_STEPS + int(np.ceil(np.log2(first_px / _FIRST_WIDTH_PX)))
+        width_px = first_px
+        for k in range(narrowing + _STEPS):
             fill_basis(t, basis)
             _fill_system(rays, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
             length = _solve(system, step)
             _move(step, min(1.0, _LONGEST_STEP_RAD / max(length, 1e-300)), basis, rotation, t)
-            if k >= _NARROWING_STEPS - 1 and length < _CONVERGED_RAD:
+            if k >= narrowing - 1 and length < _CONVERGED_RAD:
                 break
-            if k < _NARROWING_STEPS - 1:
-                width_px *= (LAST_WIDTH_PX / _FIRST_WIDTH_PX) ** (1.0 / (_NARROWING_STEPS - 1))
+            if k < narrowing - 1:
+                width_px *= (LAST_WIDTH_PX / first_px) ** (1.0 / (narrowing - 1))
         fill_basis(t, basis)
         total = _fill_system(rays, pixel_angles[p], rotation, t, basis, width_px, system, sizes)
         weight_shares[p] = total / max(count, 1)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.sources import links_touching
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg, tangent_bases
@@ -29,6 +30,7 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.matches import is_among
 
 _SAID_OF_MATCHES = (
     "num_inliers",
@@ -75,6 +77,8 @@ def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
     images, placement, directions = stand.source.images, stand.placement, stand.directions
     posed = posed_part(stand.place())
     links = stand.read_links(posed, clock.advance)
+    if stand.source.fixed is not None:  # points that fixed images alone see move nothing
+        links = links_touching(posed.images, links, ~stand.source.fixed[posed.rows])
     freedom = replace(stand.freedom.of(posed.frames, posed.lenses), pull_rad=stand.given.pull_rad)
     adjusted = adjust_placement(posed.images, links, options.structure, freedom, stand.given_poses(posed))
     del links
@@ -135,7 +139,8 @@ def _measure_again(
     Images whose rotations were clearly wrong, and are `corrected`, get what their matches say now.
     """
     usable = before.usable()
-    others = np.delete(before.pairs, usable, axis=0)
+    used = before.pairs[usable]
+    others = source.view.pairs[~is_among(source.view.pairs, used)]
     batches = source.view.batches(without=others, advance=clock.advance)
     again = concatenate([estimate_directions(batch, options, clock.threads) for batch in batches])
     rows = again.usable()

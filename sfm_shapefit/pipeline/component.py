@@ -16,7 +16,11 @@ from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.components import pairs_among
-from sfm_shapefit.pipeline.first_placement import FirstPlacement, adjust_first_placement
+from sfm_shapefit.pipeline.first_placement import (
+    FirstPlacement,
+    adjust_first_placement,
+    start_from_first,
+)
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun
@@ -110,16 +114,10 @@ def _locate_component(
 
 def _place(run: MapRun, members: IntArray, given: Given, source: MatchSource) -> LocateResult:
     """Adjust a first placement of some images, and locate them from the rotations of that."""
-    images, first = given.images, None
+    first = None
     if run.options.freedom.adjust != "none":
-        with run.clock("first placement"):
-            lenses: LensesAtFirst = "known" if run.lenses_found else "free"
-            first = adjust_first_placement(given, source, run.options, run.clock, lenses=lenses)
-        source = source.at(run.pose(members, first.rotations, first.adjusted))
-        given = given._replace(
-            rigid=find_rigid_parts(source.images, run.options.placement),
-            intrinsics=given.intrinsics.after(first.adjusted, images.lenses_of(first.adjusted.images)),
-        )
+        lenses: LensesAtFirst = "known" if run.lenses_found else "free"
+        given, source, first = start_from_first(given, source, run.options, run.clock, lenses=lenses)
     with run.clock("locate"):
         return _settle(run, source, _with_told(run, given, members), first)
 

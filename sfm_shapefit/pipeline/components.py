@@ -11,8 +11,8 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.rotations.arrangements import choose_arrangement, evidence_of

@@ -62,7 +62,9 @@ def ask_pairs(
         return concatenate_rotations([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    without = None if among is None else source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
+    without = source.pairs_of_fixed
+    if among is not None:
+        without = source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
     for batch in source.view.batches(without=without):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.images, batch, rows)

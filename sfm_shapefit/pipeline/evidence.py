@@ -30,6 +30,8 @@ class Structure(NamedTuple):
     """Keypoints and lenses of the images."""
     among: BoolArray | None = None
     """(i,) images that make the points; all if None."""
+    asked: BoolArray | None = None
+    """(i,) images that are asked whether they contradict their lenses; all if None."""
 
 
 def gather_evidence(
@@ -43,8 +45,8 @@ def gather_evidence(
         structure: the points of the model.
         threads: number of threads to use.
     """
-    points, images, pictures, among = structure
-    _, lenses = question_lenses(points, images, pictures, threads, among)
+    points, images, pictures, among, asked = structure
+    _, lenses = question_lenses(points, images, pictures, threads, among, asked)
     if fits is None:
         return ModelEvidence(lenses=lenses)
     seams = _question_cuts(source, fits.cuts(), threads)

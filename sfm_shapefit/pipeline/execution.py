@@ -14,11 +14,10 @@ task to another one.
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context, resource_tracker
 from typing import Any, Generic
 
 from sfm_shapefit.base.errors import MissingExtraError
@@ -84,36 +83,15 @@ def open_executor(name: str, workers: int) -> Iterator[Executor | None]:
     if name == "serial":
         yield None
     elif name == "processes":
-        # Processes are spawned, because forking clashes with threads.
-        with _Pool(workers, mp_context=get_context("spawn")) as pool:
+        from multiprocessing import get_context  # spawned, because forking clashes with threads
+
+        from sfm_shapefit.pipeline.process_pool import ProcessPool
+
+        with ProcessPool(workers, mp_context=get_context("spawn")) as pool:
             yield pool
     else:
         with _dask_client(workers, name.partition(":")[2]) as client:
             yield client.get_executor(retries=_RETRIES)
-
-
-class _Pool(ProcessPoolExecutor):
-    """A pool whose processes leave interrupts to this one."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit a task, for which a process may have to be started."""
-        with _children_are_not_interrupted():
-            return super().submit(fn, *args, **kwargs)
-
-
-@contextmanager
-def _children_are_not_interrupted() -> Iterator[None]:
-    """Start threads and processes in which SIGINT is blocked.
-
-    A terminal interrupts all processes of a command at once. The first one ends the others; what these had to
-    say of it would be tracebacks.
-    """
-    resource_tracker.ensure_running()  # whose start would end the blocking
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
@@ -140,8 +118,10 @@ def _dask_client(workers: int, scheduler: str) -> Iterator[Any]:
     except ModuleNotFoundError:
         raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
     if not scheduler:
+        from sfm_shapefit.pipeline.process_pool import children_are_not_interrupted
+
         with ExitStack() as opened:
-            with _interrupts_wait(), _children_are_not_interrupted():
+            with _interrupts_wait(), children_are_not_interrupted():
                 # The port of the dashboard is taken where another run has a cluster.
                 local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0")
                 client = opened.enter_context(Client(opened.enter_context(local)))

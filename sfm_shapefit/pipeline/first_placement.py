@@ -19,7 +19,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
-from sfm_shapefit.pipeline.rigs import place_cameras
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.place import Near
 
@@ -73,6 +73,30 @@ def adjust_first_placement(
     is_posed = np.isin(np.arange(images.num_images), posed.rows)
     near = Near(centers, placement.refined)
     return FirstPlacement(adjusted, _turn_the_others(images.rotations, rotations, is_posed), near)
+
+
+def start_from_first(
+    given: Given,
+    source: MatchSource,
+    options: PlacingOptions,
+    clock: Clock,
+    *,
+    lenses: LensesAtFirst = "free",
+) -> tuple[Given, MatchSource, FirstPlacement]:
+    """Return what is known of images, and their matches, with the rotations and lenses of a first placement.
+
+    Args and errors as of `adjust_first_placement`.
+    """
+    with clock("first placement"):
+        first = adjust_first_placement(given, source, options, clock, lenses=lenses)
+    images, adjusted = source.images, first.adjusted
+    intrinsics = given.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
+    images = images.with_lenses_of(adjusted.images, adjusted.is_tried)
+    if adjusted.refines_sensors:
+        images = images.with_sensors_of(adjusted.images)
+    source = source.at(images.turned_to(first.rotations))
+    rigid = find_rigid_parts(source.images, options.placement)
+    return given._replace(rigid=rigid, intrinsics=intrinsics), source, first
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

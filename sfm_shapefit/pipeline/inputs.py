@@ -5,6 +5,9 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.options import PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
@@ -28,6 +31,8 @@ class MatchSource:
     inputs: Inputs
     """Where they come from."""
     economy: Economy = ECONOMIES[0]
+    fixed: BoolArray | None = None
+    """(i,) images that stay where they are; None if none does."""
     alone: RelativeRotations | None = None
     """What pairs, ascending, said of their rotations alone, before anything was placed; None if not asked."""
 
@@ -40,6 +45,13 @@ class MatchSource:
     def has_database(self) -> bool:
         """Whether the matches are those of a database; else the model's own tracks serve."""
         return self.inputs.database is not None
+
+    @property
+    def pairs_of_fixed(self) -> IntArray | None:
+        """Pairs (k, 2) of two fixed images, which say nothing of where others are; None if none is fixed."""
+        if self.fixed is None:
+            return None
+        return np.asarray(self.view.pairs[self.fixed[self.view.pairs].all(axis=1)])
 
     def at(self, images: Images, economy: Economy | None = None) -> "MatchSource":
         """Return the same matches as other images see them, or with more that is given up."""

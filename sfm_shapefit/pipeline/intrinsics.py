@@ -23,6 +23,7 @@ def settle_intrinsics(
     file: DatabaseFile | None,
     wanted: IntrinsicsFreedom,
     left_out: PairNames = frozenset(),
+    listed: frozenset[int] = frozenset(),
 ) -> tuple[Images, RefinedIntrinsics]:
     """Return the images to start from, lenses in doubt marked, and what adjustments may change of these.
 
@@ -31,6 +32,7 @@ def settle_intrinsics(
         file: the database, if there is one, which says which intrinsics are guesses.
         wanted: intrinsics that may change.
         left_out: pairs that say nothing of focal lengths.
+        listed: ids of lenses whose focal lengths are guesses of a list of poses.
 
     Raises:
         InputError: if the database cannot be read.
@@ -39,6 +41,8 @@ def settle_intrinsics(
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
     if wanted in ("focal", "all"):
         lenses = [in_doubt(lens, Origin.CALIBRATION) for lens in lenses]
+    for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
+        lenses[k] = in_doubt(images.lenses[k], Origin.GUESS)
     for k, found in guessed.items():
         lenses[k] = in_doubt(images.lenses[k], found.origin)
     if file is not None and guessed and wanted != "held":

@@ -23,7 +23,6 @@ from sfm_shapefit.placement.control_points import (
     fit_control_points,
     triangulate_control_points,
 )
-from sfm_shapefit.rotations.gravity import FEWEST_GRAVITIES, down_of, judge_gravity, turn_upright
 from sfm_shapefit.rotations.options import GRAVITY_OF_DATABASE
 from sfm_shapefit.scene.given import ControlPoints, Gravity, Known, PositionPriors
 from sfm_shapefit.scene.images import Images
@@ -121,6 +120,8 @@ def _bring_to_control_points(
 
 def _turn_upright(seeded: Seeded, gravity: Gravity) -> tuple[Seeded, list[str]]:
     """Return a model turned so that z points up, unless something else set its axes, and what to warn of."""
+    from sfm_shapefit.rotations.gravity import FEWEST_GRAVITIES, down_of, judge_gravity, turn_upright
+
     images, members = seeded.images, np.flatnonzero(seeded.images.is_posed)
     rotations, own = images.rotations[members], gravity.of(members)
     if len(own.indices) < FEWEST_GRAVITIES:

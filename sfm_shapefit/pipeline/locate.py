@@ -5,15 +5,19 @@ Each stage is one function from values to a new value; the input is never change
 
 from concurrent.futures import Executor
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.listed_poses import is_list, read_list
 from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.acting import act
@@ -30,7 +34,10 @@ from sfm_shapefit.pipeline.inputs import (
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
+from sfm_shapefit.pipeline.rough import settle_rough
 from sfm_shapefit.pipeline.settle import settle
+
+_ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 
 
 def locate(
@@ -51,8 +58,9 @@ def locate(
         found.write("out")                                      # the model, tables, and report.html
 
     Args:
-        reconstruction: a pycolmap.Reconstruction, a result or a model folder; nothing of it is changed, and
-            its camera centers never place a camera.
+        reconstruction: a pycolmap.Reconstruction, a result or a model folder; or the file of a list of poses,
+            transforms.json or a trajectory, of images of the database. Nothing of it is changed, and its
+            camera centers never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings, see `help(LocateOptions)`; defaults if None.
@@ -79,7 +87,12 @@ def locate(
     clock = Clock.of(progress, options.placement.solver, executor)
     with ExitStack() as stack:
         with clock("read"):
-            model = read_model(reconstruction)
+            listed: frozenset[int] = frozenset()
+            if isinstance(reconstruction, Path | str) and is_list(reconstruction):
+                posed, listed = read_list(Path(reconstruction), database)
+                model = read_model(posed)
+            else:
+                model = read_model(reconstruction)
             given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
             inputs = read_left_out(inputs, given.names, options.directions.without)
@@ -88,13 +101,14 @@ def locate(
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
             matches = stack.enter_context(closing(open_matches(model, inputs)))
             wanted = options.freedom.intrinsics
-            images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out)
+            images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
             rigid = find_rigid_parts(images, options.placement, read_fixed_images(model, options.fix))
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
+            source = replace(source, fixed=rigid.fixed if rigid.fixed.any() else None)
         told = Given(
             template,
             images,
@@ -106,4 +120,8 @@ def locate(
             distances=options.gauge.known_distance,
             known=known,
         )
-        return act(partial(settle, options=options, clock=clock), told, source, options)
+        place = partial(settle, options=options, clock=clock)
+        sigma_rad = pull_of_rotations(options.rotations)
+        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf and not rigid.fixed.any():
+            place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
+        return act(place, told, source, options)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics
@@ -172,14 +171,6 @@ class MapRun(NamedTuple):
         """What models are located from."""
         return replace(inputs_from(self.matches.file.path), left_out=self.without)
 
-    def pose(self, members: IntArray, rotations: FloatArray, first: Estimate | None = None) -> Images:
-        """Return some images with these rotations (k, 3, 3), all frames at the origin.
-
-        An adjustment, if there was one, gives them the lenses that it was free to change, and its sensors.
-        """
-        images = self.images.part(members)
-        if first is not None:
-            images = images.with_lenses_of(first.images, first.is_tried)
-            if first.refines_sensors:
-                images = images.with_sensors_of(first.images)
-        return images.turned_to(rotations)
+    def pose(self, members: IntArray, rotations: FloatArray) -> Images:
+        """Return some images with these rotations (k, 3, 3), all frames at the origin."""
+        return self.images.part(members).turned_to(rotations)

@@ -20,7 +20,7 @@ from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch
+from sfm_shapefit.scene.matches import MatchBatch, is_among
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -63,7 +63,9 @@ DIRECTIONS = Wanted()
 def measure(
     source: MatchSource, options: DirectionOptions, clock: Clock, wanted: Wanted = DIRECTIONS
 ) -> Measured:
-    """Measure the direction of every pair that the source has, and what is wanted beside, in one pass.
+    """Measure the direction of every pair of a source, and what is wanted beside, in one pass.
+
+    Pairs of two fixed images are left out.
 
     Workers of an executor estimate the directions of a database's pairs; what is wanted beside takes a second
     pass then.
@@ -71,19 +73,22 @@ def measure(
     Raises:
         UnsolvableError: if no pair has a match.
     """
-    beside = _Beside(source, options.inlier_threshold_px, wanted)
+    beside, without = _Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
         work = PairWork(estimate=partial(estimate_directions, options=options))
         parts = measure_with_workers(source.view, work, clock.executor, clock.advance)
+        if without is not None and parts:
+            every = concatenate(parts)
+            parts = [every.subset(np.flatnonzero(~is_among(every.pairs, without)))]
         if parts and any(wanted):
             directions = concatenate(parts)
             row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
-            for batch in source.view.batches():
+            for batch in source.view.batches(without=without):
                 rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
                 beside.add(batch, directions.subset(rows))
     else:
         parts = []
-        for batch in source.view.batches(advance=clock.advance):
+        for batch in source.view.batches(without=without, advance=clock.advance):
             parts.append(estimate_directions(batch, options, clock.threads))
             beside.add(batch, parts[-1])
     if not parts:

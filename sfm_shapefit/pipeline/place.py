@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results show their report in notebooks
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.result import GraphResult
@@ -92,16 +91,14 @@ def place_graph_file(
     """
     options = merge_options(options, PlacementOptions, overrides)
     clock = Clock.of(progress, options.solver)
-    cam_from_world, statement = None, "directions as given"
+    statement = "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
     if geometries is not None:
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out reverse=True")
         with clock("rotations"):
-            graph, cam_from_world, statement = _orient(
-                geometries, rotations, max_rotation_error_deg, clock.threads
-            )
+            graph, statement = _orient(geometries, rotations, max_rotation_error_deg, clock.threads)
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
@@ -121,8 +118,6 @@ def place_graph_file(
         placement=judged[0],
         further=tuple(judged[1:]),
         timings_s=clock.seconds,
-        geometries=geometries,
-        rotations=cam_from_world,
     )
 
 
@@ -139,8 +134,8 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
 
 def _orient(
     geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float, threads: int
-) -> tuple[ViewGraph, FloatArray, str]:
-    """Return the directions of the pairs that agree with the rotations, of a file or averaged, and these."""
+) -> tuple[ViewGraph, str]:
+    """Return the directions of the pairs that agree with the rotations, of a file or averaged."""
     if path is not None:
         read = read_g2o_rotations if is_g2o(path) else read_rotations
         (rotations, known), origin = read(path, geometries.names), f"of {path}"
@@ -161,4 +156,4 @@ def _orient(
         f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
         f"contradict them by more than {max_rotation_error_deg:g} deg and are left out"
     )
-    return geometries.subset(agreeing.tolist()).view_graph(rotations, known), rotations, statement
+    return geometries.subset(agreeing.tolist()).view_graph(rotations, known), statement

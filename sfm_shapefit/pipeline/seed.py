@@ -88,7 +88,7 @@ def seed_points(stand: Stand, kept: BoolArray, options: PlacingOptions, clock: C
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:
         limit_px, rotations = options.structure.max_reprojection_error_px, source.images.rotations
-        num_keypoints, batches = source.view.num_keypoints, source.view.batches()
+        num_keypoints, batches = source.view.num_keypoints, source.view.batches(without=source.pairs_of_fixed)
         counts = count_observations(points, images, num_keypoints, batches, rotations, limit_px)
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:

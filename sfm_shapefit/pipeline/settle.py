@@ -238,7 +238,8 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     if (others := images.is_posed & ~among).any():
         points = points.seen_by(others, source.view.num_keypoints, source.view.links())
     pictures = ModelPictures(images, source.view.keypoints)
-    structure = Structure(points, images, pictures, among)
+    asked = None if source.fixed is None else ~source.fixed
+    structure = Structure(points, images, pictures, among, asked)
     return gather_evidence(source, fits, structure, clock.threads)
 
 

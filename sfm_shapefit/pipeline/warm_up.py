@@ -15,8 +15,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +156,9 @@ def _kernels(only_needed: bool) -> set[str]:
 
 def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpError]:
     """Run examples in processes; yield the names of kernels, and errors."""
+    from multiprocessing import get_context  # here and not above: few commands start processes
+    from multiprocessing.connection import Connection, wait
+
     context, waiting = get_context("spawn"), list(examples)
     workers, at_work = {}, dict[Any, str]()
     try:
@@ -189,7 +190,7 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
             process.join()
 
 
-def _work(connection: Connection, objects_between_searches: tuple[int, int, int]) -> None:
+def _work(connection: Any, objects_between_searches: tuple[int, int, int]) -> None:
     """Run the examples that the connection names, and tell of every kernel.
 
     Unused objects are looked for as often as in the parent: compiling makes very many of them.

@@ -5,7 +5,6 @@ bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `
 that were joined stand in `joined_0` in one world too.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +43,6 @@ def write_result(
     out: Path | str,
     *,
     options: WriteOptions | None = None,
-    further_files: Mapping[str, str] | None = None,
     **overrides: Any,
 ) -> None:
     """Write a result into a folder that appears whole or not at all: models, tables, a page for each.
@@ -53,7 +51,6 @@ def write_result(
         found: what `locate`, `map_database`, `join` or `place_graph_file` returned.
         out: the folder to be made.
         options: settings, see `help(WriteOptions)`; defaults if None.
-        further_files: the text of more files, by their path in the folder.
         **overrides: single options by name: `write_result(found, "out", overwrite=True)`.
 
     Raises:
@@ -62,9 +59,6 @@ def write_result(
     options = merge_options(options, WriteOptions, overrides)
     protect = [*_inputs_of(found), *options.protect]
     with atomic_folder(out, overwrite=options.overwrite, protect=protect) as folder:
-        for name, text in (further_files or {}).items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).write_text(text, encoding="utf-8")
         if isinstance(found, MapResult):
             for number, model in enumerate(found.models):
                 (folder / str(number)).mkdir()

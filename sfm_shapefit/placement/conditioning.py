@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, sum_by
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import median_spread, normalized
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
 
 LOOSE_SHARE = 0.05

@@ -19,7 +19,6 @@ right cameras are among these, unless the pairs' own relative rotations (`judgem
 from typing import Annotated
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
@@ -223,6 +222,8 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
 
 def _in_triangle(graph: ViewGraph) -> BoolArray:
     """Return which pairs (m,) have a common neighbor."""
+    from scipy.sparse import coo_array  # here, since it takes long to import
+
     i, j = graph.edges.T
     half = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_nodes, graph.num_nodes)).tocsr()
     adjacency = half + half.T

@@ -21,9 +21,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
 from sfm_shapefit.placement.piece_program import (
     Standing,
@@ -40,6 +40,7 @@ from sfm_shapefit.placement.piece_ties import (
     direct_ties,
     turn_pieces,
 )
+from sfm_shapefit.solver.options import SolverResult
 
 FEWEST_PAIRS = 3
 """Agreeing pairs that a join needs; a wrong one has two by chance, and two leave nothing to check it by."""
@@ -79,6 +80,8 @@ class PieceJoin:
     """Pairs between it and these that do not agree."""
     rivals: IntArray = field(default_factory=_none)
     """Pairs among these that agree on another join."""
+    solved: SolverResult | None = None
+    """The last solve of the convex program over all pieces that were placed with it; None without one."""
     evidence: str = ""
     """What it rests on, in words."""
     reason: str = ""
@@ -181,6 +184,8 @@ class _Joint(NamedTuple):
     covariances: FloatArray
     agrees: BoolArray
     """(k,)"""
+    solved: SolverResult
+    """The program's last solve, from which the refinement started."""
 
     def support(self, counted: BoolArray) -> IntArray:
         """Return how many agreeing pairs are between every two pieces, (G, G), of those that count (k,)."""
@@ -212,7 +217,7 @@ def _search(evidence: _Evidence, enough: int) -> _Joint:
             break
         agrees = _agreeing(best.evidence, latest.standing)
         if best.evidence.weigh(agrees) > best.evidence.weigh(best.agrees):
-            best = best._replace(standing=latest.standing, covariances=latest.covariances, agrees=agrees)
+            best = latest._replace(evidence=best.evidence, agrees=agrees)
     return best
 
 
@@ -236,9 +241,9 @@ def _place(evidence: _Evidence) -> _Joint:
         raise UnsolvableError("no pair of images between them has a direction")
     if not tied.all():
         return _place(evidence.part(evidence.numbers[tied]))
-    standing = solve_pieces(evidence.cameras, evidence.ties, directions, turns)
+    standing, solved = solve_pieces(evidence.cameras, evidence.ties, directions, turns)
     standing, covariances = refine_pieces(evidence.cameras, evidence.ties.subset(used), standing)
-    return _Joint(evidence, standing, covariances, _agreeing(evidence, standing))
+    return _Joint(evidence, standing, covariances, _agreeing(evidence, standing), solved)
 
 
 def _agreeing(evidence: _Evidence, standing: Standing) -> BoolArray:
@@ -335,6 +340,7 @@ def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:
         agreeing=evidence.rows[agreeing],
         contradicting=evidence.rows[against],
         rivals=evidence.rows[own & rivals],
+        solved=joint.solved,
         evidence=pairs + same,
         reason=uncertainty(scale_sigma, turn_sigma_deg, center_sigma),
     )

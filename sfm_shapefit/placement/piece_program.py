@@ -9,8 +9,9 @@ over two kinds of directions:
 
 Three pairs at least tell a scale; one pair with rays does, and pieces that follow one another need these.
 Half of the weight goes to each kind, the rays of a pair count as the root of their number, and the program is
-solved twice, the second time with weights over lengths, so that angles count. Places are only as good as the
-turns, so that a robust refinement moves all seven unknowns, its scale of the residuals falling in steps.
+solved twice, the second time certified and with weights over lengths, so that angles count. Places are only
+as good as the turns, so that a robust refinement moves all seven unknowns, its scale of the residuals falling
+in steps.
 """
 
 from typing import NamedTuple
@@ -20,11 +21,13 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, normalized
+from sfm_shapefit.base.rotation_vectors import rotations_of
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
+from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.solve import solve_groups
 
@@ -56,8 +59,8 @@ class Standing(NamedTuple):
 
 def solve_pieces(
     cameras: PieceCameras, ties: PieceTies, directions: PairDirections, turns: FloatArray
-) -> Standing:
-    """Return where pieces stand by the convex program, with their turns (G, 3, 3) held.
+) -> tuple[Standing, SolverResult]:
+    """Return where pieces stand by the convex program, with their turns (G, 3, 3) held, and its certificate.
 
     Raises:
         UnsolvableError: if the directions do not determine it, or turn a piece inside out.
@@ -91,11 +94,11 @@ def solve_pieces(
         lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
         weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
         graph = ViewGraph(len(nodes), pairs, seen, weights)
-        locations = solve_groups(graph, groups, certified=False).locations
+        solved = _certified(graph, groups)
     except UnsolvableError as error:
         number = counted(len(usable), "pair")
         raise UnsolvableError(f"{number} of images cannot tell how large it is and where") from error
-    centers, scales = groups.split(groups.fit(locations)[0])
+    centers, scales = groups.split(groups.fit(solved.locations)[0])
     scales = scales[units]
     if not scales.min() > 0.0:
         raise UnsolvableError("the pairs of images between them turn one of them inside out")
@@ -103,11 +106,16 @@ def solve_pieces(
     own = np.einsum("gkl,gl->gk", turns, cameras.middles())
     middles = centers + scales[:, None] * own
     back = turns[0].T
-    return Standing(
-        scales / scales[0],
-        back @ turns,
-        (middles - centers[0]) / scales[0] @ back.T,
-    )
+    standing = Standing(scales / scales[0], back @ turns, (middles - centers[0]) / scales[0] @ back.T)
+    return standing, solved
+
+
+def _certified(graph: ViewGraph, groups: RigidGroups) -> SolverResult:
+    """Return the solve with its certificate; without one where the pairs are too few for a feasible dual."""
+    try:
+        return solve_groups(graph, groups)
+    except UnsolvableError:  # pairs that agree are counted all the same
+        return solve_groups(graph, groups, certified=False)
 
 
 class _Rays(NamedTuple):
@@ -296,12 +304,10 @@ def _covariances(hessian: FloatArray, held: BoolArray) -> FloatArray:
 
 def _moved(standing: Standing, step: FloatArray, sizes: FloatArray) -> Standing:
     """Return the pieces after a step (7 G,): turned about their middles, scaled, and shifted."""
-    from scipy.spatial.transform import Rotation  # here, since it takes long to import
-
     by_piece = step.reshape(-1, 7)
     return Standing(
         standing.scales * np.exp(by_piece[:, 3]),
-        Rotation.from_rotvec(by_piece[:, :3]).as_matrix() @ standing.turns,
+        rotations_of(by_piece[:, :3]) @ standing.turns,
         standing.middles + (standing.scales * sizes)[:, None] * by_piece[:, 4:],
     )
 

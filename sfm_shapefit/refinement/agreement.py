@@ -16,10 +16,10 @@ has unknowns, and leaves the others alone. The locations tell which of the two t
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized, tangent_bases
+from sfm_shapefit.base.scipy_parts import chdtri
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.solver.program import along, differences
 

@@ -33,10 +33,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import expit, logit
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
+from sfm_shapefit.base.scipy_parts import expit, logit
 from sfm_shapefit.graph.viewgraph import ViewGraph
 
 _LEVELS_RAD = (0.2, 0.13, 0.085, 0.055, 0.036, 0.024, 0.016, 0.011, 0.0075, 0.005)

@@ -19,8 +19,9 @@ each tenfold radius is looked at by itself.
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import distances_in_spreads, fit_similarity_l1
-from sfm_shapefit.graph.viewgraph import ViewGraph, connected_components
+from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.program import differences
 
 # Distance of a stray, in the largest distance of the start, both in median distances. A sound refinement

@@ -19,9 +19,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, logit
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.scipy_parts import expit, logit
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.angular import AngularResult

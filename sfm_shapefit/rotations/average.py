@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (

@@ -31,8 +31,8 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_kernels import sum_blocks

@@ -11,10 +11,10 @@ Images need no pair inside their frame: sensors that look opposite ways are tied
 """
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
+from sfm_shapefit.base.rotation_vectors import rotation_vectors, rotations_of
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 
 
@@ -60,7 +60,7 @@ def _join(several: RelativeRotations) -> RelativeRotations:
     off = ordered.rotations @ lead[group].transpose(0, 2, 1)
     agreeing = rotation_angles_deg(off) <= AGREEMENT_DEG
     weight = np.where(agreeing[:, None, None], ordered.information, 0.0)
-    vectors = Rotation.from_matrix(off).as_rotvec()
+    vectors = rotation_vectors(off)
     information = _sums(weight, group, len(pairs))
     pull = _sums(np.einsum("kab,kb->ka", weight, vectors), group, len(pairs))
     turns = np.linalg.solve(information, pull[:, :, None])[:, :, 0]
@@ -68,7 +68,7 @@ def _join(several: RelativeRotations) -> RelativeRotations:
     num_matches = np.bincount(group, counts, len(pairs)).astype(np.int64)
     return RelativeRotations(
         pairs=pairs,
-        rotations=Rotation.from_rotvec(turns).as_matrix() @ lead,
+        rotations=rotations_of(np.asarray(turns, dtype=np.float64)) @ lead,
         information=information,
         num_matches=num_matches,
         weight_shares=np.bincount(group, counts * ordered.weight_shares, len(pairs)) / num_matches,

@@ -85,18 +85,6 @@ class RayMatches:
         )
 
 
-def join_rays(parts: Sequence[RayMatches]) -> RayMatches:
-    """Return the pairs of all parts, in order; there may be no parts."""
-    counts = np.concatenate([np.zeros(0, dtype=np.int64), *(np.diff(part.offsets) for part in parts)])
-    return RayMatches(
-        pairs=np.concatenate([np.zeros((0, 2), dtype=np.int64), *(part.pairs for part in parts)]),
-        offsets=np.append(0, np.cumsum(counts)),
-        rays_i=np.concatenate([np.zeros((0, 3)), *(part.rays_i for part in parts)]),
-        rays_j=np.concatenate([np.zeros((0, 3)), *(part.rays_j for part in parts)]),
-        pixel_angles=np.concatenate([np.zeros(0), *(part.pixel_angles for part in parts)]),
-    )
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeypointMatches:
     """The matches of k image pairs, M in all, one pair after the other, as keypoints; no rays."""

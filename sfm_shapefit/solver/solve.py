@@ -14,7 +14,6 @@ from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.certificate import Certificate, certify
-from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
@@ -135,6 +134,8 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
     asked = options.solver != "auto"
     if options.solver == "conic":
+        from sfm_shapefit.solver.conic import solve_conic
+
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit), "asked for")
     resources = Resources(options.num_threads(), options.factor_bytes)
     if options.solver == "admm":

@@ -20,10 +20,10 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.scene.matches import MatchBatch, Reading
 from sfm_shapefit.synthetic.models import (
     ModelParts,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.forests import root_of
 from sfm_shapefit.base.jit import inner_kernel, kernel
 
 
@@ -32,25 +33,6 @@ def sampson_px(a: Any, b: Any, d: Any, pixel_angle: float) -> float:
     return float(abs(volume) / (gradient * pixel_angle))
 
 
-@inner_kernel
-def _root(parents: Any, k: int) -> int:
-    """Return the root of a node."""
-    while parents[k] != k:
-        parents[k] = parents[parents[k]]
-        k = parents[k]
-    return k
-
-
-@inner_kernel
-def unite(parents: Any, i: int, j: int) -> None:
-    """Join the trees of two nodes."""
-    i, j = _root(parents, i), _root(parents, j)
-    if i < j:
-        parents[j] = i
-    else:
-        parents[i] = j
-
-
 @kernel
 def _number_trees(parents: Any, order: Any, numbers: Any) -> int:
     """Write the number of the tree of each node by the first node of it in `order`; return how many."""
@@ -58,7 +40,7 @@ def _number_trees(parents: Any, order: Any, numbers: Any) -> int:
     for k in range(len(numbers)):
         numbers[k] = -1
     for position in range(len(order)):
-        root = _root(parents, order[position])
+        root = root_of(parents, order[position])
         if numbers[root] < 0:
             numbers[root] = count
             count += 1

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
+from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
+from sfm_shapefit.tracks.joining import number_trees, sampson_px
 
 # Between two slices Python can be interrupted: about 50 ms.
 _MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000
@@ -200,4 +201,4 @@ def _join(
             d[c] /= np.sqrt(square)
         angle = 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])
         if sampson_px(rays[k], rays[other], d, angle) <= limit_px:
-            unite(parents, k, other)
+            merge_sets(parents, k, other)

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
+from sfm_shapefit.base.forests import merge_sets
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.scene.matches import MatchBatch
-from sfm_shapefit.tracks.joining import number_trees, sampson_px, unite
+from sfm_shapefit.tracks.joining import number_trees, sampson_px
 
 # Observations per camera; about 3 tracks started per camera, of 6 views each, determine a straight road.
 _PER_CAMERA = 20
@@ -135,7 +136,7 @@ def _join_batch(
                     for c in range(3):
                         rays[count - first, c] = rays_i[m, c] if side == 0 else rays_j[m, c]
                     count += 1
-            unite(parents, places[keypoints[m, 0]], places[keypoints[m, 1]])
+            merge_sets(parents, places[keypoints[m, 0]], places[keypoints[m, 1]])
     return count
 
 

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.adjustment import AdjustmentOptions, adjust
 from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.layout import lay_out
-from sfm_shapefit.adjustment.priors import rotation_vectors
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.rotation_vectors import rotation_vectors
 from tests.adjustment.made import disturb, ring_problem
 
 SQUARES = AdjustmentOptions(loss_scale_px=None)

@@ -16,6 +16,7 @@ from tests.scenes import RING
 
 SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]
 RHOS = ["rho_xy", "rho_xz", "rho_yz"]
+TURNED = ["turned_deg", "moved"]
 NOT_UTF8 = os.fsdecode(b"mod\xe8le")
 
 
@@ -34,12 +35,31 @@ def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_p
         trust=0.5,
         sigma=(math.nan,) * 3,
         correlation=(0.25, -1.0, 0.0),
+        turned_deg=1.5,
     )
     write_rows([placed, CameraRow(name="c", reason="why")], CameraRow, 3, tmp_path / "cameras.csv")
     assert lines_of(tmp_path / "cameras.csv") == [
-        ["name", "placed", "reason", "piece", "x", "y", "z", "degree", "trust", *SIGMAS, *RHOS],
-        ['a,"b', "true", "", "0", "0.1", "-2.0", "1e-30", "3", "0.5", "", "", "", "0.25", "-1.0", "0.0"],
-        ["c", "false", "why", "", "", "", "", "0", "", "", "", "", "", "", ""],
+        ["name", "placed", "reason", "piece", "x", "y", "z", "degree", "trust", *SIGMAS, *RHOS, *TURNED],
+        [
+            'a,"b',
+            "true",
+            "",
+            "0",
+            "0.1",
+            "-2.0",
+            "1e-30",
+            "3",
+            "0.5",
+            "",
+            "",
+            "",
+            "0.25",
+            "-1.0",
+            "0.0",
+            "1.5",
+            "",
+        ],
+        ["c", "false", "why", "", "", "", "", "0", *[""] * 9],
     ]
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.correlated_errors import sample_direction_errors
 from sfm_shapefit.judgement.uncertainty import propagate
-from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import SceneOptions, box_graph_problem, make_scene

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from harness.graphs import laplacian_matrix
 from sfm_shapefit.laplacian.cholesky import analyze, factorize
-from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
 from tests.graph_families import random_blocks

@@ -81,6 +81,7 @@ def test_models_are_joined_in_the_world_of_the_first(tmp_path, adjust):
     assert " ".join(told["statement"].split()[:3]) == f"{models[1]} is joined"
     assert "joined" in shown
     assert told["agreeing_pairs"] >= 3
+    assert (told["solve"]["status"], told["solve"]["gap"] <= 1e-8) == ("converged", True)
     assert (told["folder"], facts["models"]) == (".", [*map(str, models)])
     assert ("image_undistorter" in shown) == (adjust == "full")
     assert told["similarity"]["scale"] == pytest.approx(2.5, rel=1e-4)

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import fit_similarity, normalized
-from sfm_shapefit.files.g2o import g2o_text
 from sfm_shapefit.files.graph_text import graph_text, read_graph
-from sfm_shapefit.files.onedsfm import is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.synthetic import random_graph_problem
@@ -68,38 +66,6 @@ def test_pairs_whose_rotation_contradicts_the_cameras_are_left_out_and_counted(t
     assert json.loads((tmp_path / "all" / "locate.json").read_text())["num_pairs"] == 36
 
 
-def test_what_solve_writes_in_other_formats_can_be_read(tmp_path):
-    source, _, _ = write_scene(tmp_path / "in", n=9)
-    out = tmp_path / "out"
-    solve(source, out, "--rotations", source / "rots.txt", "--g2o", "--1dsfm")
-    assert is_onedsfm(out / "1dsfm")
-    again = read_onedsfm(out / "1dsfm")
-    assert len(again.pairs) == 36
-    assert (out / "1dsfm" / "rots.txt").read_text().split() != []
-    known = read_rotations(out / "1dsfm" / "rots.txt", again.names)[0]
-    found = centers_of(out)
-    expected = g2o_text(list(found), np.array(list(found.values())), known)
-    assert [line.split()[:2] for line in (out / "positions.g2o").read_text().splitlines()] == [
-        line.split()[:2] for line in expected.splitlines()
-    ]
-    solution = [line.split() for line in (out / "1dsfm" / "soln.txt").read_text().splitlines()]
-    assert {row[0]: [float(x) for x in row[1:]] for row in solution} == found
-
-
-def test_a_bare_graph_written_as_1dsfm_has_the_same_directions(tmp_path):
-    out = tmp_path / "out"
-    solve(BUNDLED / "graph40.txt", out, "--1dsfm")
-    agreeing = read_onedsfm(out / "1dsfm")
-    known = read_rotations(out / "1dsfm" / "rots.txt", agreeing.names)
-    again, first = agreeing.view_graph(*known), read_graph(BUNDLED / "graph40.txt")
-    of = {
-        (first.names[i], first.names[j]): v for (i, j), v in zip(first.edges, first.directions, strict=True)
-    }
-    for (i, j), v in zip(again.edges.tolist(), again.directions, strict=True):
-        np.testing.assert_allclose(v, of[again.names[i], again.names[j]], atol=1e-14)
-    assert again.num_edges < first.num_edges  # those that contradict are gone
-
-
 def test_neither_order_nor_orientation_of_lines_matters_and_reversed_directions_give_the_same_scene(tmp_path):
     graph, rng = read_graph(BUNDLED / "graph40.txt"), np.random.default_rng(5)
     v = normalized(graph.directions + 0.03 * rng.standard_normal(graph.directions.shape))
@@ -127,19 +93,16 @@ def test_neither_order_nor_orientation_of_lines_matters_and_reversed_directions_
         (["graph.txt", "--rotations", "rots.txt"], "needs? no rotations"),
         (["EGs.txt", "--reverse"], "leave out --reverse"),
         (["EGs.txt", "--rotations", "wrong.txt"], "agrees with those of the cameras"),
-        (["flat.txt", "--1dsfm"], "of three dimensions, the graph of 2"),
     ],
 )
 def test_options_that_do_not_fit_the_source_are_refused(tmp_path, arguments, words):
     rotations, centers = scene()
-    flat = random_graph_problem(10, 0.9, d=2, seed=1)
     folder_with(
         tmp_path,
         EGs=egs_text(rotations, centers),
         rots=rots_text(rotations),
         wrong=rots_text(scene(seed=7)[0]),
         graph="0 1 1 0 0\n1 2 0 1 0\n0 2 0.6 0.8 0\n",
-        flat=graph_text(ViewGraph(10, flat.edges, flat.directions)),
     )
     paths = [tmp_path / a if a.endswith(".txt") else a for a in arguments]
     result = solve(paths[0], tmp_path / "out", *paths[1:], code=3)

@@ -56,7 +56,7 @@ def test_processes_look_for_garbage_as_often_as_the_one_that_began_them(monkeypa
 def test_where_no_process_can_be_started_a_command_compiles_alone(monkeypatch):
     monkeypatch.setattr(module, "num_cores", lambda: 2)
     monkeypatch.setattr(module, "not_done", list)
-    monkeypatch.setattr(module, "get_context", no_process)
+    monkeypatch.setattr("multiprocessing.get_context", no_process)
     with compile_together(print, print):
         miss()
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.forests import compact, connected_components, merge_sets, roots
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.graph.rigidity.growth import compact, incidence, merge_sets, roots
-from sfm_shapefit.graph.viewgraph import connected_components
+from sfm_shapefit.graph.rigidity.growth import incidence
 
 _GAME_WORK = 20  # nodes marked, per node; then contracting and restarting is cheaper than going on
 

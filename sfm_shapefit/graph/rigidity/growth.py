@@ -9,41 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.forests import compact, merge_sets, roots
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import group_by
 
 _GROWTH_ROUNDS = 4  # rounds; a later one rarely unites anything, and the pebble game is exact anyway
 
 _GROWTH_WORK = 30  # nodes looked at, per incidence of a set and a node; a bound, the game is exact anyway
-
-
-def compact(label: IntArray) -> IntArray:
-    """Renumber non-negative labels to 0..k-1, keeping their order."""
-    used = np.zeros(int(label.max(initial=-1)) + 1, dtype=np.int64)
-    used[label] = 1
-    return np.asarray((np.cumsum(used) - 1)[label], dtype=np.int64)
-
-
-def roots(parent: IntArray) -> IntArray:
-    """Return the root of each item of a forest: the smallest member of its tree."""
-    while (parent[parent] != parent).any():
-        parent = parent[parent]
-    return parent
-
-
-@inner_kernel
-def merge_sets(parent: IntArray, a: int, b: int) -> None:
-    """Unite the sets of two items under the smaller root, halving the paths to both roots."""
-    while parent[a] != a:
-        parent[a] = parent[parent[a]]
-        a = parent[a]
-    while parent[b] != b:
-        parent[b] = parent[parent[b]]
-        b = parent[b]
-    if a < b:
-        parent[b] = a
-    else:
-        parent[a] = b
 
 
 def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:

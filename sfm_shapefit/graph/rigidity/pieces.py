@@ -7,9 +7,10 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.forests import compact
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.rigidity.game import contract, play
-from sfm_shapefit.graph.rigidity.growth import compact, grow_sets, incidence, triangle_sets
+from sfm_shapefit.graph.rigidity.growth import grow_sets, incidence, triangle_sets
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency, check_edges
 

@@ -11,7 +11,6 @@ from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.certificate import Certificate
-from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import scale_functional
@@ -82,6 +81,8 @@ def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions
     by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
+        from sfm_shapefit.solver.conic import solve_conic
+
         return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
     factor = RigidReduction(
         graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_bytes

@@ -16,9 +16,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.graph.viewgraph import connected_components
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 

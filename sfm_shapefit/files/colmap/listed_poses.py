@@ -1,0 +1,129 @@
+"""Lists of poses, of NeRF's programs or SLAM, as models of a database's images.
+
+The images are found by their names. Lenses are those of the database; where it guessed one, the focal length
+is that of the list, the median of its images, which is a guess too.
+"""
+
+from collections import Counter
+from contextlib import closing
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.intrinsics import find_uncalibrated
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.nerf import read_nerf
+from sfm_shapefit.files.tum import read_tum
+
+_READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum}
+
+
+class ListedModel(NamedTuple):
+    """A model made of a list of poses."""
+
+    reconstruction: pycolmap.Reconstruction
+    guessed: frozenset[int]
+    """Ids of the cameras whose focal lengths are those of the list."""
+
+
+def is_list(source: object) -> bool:
+    """Return whether a source of a model is the file of a list."""
+    return isinstance(source, Path | str) and Path(source).suffix.lower() in _READERS
+
+
+def read_list(file: Path, database: Path | str | None) -> ListedModel:
+    """Return the images of a database with the poses of a list; those that it lacks have none.
+
+    Raises:
+        InputError: if a file cannot be used, or hardly an image is in both.
+    """
+    if not file.is_file():
+        raise InputError(f"{file} does not exist; give a COLMAP folder, transforms.json or a trajectory")
+    poses = _READERS[file.suffix.lower()](file)
+    if database is None:
+        raise InputError(f"{file} has poses but no matches; give the database that has them (database=FILE)")
+    with closing(DatabaseFile(database)) as opened:
+        read = read_images(opened)
+        images, model = read.images, read.reconstruction
+        uncalibrated = find_uncalibrated(opened, images)
+    rows = _find(poses.names, images.names)
+    if np.sum(rows >= 0) < 2:
+        raise InputError(
+            f"{file} and {database} have fewer than two images in common: "
+            f"{poses.names[0] if poses.names else 'none'} in the one, {images.names[0]} in the other"
+        )
+    place = {int(row): k for k, row in enumerate(rows.tolist()) if row >= 0}
+    for row, image_id in enumerate(images.ids.tolist()):
+        frame_id = model.image(image_id).frame_id
+        if row not in place:
+            model.deregister_frame(frame_id)
+            continue
+        turn, center = poses.rotations[place[row]], poses.centers[place[row]]
+        model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ center)
+    lens_of = np.where(rows >= 0, images.lens_of[rows], -1)
+    guessed = {
+        images.lenses[k].id
+        for k in uncalibrated
+        if _set_focal_length(model.camera(images.lenses[k].id), poses.focal_shares[lens_of == k])
+    }
+    return ListedModel(model, frozenset(guessed))
+
+
+def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
+    """Give a camera the median focal length of its images, if any is known, and return whether one is.
+
+    `shares` (n, 2) are of width and height.
+    """
+    across = shares[:, 0][shares[:, 0] > 0.0]
+    if not len(across):
+        return False
+    x = float(np.median(across)) * camera.width
+    down = shares[:, 1][shares[:, 1] > 0.0]
+    y = float(np.median(down)) * camera.height if len(down) else x
+    params, places = camera.params.tolist(), list(camera.focal_length_idxs())
+    for place, length in zip(places, (x, y) if len(places) == 2 else (0.5 * (x + y),), strict=True):
+        params[place] = length
+    camera.params = params
+    return True
+
+
+def _find(listed: tuple[str, ...], names: tuple[str, ...]) -> IntArray:
+    """Return which image (n,) each listed name is of; -1 where none, or not one alone.
+
+    By the name without more leading folders than needed, else without suffix, else by the number that it is.
+    """
+    found = np.full(len(listed), -1)
+    for keys_of in (_tails, _stem, _number):
+        keys = [keys_of(name)[0] for name in names]
+        once = {key for key, count in Counter(keys).items() if count == 1}
+        row_of = {key: row for row, key in enumerate(keys) if key in once}
+        for k in np.flatnonzero(found < 0).tolist():
+            found[k] = next((row_of[key] for key in keys_of(listed[k]) if key in row_of), -1)
+    _, first = np.unique(found, return_index=True)
+    found[np.setdiff1d(np.arange(len(found)), first)] = -1
+    return found
+
+
+def _tails(name: str) -> list[str]:
+    """Return a name, and it without one leading folder after the other."""
+    parts = PurePosixPath(name).parts
+    return ["/".join(parts[k:]) for k in range(len(parts))]
+
+
+def _stem(name: str) -> list[str]:
+    """Return a name without folders and suffix; a number keeps what follows its point."""
+    last = PurePosixPath(name)
+    return [last.name if last.suffix[1:].isdigit() else last.stem]
+
+
+def _number(name: str) -> list[float]:
+    """Return the number that a name is, if it is one."""
+    try:
+        return [float(*_stem(name))]
+    except ValueError:
+        return [np.nan]  # which equals nothing

@@ -1,0 +1,84 @@
+"""Rough rotations: corrected by the matches, wrong ones named, and as little tried as they allow."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_shapefit
+from sfm_shapefit.facts.warnings import rotation_warnings, wrong_rotations
+from sfm_shapefit.pipeline import rough
+from tests.models import posed
+from tests.scenes import COURTYARD
+
+DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
+WRONG = ("0003.jpg", "0011.jpg")
+
+
+@pytest.fixture(scope="module")
+def spoiled():
+    """The truth, rotations 2 degrees off about each axis, two by anything, centers anywhere."""
+    rng = np.random.default_rng(2)
+
+    def change(name, rotation, center):
+        turn = Rotation.from_rotvec(np.radians(2.0) * rng.standard_normal(3))
+        turn = Rotation.from_euler("x", 120, degrees=True) if name in WRONG else turn
+        return turn.as_matrix() @ rotation, rng.standard_normal(3)
+
+    return posed(TRUTH, change)
+
+
+@pytest.fixture(scope="module")
+def found(spoiled):
+    return sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
+
+
+def test_rough_rotations_lead_to_the_model_of_map(found):
+    mapped = sfm_shapefit.map_database(DATABASE).models[0].located
+    errors = [sfm_shapefit.evaluate(one, TRUTH).position.mean for one in (found, mapped)]
+    assert found.reconstruction.num_reg_images() == mapped.reconstruction.num_reg_images()
+    assert errors[0] <= 1.05 * errors[1]
+
+
+def test_what_was_wrong_is_told_per_camera(found):
+    names = [found.images.names[k] for k in wrong_rotations(found.turned_deg).tolist()]
+    assert set(names) == set(WRONG)
+    assert found.warnings[0].startswith("2 given rotations wrong and corrected: ")
+    table = found.table("cameras")
+    turned = dict(zip(table["name"], table["turned_deg"], strict=True))
+    assert all(turned[name] == pytest.approx(120.0, abs=6.0) for name in WRONG)
+    assert 1.0 < np.median(list(turned.values())) < 5.0
+    assert np.isfinite(table["moved"]).all()
+
+
+def test_only_pairs_of_turned_images_are_tried(spoiled, monkeypatch):
+    tried, estimate = [], rough.estimate_relative_rotations
+
+    def count(batch, *args, **known):
+        tried.append(batch.pairs)
+        return estimate(batch, *args, **known)
+
+    monkeypatch.setattr(rough, "estimate_relative_rotations", count)
+    found = sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
+    rows = [found.images.names.index(name) for name in WRONG]
+    pairs = np.concatenate(tried)
+    assert 0 < len(pairs) < len(found.directions.pairs) / 2
+    assert np.isin(pairs, rows).any(axis=1).all()
+
+
+def test_moved_is_not_told_where_the_given_centers_are_no_places(spoiled):
+    flat = posed(spoiled, lambda _, rotation, center: (rotation, 0.0 * center))
+    found = sfm_shapefit.locate(flat, DATABASE, rotations=2.0)
+    assert found.moved is None
+    assert np.isnan(found.table("cameras")["moved"]).all()
+
+
+def test_a_sigma_of_tenths_of_a_degree_and_fixed_images_go_the_usual_way(monkeypatch, tmp_path):
+    monkeypatch.setattr("sfm_shapefit.pipeline.locate.settle_rough", None)
+    sfm_shapefit.locate(TRUTH, DATABASE, rotations=0.2)
+    (tmp_path / "names.txt").write_text("0001.jpg\n0002.jpg\n")
+    sfm_shapefit.locate(TRUTH, DATABASE, rotations=2.0, fix=str(tmp_path / "names.txt"))
+
+
+def test_rotations_without_outliers_are_not_called_wrong():
+    turned = np.abs(np.random.default_rng(0).standard_normal((200, 3))) @ np.ones(3) / np.sqrt(3.0)
+    assert list(rotation_warnings(turned, [str(k) for k in range(200)])) == []
