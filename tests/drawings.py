@@ -176,6 +176,7 @@ def _facts(names):
         num_doubtful_pairs=0,
         loops=(),
         adjustment=None,
+        lens_errors=None,
         rotation_refinement=None,
         bundle_adjustment=None,
         join=None,

@@ -35,16 +35,16 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4490,
+    "adjustment": 4670,
     "base": 2210,
     "cli": 1770,
-    "facts": 3380,
+    "facts": 3400,
     "files": 4750,
-    "graph": 1250,
+    "graph": 1260,
     "judgement": 3290,
     "laplacian": 2080,
     "pairs": 1610,
-    "pipeline": 6340,
+    "pipeline": 6380,
     "placement": 2660,
     "refinement": 2100,
     "report": 1700,

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
 _NOTHING_GIVEN = GivenPoses()
+LensesAtFirst = Literal["wanted", "free", "known"]
 
 
 def adjust_seed(
@@ -56,7 +59,7 @@ def adjust_thinly(
     freedom: Freedom,
     given: GivenPoses = _NOTHING_GIVEN,
     *,
-    thorough: bool = False,
+    lenses: LensesAtFirst = "wanted",
 ) -> Estimate:
     """Adjust the poses of images on few tracks that hold every camera; for poses that may be coarse.
 
@@ -71,8 +74,10 @@ def adjust_thinly(
         freedom: what moves. A lens whose focal length the points leave open gets what was given back, and the
             poses are adjusted again.
         given: what is known of the poses.
-        thorough: whether all points follow where a lens or a rig has changed: a shape bends with a focal
-            length that few points leave a thousandth off. Up to 2,000 frames.
+        lenses: "wanted": they alone are of use, and how well centers are known stays open. "free" or "known":
+            all points follow where a lens or a rig has changed, up to 2,000 frames: a shape bends with a
+            focal length that few points leave a thousandth off; "known" ones, as an adjustment has found
+            them before, are held in the first solve.
 
     Returns:
         The gauge is as from `adjust_seed`.
@@ -82,16 +87,19 @@ def adjust_thinly(
     """
     run = steps.begin(images, read_links(), options, freedom, given)
     if run.frees_more_than_poses:
-        run, last = steps.repeat_with_known_lenses(run, steps.solve_twice_thinly)
-        if thorough and run.frees_more_than_poses and last.num_frames <= MOST_FRAMES:
+        by_all = lenses != "wanted" and len(images.frames.ids) <= MOST_FRAMES
+        solve = partial(steps.solve_twice_thinly, lenses_known=lenses == "known")
+        again = steps.solve_thinly_again
+        run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=lenses == "wanted")
+        if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run)
-        return run.estimate(last, with_sensors=thorough)
+        return run.estimate(last, judged=lenses != "wanted")
     run, last = steps.solve_coarsely(run)
     problem = steps.fine_problem(run)
     if problem is not None:
         run = replace(run, links=None)  # all matches, at the peak of the memory
         run, last = steps.solve_finely(run, problem)
-    return run.estimate(last, with_sensors=thorough)
+    return run.estimate(last, judged=lenses != "wanted")
 
 
 def adjust_placement(
@@ -115,7 +123,8 @@ def adjust_placement(
     """
     run, errors = steps.begin(images, links, options, replace(freedom, pull_rad=np.inf), given), None
     if run.frees_more_than_poses:  # points are found, and rotations judged, with what comes out
-        run, _ = steps.repeat_with_known_lenses(run, steps.solve_twice_thinly)
+        solve, again = steps.solve_twice_thinly, steps.solve_thinly_again
+        run, _ = steps.repeat_with_known_lenses(run, solve, again)
         run = run.moved(run.images.posed(images.frames.rotations, run.images.frames.centers))
     _, _, problem = run.problem_of_all(checked=True)
     decided = replace(run.freedom, pull_rad=freedom.pull_rad)

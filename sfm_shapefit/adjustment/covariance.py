@@ -8,11 +8,14 @@ coordinates of two frames that tell these motions apart: regular, and as sparse 
 
 is the covariance with F^T x = 0 (the S-transformation: Baarda 1973, "S-transformations and criterion
 matrices"; Triggs et al. 2000, section 9). F are the centers' parts of N: the best similarity of the centers
-to the true ones is the identity, as in the gauge of `adjust`. Blocks of K^-1 are selected entries; K^-1 F
-takes one solve for each of the at most seven motions.
+to the true ones is the identity, as in the gauge of `adjust`. Frames that are known far worse than others
+have no part in F: each would lend its own errors to all. Blocks of K^-1 are selected entries; K^-1 F takes
+one solve for each of the at most seven motions.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +36,8 @@ from sfm_shapefit.scene.lens import FOCAL_LENGTHS
 
 # Shares added to the diagonal, tried in turn; what nothing holds becomes large, not singular.
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)
+# Median sizes; a frame of larger standard deviation may not decide the gauge, and rounds in which such leave.
+_LOOSE, _LOOSENING_ROUNDS = 5.0, 20
 _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest; rounding leaves less
 
 
@@ -46,6 +51,8 @@ class FrameCovariances:
     """(n, 3, 3) in rad^2, axes of the camera (the rig); 0 also for held rotations."""
     free_similarities: int
     """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
+    deciding: BoolArray
+    """(n,) frames relative to whose similarity these covariances are."""
     lens_sigmas: FloatArray
     """(l, 8) standard deviations of the OPENCV parameters of each lens; 0 for what is held."""
     sensor_sigmas: FloatArray
@@ -54,7 +61,11 @@ class FrameCovariances:
 
 
 def estimate_covariances(
-    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
+    problem: AdjustmentProblem,
+    options: AdjustmentOptions | None = None,
+    *,
+    deciding: BoolArray | None = None,
+    **overrides: Any,
 ) -> FrameCovariances:
     """Return the covariances of the frames at the minimum that a problem stands at.
 
@@ -64,6 +75,7 @@ def estimate_covariances(
     Args:
         problem: `Adjusted.problem`.
         options: as it was adjusted with.
+        deciding: (n,) frames that decide the gauge; those that are not known far worse than most if None.
         **overrides: single options by name.
 
     Raises:
@@ -72,10 +84,14 @@ def estimate_covariances(
     options = merge_options(options, AdjustmentOptions, overrides)
     system = ground_system(problem, options)
     blocks = system.factor.inverse_blocks()
+    nodes = system.seen_nodes() if deciding is None else system.layout.node_of_frame[deciding]
     if system.free.size:
-        blocks = _transform(blocks, system.factor, system.motions)
+        regauged = partial(_transform, blocks, system.factor, system.motions)
+        if deciding is None:
+            nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", regauged(dual)[:, :3, :3]))
+        blocks = regauged(_dual(system.motions, nodes))
     blocks *= options.noise_px**2
-    return _by_frame(system.layout, blocks, system.unseen, system.free.shape[1])
+    return _by_frame(system.layout, blocks, system.unseen, system.free.shape[1], nodes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,10 +112,36 @@ class GroundedSystem:
     def solve(self, right: FloatArray, *, gauge: bool = True) -> FloatArray:
         """Return Z K^-1 of right sides (N, 6, r); K^-1 alone without the gauge."""
         moved = self.factor.solve(np.ascontiguousarray(right))
-        if gauge and self.free.size:
-            drift = np.einsum("nai,nar->ir", _dual(self.motions), moved)
-            moved = moved - self.motions @ drift
-        return moved
+        if not (gauge and self.free.size):
+            return moved
+        regauged = partial(self._regauge, moved)
+        nodes = self.steady_nodes(lambda dual: np.sum(regauged(dual)[:, :3] ** 2, axis=(1, 2)))
+        return regauged(_dual(self.motions, nodes))
+
+    def _regauge(self, moved: FloatArray, dual: FloatArray) -> FloatArray:
+        """Return moves (N, 6, r) less the motions that a dual reads off them."""
+        return np.asarray(moved - self.motions @ np.einsum("nai,nar->ir", dual, moved))
+
+    def seen_nodes(self) -> IntArray:
+        """Return the nodes of frames that move and are seen."""
+        nodes = self.layout.node_of_frame
+        return np.asarray(nodes[(nodes >= 0) & ~self.unseen])
+
+    def steady_nodes(self, variances_in: Callable[[FloatArray], FloatArray]) -> IntArray:
+        """Return the nodes of frames that are not known far worse than most, in the gauge of themselves.
+
+        Args:
+            variances_in: returns the variance of each node, (N,), in the gauge that a dual reads off.
+        """
+        nodes = self.seen_nodes()
+        least = max(3, len(nodes) // 2)
+        for _ in range(_LOOSENING_ROUNDS):
+            sizes = np.sqrt(np.maximum(variances_in(_dual(self.motions, nodes))[nodes], 0.0))
+            steady = nodes[sizes <= _LOOSE * np.median(sizes)]
+            if len(steady) == len(nodes) or len(steady) < least:
+                break
+            nodes = steady
+        return nodes
 
     def by_frame(self, blocks: FloatArray) -> FloatArray:
         """Put blocks of the nodes (N, 3, 3) in the places of their frames: 0 if fixed, NaN if unseen."""
@@ -179,9 +221,10 @@ def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
                 raise
 
 
-def _transform(blocks: FloatArray, factor: ReducedFactor, motions: FloatArray) -> FloatArray:
+def _transform(
+    blocks: FloatArray, factor: ReducedFactor, motions: FloatArray, dual: FloatArray
+) -> FloatArray:
     """Return the diagonal blocks of Z K^-1 Z^T."""
-    dual = _dual(motions)
     solved = factor.solve(dual)
     middle = np.einsum("nai,naj->ij", dual, solved)
     cross = motions @ solved.transpose(0, 2, 1)
@@ -191,13 +234,13 @@ def _transform(blocks: FloatArray, factor: ReducedFactor, motions: FloatArray) -
     return transformed
 
 
-def _dual(motions: FloatArray) -> FloatArray:
-    """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers."""
-    dual = motions.copy()
-    dual[:, 3:] = 0.0
+def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
+    """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers of some nodes."""
+    dual, own = np.zeros_like(motions), motions[nodes]
+    dual[nodes, :3] = own[:, :3]
     gram = np.einsum("nai,naj->ij", dual, motions)
     if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
-        dual[:, 3:] = motions[:, 3:] * np.sum(motions[:, :3] ** 2) / np.sum(motions[:, 3:] ** 2)
+        dual[nodes, 3:] = own[:, 3:] * np.sum(own[:, :3] ** 2) / np.sum(own[:, 3:] ** 2)
         gram = np.einsum("nai,naj->ij", dual, motions)
     read: FloatArray = dual @ np.linalg.inv(gram)
     return read
@@ -218,7 +261,9 @@ def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> Floa
     return np.asarray((sigmas / values).max(axis=1))
 
 
-def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int) -> FrameCovariances:
+def _by_frame(
+    layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int, deciding: IntArray
+) -> FrameCovariances:
     """Put the blocks of the nodes in the places of their frames."""
     n = len(layout.node_of_frame)
     centers, rotations = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
@@ -230,6 +275,7 @@ def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: i
         centers=centers,
         rotations=rotations,
         free_similarities=num_free,
+        deciding=np.isin(layout.node_of_frame, deciding),
         lens_sigmas=_by_lens(layout, blocks),
         sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
     )

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,17 @@ from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
+
+
+class LensErrors(NamedTuple):
+    """What covariances take errors of the lenses for."""
+
+    score: float
+    """Standard score of smooth errors that all images of a lens share, the largest of all lenses'."""
+    own_px: float
+    """Root of the mean square of the smooth errors of an image of its own; 0 where the lenses fit."""
+    shared_px: float
+    """The same of those that all images of a lens share, the largest of all lenses'."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,6 +37,8 @@ class Estimate:
     covariances: FloatArray | None = None
     """Covariances (i, 3, 3) of the centers, an image of a rig having its frame's, in squared units of the
     images; see `shared_errors`. None where unknown, as for more frames than are worth the time."""
+    lens_errors: LensErrors | None = None
+    """What the covariances take errors of the lenses for; None where they are unknown."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale; None where it is not known, or nothing sets the scale."""
     focal_sigmas: FloatArray

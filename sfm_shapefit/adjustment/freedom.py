@@ -103,6 +103,10 @@ class Freedom:
         distortion = self.distortion & ~(held & ~(self.focal & bends))
         return replace(self, focal=self.focal & ~held, distortion=distortion)
 
+    def without_lenses(self) -> "Freedom":
+        """Return the same with all lenses held."""
+        return replace(self, focal=np.zeros_like(self.focal), distortion=np.zeros_like(self.distortion))
+
     def overrides(self) -> dict[str, Any]:
         """Return the options of an adjustment that moves its lenses."""
         return {

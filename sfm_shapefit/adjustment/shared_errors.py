@@ -37,6 +37,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
+from sfm_shapefit.adjustment.estimate import LensErrors
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -55,9 +56,10 @@ _SAMPLES = 24
 # Smooth field of a doubted lens, in median errors; between what two sets with truth call for, see the header.
 _CALIBRATION_OF_ERROR = 0.45
 _VISIBLE = 0.05  # share of a field's energy left in the residuals; a field of less cannot be read off them
-# Standard deviations beyond noise of the visible part, from which calibration is doubted at all, and fully;
-# three are rare by chance, five are no chance.
-_DOUBT, _CERTAIN = 3.0, 5.0
+_REDUNDANCY = 0.1  # share of the squared noise left in residuals; what leaves less does not tell it
+# Standard scores beyond noise of the visible part, from which calibration is doubted at all, and fully;
+# three are rare by chance, four are no chance even of the largest of eight.
+_DOUBT, _CERTAIN = 3.0, 4.0
 # Lenses that are tested, those of most observations; each takes twenty right sides.
 _MOST_LENSES = 8
 # Observations of a tested lens; ten for each of the twenty coefficients of its fields.
@@ -81,7 +83,11 @@ class CenterErrors:
     """Relative standard deviation of the scale; None where nothing in the problem sets it. From a tenth on,
     the covariances leave errors of the scale out: they are then those of the shape, in whatever scale."""
     evidence: float
-    """By how many standard deviations smooth errors of the lenses exceed noise; the largest of all."""
+    """Standard score of smooth errors of the lenses beyond noise; the largest of all lenses'."""
+
+    def lens_errors(self) -> LensErrors:
+        """Return what the covariances take errors of the lenses for."""
+        return LensErrors(self.evidence, self.calibration_px, float(self.lens_errors_px.max(initial=0.0)))
 
 
 def estimate_center_errors(
@@ -103,7 +109,8 @@ def estimate_center_errors(
     scale = np.inf if options.loss_scale_px is None else options.loss_scale_px
     weights = 1.0 / (1.0 + (errors / scale) ** 2)
     kappa = float(np.sum(weights**2) / np.sum(weights))
-    noise2 = float(np.sum(weights**2 * errors**2) / (2.0 * np.sum(weights)))
+    redundancy = 1.0 - (3.0 * problem.num_points + 6.0 * problem.num_frames) / (2.0 * len(errors))
+    noise2 = float(np.sum(weights**2 * errors**2) / (2.0 * np.sum(weights))) / max(redundancy, _REDUNDANCY)
     # The system is that of K / kappa.
     system = ground_system(problem, replace(options, noise_px=options.noise_px / np.sqrt(kappa)))
     pulls = _Pulls(problem, options, system)
@@ -212,7 +219,7 @@ class _Pulls:
         return by_field, squares
 
     def detect_lens_errors(self, noise2: float) -> tuple[float, FloatArray]:
-        """Return by how much fields of the lenses exceed noise of `noise2` px^2, and the size of each (l,).
+        """Return the score of fields of the lenses beyond noise of `noise2` px^2, and the size of each (l,).
 
         Lenses that few observations see, and those beyond the most used ones, get the mean of the others.
         """
@@ -225,7 +232,7 @@ class _Pulls:
         variances[tested] = [one.variance for one in found]
         return max((one.evidence for one in found), default=0.0), np.sqrt(variances)
 
-    def _detect(self, lens: int, noise2: float) -> "_LensErrors":
+    def _detect(self, lens: int, noise2: float) -> "_SharedErrors":
         """Return what the visible part of the fields of a lens says of them."""
         own = self.problem.lens_of_camera == lens
         count = 2 * self.num_fields
@@ -242,18 +249,17 @@ class _Pulls:
         shares, modes = np.linalg.eigh(0.5 * (visible + visible.T))
         seen = shares > _VISIBLE * np.trace(squares[:count, :count]) / count
         if not seen.any() or noise2 <= 0.0:
-            return _LensErrors(0.0, 0.0)
+            return _SharedErrors(0.0, 0.0)
         amplitudes, variances = (modes.T @ wanted)[seen] / shares[seen], noise2 / shares[seen]
-        excess = float(np.sum(amplitudes**2 / variances) - seen.sum())
-        evidence = excess / np.sqrt(2.0 * seen.sum())
-        return _LensErrors(evidence, _doubt(evidence) * likeliest_variance(amplitudes, variances))
+        evidence = score_of_squares(float(np.sum(amplitudes**2 / variances)), int(seen.sum()))
+        return _SharedErrors(evidence, _doubt(evidence) * likeliest_variance(amplitudes, variances))
 
 
-class _LensErrors(NamedTuple):
+class _SharedErrors(NamedTuple):
     """What the residuals say of smooth errors that all images of a lens share."""
 
     evidence: float
-    """By how many standard deviations what the fields explain exceeds noise."""
+    """Standard score of what the fields explain beyond noise."""
     variance: float
     """Variance of each coefficient of the fields, px^2."""
 
@@ -261,6 +267,16 @@ class _LensErrors(NamedTuple):
 def _doubt(evidence: float) -> float:
     """Return how far lenses are to be doubted, in [0, 1]."""
     return float(np.interp(evidence, [_DOUBT, _CERTAIN], [0.0, 1.0]))
+
+
+def score_of_squares(total: float, count: int) -> float:
+    """Return the standard score that is as rare as a sum of `count` squares of standard normal numbers.
+
+    By the cube root, which is nearly normal (Wilson and Hilferty, "The distribution of chi-square", 1931). A
+    sum of twenty is three standard deviations too large five times as often as a normal number.
+    """
+    variance = 2.0 / (9.0 * count)
+    return float((np.cbrt(total / count) - (1.0 - variance)) / np.sqrt(variance))
 
 
 def likeliest_variance(values: FloatArray, variances: FloatArray) -> float:

@@ -108,7 +108,7 @@ class RefinedIntrinsics:
         focal[lenses], distortion[lenses] = estimate.freedom.focal, estimate.freedom.distortion
         undetermined[lenses] |= estimate.undetermined
         sigmas = self.focal_sigmas.copy()
-        sigmas[lenses] = np.where(estimate.is_refined, estimate.focal_sigmas, sigmas[lenses])
+        sigmas[lenses] = np.where(estimate.is_tried, estimate.focal_sigmas, sigmas[lenses])
         return RefinedIntrinsics(focal, distortion, self.by_view_graph, sigmas, undetermined)
 
     def how(self, lens: int) -> How:

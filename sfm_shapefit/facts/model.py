@@ -113,6 +113,18 @@ class PlacementAdjustment(Record):
         )
 
 
+class LensErrorFacts(Record):
+    """What the standard deviations take smooth errors of the lenses for, by what the residuals say."""
+
+    score: Annotated[
+        float,
+        "Standard score of errors that all images of a lens share, the largest; up to 3 they are noise, "
+        "from 4 on they count in full.",
+    ]
+    own_px: Annotated[float, "Errors of an image of its own, root of the mean square in pixels; 0 if none."]
+    shared_px: Annotated[float, "The same of errors that all images of a lens share."]
+
+
 class RotationRefinement(Record):
     """What the adjustment of the placement changed of the given rotations."""
 
@@ -269,6 +281,9 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     ]
     loops: Annotated[tuple[Loop, ...], "Loops of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
+    lens_errors: Annotated[
+        LensErrorFacts | None, "Null where the standard deviations know of matching noise only."
+    ]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if nothing was adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
     join: Annotated[JoinFacts | None, "Join of a model of `map` beside the largest; else null."]

@@ -22,6 +22,7 @@ from sfm_shapefit.facts.model import (
     EarthDatum,
     EvidenceShares,
     GroupFacts,
+    LensErrorFacts,
     ModelFacts,
     ModelInputs,
     PlacementAdjustment,
@@ -217,6 +218,7 @@ class LocateResult(Written):
             refined_rigs=self.rigs,
             num_doubtful_pairs=len(self.doubtful_pairs),
             adjustment=PlacementAdjustment.of_estimate(self.adjustment),
+            lens_errors=placement.lens_errors and LensErrorFacts(**placement.lens_errors._asdict()),
             rotation_refinement=RotationRefinement.of_turns(self.turned_deg),
             bundle_adjustment=BundleAdjustment.of(self.adjusted),
         )

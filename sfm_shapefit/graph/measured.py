@@ -26,6 +26,9 @@ class Evidence:
     errors: FloatArray | None = None
     """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
     share keypoints (`judgement.correlated_errors`); the pairs' errors are independent if None."""
+    facts_per_match: float = 1.0
+    """Constraints on the cameras that the tracks of the matches give, for each match; see
+    `judgement.correlated_errors`. Variances from independent errors are too small by this factor."""
 
     def part(self, rows: IntArray, nodes: IntArray, num_nodes: int) -> "Evidence":
         """Return the evidence for a graph of some of the edges and nodes, renumbered.
@@ -44,6 +47,7 @@ class Evidence:
             contradicting=pairs[kept],
             contradicting_support=self.contradicting_support[kept],
             errors=None if self.errors is None else self.errors[rows],
+            facts_per_match=self.facts_per_match,
         )
 
 

@@ -11,6 +11,10 @@ and a pair's direction from its inlier matches, theta = Sigma B^T sum (a x b) r 
 covariance Sigma and noise. Random signs have the variance of the noise, and cost no memory: they are the bits
 of a hash of the keypoint (the wild bootstrap in parametric form: Liu 1988; clusters: Cameron et al. 2008).
 
+Where samples would take too much memory, variances are those of independent pairs times the matches for each
+of those constraints (`Evidence.facts_per_match`): on drawn scenes the root of the mean square of errors over
+standard deviations is 1.2 to 2.1 without this factor, 0.8 to 1.2 with it.
+
 The given rotations are taken as exact: their errors leave no trace in the residuals.
 """
 

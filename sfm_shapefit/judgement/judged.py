@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from sfm_shapefit.adjustment.estimate import LensErrors
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
@@ -23,6 +24,8 @@ class Judged(Placement):
     adjusted_covariances: FloatArray | None = None
     """(k, 3, 3) covariances of adjusted centers, squared solver's units; NaN where unknown, None without an
     adjustment."""
+    lens_errors: LensErrors | None = None
+    """What these covariances take errors of the lenses for."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale, where an adjustment knows it."""
 

@@ -131,6 +131,8 @@ def assess(
     propagate_all = _propagate_nodes if groups is None else _propagate_groups
     covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
     leverages[inliers & ~holding] = np.nan
+    if sampled is None and measured.evidence is not None:
+        covariances = covariances / measured.evidence.facts_per_match
     covariances = scale**2 * covariances
     sigmas = standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)

@@ -119,7 +119,12 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
         images.ids[placement.cameras], known.images.ids, assume_unique=True, return_indices=True
     )
     own[rows] = known.covariances[there] / scale**2
-    return replace(placement, adjusted_covariances=own, scale_sigma=known.scale_sigma)
+    return replace(
+        placement,
+        adjusted_covariances=own,
+        lens_errors=known.lens_errors,
+        scale_sigma=known.scale_sigma,
+    )
 
 
 def _measure_again(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.bundle_adjustment import LensesAtFirst, adjust_thinly
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
@@ -37,7 +37,12 @@ class FirstPlacement(NamedTuple):
 
 
 def adjust_first_placement(
-    given: Given, source: MatchSource, options: PlacingOptions, clock: Clock, *, thorough: bool = True
+    given: Given,
+    source: MatchSource,
+    options: PlacingOptions,
+    clock: Clock,
+    *,
+    lenses: LensesAtFirst = "free",
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
@@ -46,7 +51,7 @@ def adjust_first_placement(
         source: at the averaged rotations.
         options: of the run.
         clock: of the run.
-        thorough: as in `adjust_thinly`.
+        lenses: as in `adjust_thinly`.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
@@ -62,7 +67,7 @@ def adjust_first_placement(
     posed = posed_part(stand.place())
     links = partial(stand.read_links, posed, clock.advance)
     freedom = stand.freedom.of(posed.frames, posed.lenses)
-    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, thorough=thorough)
+    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, lenses=lenses)
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(images.num_images), posed.rows)
@@ -71,14 +76,19 @@ def adjust_first_placement(
 
 
 def start_from_first(
-    given: Given, source: MatchSource, options: PlacingOptions, clock: Clock
+    given: Given,
+    source: MatchSource,
+    options: PlacingOptions,
+    clock: Clock,
+    *,
+    lenses: LensesAtFirst = "free",
 ) -> tuple[Given, MatchSource, FirstPlacement]:
     """Return what is known of images, and their matches, with the rotations and lenses of a first placement.
 
     Args and errors as of `adjust_first_placement`.
     """
     with clock("first placement"):
-        first = adjust_first_placement(given, source, options, clock)
+        first = adjust_first_placement(given, source, options, clock, lenses=lenses)
     images, adjusted = source.images, first.adjusted
     intrinsics = given.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
     images = images.with_lenses_of(adjusted.images, adjusted.is_tried)

@@ -121,7 +121,7 @@ def measure_run(run: MapRun) -> MeasuredPairs:
     if run.options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
         if differ_in_rays(known, run.images):
-            run = run._replace(images=known)
+            run = run._replace(images=known, lenses_found=True)
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)

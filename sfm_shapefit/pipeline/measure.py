@@ -45,6 +45,8 @@ class Measured:
     errors: list[FloatArray] | None = None
     """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
     where directions count as independent."""
+    facts_per_match: float = 1.0
+    """See `Evidence`."""
 
 
 class Wanted(NamedTuple):
@@ -93,7 +95,12 @@ def measure(
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
         )
-    return Measured(directions=concatenate(parts), tracks=beside.tracks(), errors=beside.errors)
+    return Measured(
+        directions=concatenate(parts),
+        tracks=beside.tracks(),
+        errors=beside.errors,
+        facts_per_match=beside.facts_per_match(),
+    )
 
 
 class _Beside:
@@ -103,6 +110,9 @@ class _Beside:
         view = source.view
         self._threshold_px, self._num_usable = threshold_px, 0
         self.errors: list[FloatArray] | None = [] if wanted.errors else None
+        self._begins = np.append(0, np.cumsum(view.num_keypoints))
+        # Pairs of most keypoints are far below the limit of the type, 65,535.
+        self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
         self._joiner = None
         if wanted.tracks:
             self._joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
@@ -113,6 +123,9 @@ class _Beside:
             self._joiner.add(batch, directions)
         usable = directions.usable()
         self._num_usable += len(usable)
+        for row in usable.tolist():
+            own = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
+            self._num_pairs_of[self._begins[batch.pairs[row]] + own] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None
         if self.errors is not None:
@@ -124,6 +137,12 @@ class _Beside:
                 self._threshold_px,
             )
             self.errors.append(sampled[usable])
+
+    def facts_per_match(self) -> float:
+        """Return what `Evidence` says: a track of k keypoints, each in k - 1 pairs, gives 2 k - 3 facts."""
+        counts = self._num_pairs_of[self._num_pairs_of > 0].astype(np.float64)
+        facts = np.sum((2.0 * counts - 1.0) / (counts + 1.0))
+        return min(1.0, float(facts / max(0.5 * np.sum(counts), 1.0)))
 
     def tracks(self) -> Tracks | None:
         """Return the tracks, if they are wanted."""
@@ -202,5 +221,6 @@ def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
         contradicting=directions.pairs[against].reshape(-1, 2),
         contradicting_support=directions.num_matches[against],
         errors=errors,
+        facts_per_match=measured.facts_per_match,
     )
     return replace(graph, evidence=evidence)

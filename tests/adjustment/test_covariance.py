@@ -121,3 +121,28 @@ def test_points_of_one_view_say_nothing():
     np.testing.assert_allclose(
         estimate_covariances(extra, PLAIN).centers, estimate_covariances(problem, PLAIN).centers, rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_frames_that_nearly_nothing_holds_do_not_lend_their_errors_to_the_others(count):
+    problem = ring_problem(np.random.default_rng(1), 12, 200, share=0.8)
+    rows = np.arange(problem.num_observations)
+    seen_by = [rows[problem.cameras_seeing == k] for k in range(count)]
+    dropped = np.concatenate([rows[:0], *(own[4:] for own in seen_by)])
+    few = observed(problem, np.setdiff1d(rows, dropped))
+    without = observed(problem, np.setdiff1d(rows, np.concatenate([rows[:0], *seen_by])))
+    found = estimate_covariances(few, PLAIN)
+    assert found.deciding.tolist() == [k >= count for k in range(12)]
+    sizes, alone = (
+        np.sqrt(np.einsum("naa->n", estimate_covariances(one, PLAIN).centers)) for one in (few, without)
+    )
+    np.testing.assert_allclose(sizes[count:], alone[count:], rtol=0.05)
+    assert (sizes[:count] > 5.0 * sizes[count:].max()).all()
+
+
+def test_centers_relative_to_frames_that_are_told_are_known_relative_to_these():
+    problem, deciding = ring_problem(np.random.default_rng(1), 12, 200, share=0.8), np.arange(12) < 4
+    found = estimate_covariances(problem, PLAIN, deciding=deciding)
+    np.testing.assert_array_equal(found.deciding, deciding)
+    sizes = np.einsum("naa->n", found.centers)
+    assert sizes[deciding].max() < sizes[~deciding].min()

@@ -47,3 +47,18 @@ def test_errors_of_cameras_through_lenses_that_were_free_are_as_large_as_is_said
     errors = np.linalg.norm(motion.apply(centers) - right, axis=1)
     sigmas = motion.scale * np.linalg.norm([row.sigma for row in rows], axis=1)
     assert 0.5 < np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.7  # 2.4 with lenses held
+
+
+def test_what_standard_deviations_take_errors_of_lenses_for_is_told():
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    bent = pycolmap.Reconstruction(truth)
+    for camera in bent.cameras.values():
+        camera.params = camera.params * np.where(np.arange(len(camera.params)) < 2, 1.02, 1.0)
+    for model, is_wrong in ((truth, False), (bent, True)):
+        found = sfm_shapefit.locate(model, COURTYARD / "database.db", intrinsics="held")
+        told = found.summary()["lens_errors"]
+        assert (told["score"] > 3.0) == (told["own_px"] > 0.0)
+        assert (told["own_px"] > 0.1) == is_wrong
+        assert (told["shared_px"] > 0.0) == is_wrong
+    alone = sfm_shapefit.locate(truth, COURTYARD / "database.db", adjust="none")
+    assert alone.summary()["lens_errors"] is None

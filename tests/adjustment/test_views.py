@@ -272,6 +272,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
     held = adjusted_thinly(start, tracks, **free)
     assert held.estimate.undetermined.all()
+    assert not held.estimate.is_refined.any()  # nor has it a standard deviation
     assert held.reconstruction.camera(1).params.tolist() == given
 
 

@@ -94,8 +94,10 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     known = intrinsics_in_doubt(every, every, np.array([True, False, False]))
     assert known.may_change
     assert [known.how(k) for k in (0, 1)] == ["view graph", "held"]
-    held = Freedom(focal=every, distortion=every).holding(np.array([False, True, True]), [lens] * 3)
-    after = known.after(estimate_of(held, [0.01, nan, nan], [False, True, True]), np.arange(3))
+    free = Freedom(focal=every, distortion=every)
+    after = known.after(estimate_of(free, [0.02, 0.1, nan], [False, False, False]), np.arange(3))
+    held = free.holding(np.array([False, True, True]), [lens] * 3)
+    after = after.after(estimate_of(held, [0.01, nan, nan], [False, True, True]), np.arange(3))
     # The second adjustment is one of the first and the last lens alone.
     part = held.of(np.arange(0), np.array([0, 2])).holding(np.array([False, True]), [lens] * 2)
     after = after.after(estimate_of(part, [0.005, nan], [False, True]), np.array([0, 2]))
