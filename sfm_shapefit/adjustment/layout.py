@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -216,7 +215,7 @@ def _nodes(
 def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArray]:
     """Return the pack of each lens (l,), -1 if it is held, and the first of its slots there.
 
-    Each lens takes in those that share most points with it, as long as there is room and these are half of
+    Each lens takes in those that share most points with it, as long as there is room and these are a tenth of
     its own: what is apart would else meet in a block.
 
     Args:
@@ -225,6 +224,11 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     """
     packs, first_slots = np.full(len(sizes), -1), np.zeros(len(sizes), np.int64)
     small = np.flatnonzero((sizes > 0) & (2 * sizes <= SLOTS))
+    if len(small) < 2:
+        packs[sizes > 0] = np.arange(np.sum(sizes > 0))
+        return packs, first_slots
+    from scipy.sparse import coo_array  # here, since it takes long to import
+
     row_of = np.full(len(sizes), -1)
     row_of[small] = np.arange(len(small))
     rows = row_of[problem.lens_of_camera[problem.cameras_seeing]]
