@@ -13,7 +13,7 @@ from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_recons
 
 def test_a_fifth_of_wrong_pairs_does_no_harm(drawn_workspace):
     rotations = WorkspaceOptions(model="rotations")
-    workspace = drawn_workspace("courtyard", rotations, corrupted_pair_fraction=0.2)
+    workspace = drawn_workspace("courtyard", rotations, num_images=16, corrupted_pair_fraction=0.2)
     found = locate(workspace / "sparse/0", workspace / "database.db")
     assert found.verdict.grade == "good"
     assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05)
