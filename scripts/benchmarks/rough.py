@@ -113,7 +113,7 @@ def one_run(
 
     wrong = spoil(truth, poses, sigma_deg, seed)
     found, seconds = timed(lambda: sfm_shapefit.locate(poses, database, rotations=sigma_deg, threads=threads))
-    named = {found.images.names[k] for k in wrong_rotations(found.turned_deg).tolist()}
+    named = {found.images.names[k] for k in wrong_rotations(found.turned_deg, sigma_deg).tolist()}
     return {
         "error": sfm_shapefit.evaluate(found, truth).position.mean,
         "images": found.reconstruction.num_reg_images(),

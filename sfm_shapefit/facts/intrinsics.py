@@ -93,11 +93,6 @@ class RefinedIntrinsics:
     undetermined: BoolArray
     """(l,) lenses whose focal length an adjustment has left open."""
 
-    @property
-    def may_change(self) -> bool:
-        """Whether adjustments may change any lens."""
-        return bool(self.focal.any() or self.distortion.any())
-
     def part(self, lenses: IntArray) -> "RefinedIntrinsics":
         """Return those of some lenses."""
         return RefinedIntrinsics(*(getattr(self, one.name)[lenses] for one in fields(self)))

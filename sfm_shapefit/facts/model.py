@@ -142,13 +142,13 @@ class RotationRefinement(Record):
 
     @classmethod
     def of_turns(cls, turned_deg: FloatArray | None) -> Self | None:
-        """Return what is told of turns (n,), exactly 0 where a rotation is kept; None of None."""
+        """Return what is told of turns (n,), 0 where a rotation is kept, NaN where unknown; None of None."""
         if turned_deg is None:
             return None
         changed = turned_deg[turned_deg > 0.0]
         return cls(
             num_updated=len(changed),
-            num_kept=len(turned_deg) - len(changed),
+            num_kept=int(np.sum(turned_deg == 0.0)),
             median_change_deg=float(np.median(changed)) if len(changed) else 0.0,
             max_change_deg=float(changed.max(initial=0.0)),
         )

@@ -91,7 +91,7 @@ class KeyFigures(Record):
         placed = [camera for camera in cameras if camera.placed]
         centers = np.array([camera.center for camera in placed if camera.center])
         extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) else 0.0
-        largest = [max(camera.sigma) for camera in placed if camera.sigma]
+        largest = [max(camera.sigma) for camera in placed if camera.sigma and max(camera.sigma) > 0.0]
         known = [sigma for sigma in largest if math.isfinite(sigma)]
         sigma = float(np.median(known)) if known else math.nan
         error_deg = math.nan if pair_error_deg is None else pair_error_deg

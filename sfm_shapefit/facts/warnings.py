@@ -26,17 +26,27 @@ _GROSS = 4.0  # standard deviations about each axis; of 1,000 rotations, one is 
 _MEDIAN_TURN = 1.538  # standard deviations; median angle of turns that are normal about each axis
 
 
-def wrong_rotations(turned_deg: FloatArray) -> IntArray:
-    """Return the images (k,) that turned (n,) by more than the scatter of most explains, the worst first."""
-    rows = np.flatnonzero(turned_deg > _GROSS / _MEDIAN_TURN * np.median(turned_deg))
+def wrong_rotations(turned_deg: FloatArray, sigma_deg: float) -> IntArray:
+    """Return the images (k,) that turned by more than what was said and the scatter of most explain.
+
+    Args:
+        turned_deg: (n,) angles; NaN where unknown.
+        sigma_deg: how far off rotations were said to be about each axis.
+
+    Returns:
+        Their rows, the worst first.
+    """
+    typical = np.nanmedian(turned_deg) if np.isfinite(turned_deg).any() else 0.0
+    rows = np.flatnonzero(turned_deg > _GROSS * max(typical / _MEDIAN_TURN, sigma_deg))
     return rows[np.argsort(-turned_deg[rows], kind="stable")]
 
 
-def rotation_warnings(turned_deg: FloatArray, names: Sequence[str]) -> Iterator[str]:
-    """Yield which given rotations of `names` (n,) are wrong."""
-    wrong = [f"{names[k]} (turned by {turned_deg[k]:.3g} deg)" for k in wrong_rotations(turned_deg).tolist()]
+def rotation_warnings(turned_deg: FloatArray, names: Sequence[str], sigma_deg: float) -> Iterator[str]:
+    """Yield which given rotations of `names` (n,), said to be off by `sigma_deg`, are wrong."""
+    rows = wrong_rotations(turned_deg, sigma_deg).tolist()
+    wrong = [f"{names[k]} (turned by {turned_deg[k]:.3g} deg)" for k in rows]
     if wrong:
-        most = f"the others are off by {np.median(turned_deg):.2g} deg; see turned_deg in cameras.csv"
+        most = f"the others are off by {np.nanmedian(turned_deg):.2g} deg; see turned_deg in cameras.csv"
         yield f"{counted(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 

@@ -22,6 +22,8 @@ from sfm_shapefit.base.geometry import FLIP_YZ
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.scene.posed_model import Intrinsics, ListedPoses, PosedModelFile
 
+_LEAST_ANGLE_RAD = 1e-3  # radians, angle of view; no lens has so small a one, and none has 0
+
 _MODELS = {
     "SIMPLE_PINHOLE": ("OPENCV", 1, ()),
     "PINHOLE": ("OPENCV", 2, ()),
@@ -80,8 +82,9 @@ def _focal_shares(frame: JsonNode, content: JsonNode) -> tuple[float, float]:
 
     width, height, x, y = (value(key) for key in ("w", "h", "fl_x", "fl_y"))
     across = x / width if width > 0.0 else np.nan
-    if np.isnan(across):
-        across = 0.5 / np.tan(0.5 * value("camera_angle_x"))
+    angle = value("camera_angle_x")
+    if np.isnan(across) and _LEAST_ANGLE_RAD < angle < np.pi:
+        across = 0.5 / np.tan(0.5 * angle)
     return (across, y / height if height > 0.0 else np.nan)
 
 

@@ -54,6 +54,8 @@ def inspect(
     """
     options = merge_options(options, InspectOptions, overrides)
     if isinstance(source, Path | str) and Path(source).is_file():
+        if Path(source).suffix.lower() in (".json", ".tum"):
+            raise InputError(f"{source} is a list of poses; place it with `locate`, and inspect the model")
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         graph = read_graph(source)

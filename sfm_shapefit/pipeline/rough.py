@@ -52,14 +52,19 @@ def settle_rough(
     given = given._replace(pull_rad=np.inf)
     given, source, first = start_from_first(given, source, options, clock)
     found = settle(given, source, options, clock, first)
-    common = mean_rotation_l1(rough.rotations.transpose(0, 2, 1) @ found.images.rotations)
-    turned = turned_deg(rough.rotations @ common, found.images.rotations)
-    return replace(
-        found,
-        turned_deg=turned,
-        moved=_moved(given.images.centers, found.placed.centers),
-        warnings=(*rotation_warnings(turned, rough.names), *found.warnings),
-    )
+    told = _tell_changes(found, rough, given.images)
+    assert told.turned_deg is not None
+    wrong = rotation_warnings(told.turned_deg, rough.names, float(np.degrees(sigma_rad)))
+    further = tuple(_tell_changes(piece, rough, given.images) for piece in found.further)
+    return replace(told, further=further, warnings=(*wrong, *found.warnings))
+
+
+def _tell_changes(found: LocateResult, rough: Images, given: Images) -> LocateResult:
+    """Return a piece with how far its images were turned and moved from where they were given."""
+    there = np.isfinite(found.placed.centers).all(axis=1)
+    common = mean_rotation_l1(rough.rotations[there].transpose(0, 2, 1) @ found.images.rotations[there])
+    turned = np.where(there, turned_deg(rough.rotations @ common, found.images.rotations), np.nan)
+    return replace(found, turned_deg=turned, moved=_moved(given.centers, found.placed.centers))
 
 
 def _moved(given: FloatArray, placed: FloatArray) -> FloatArray | None:

@@ -22,6 +22,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, median_spread
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
@@ -317,7 +318,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     if found.reconstruction.num_points3D() == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
-        yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
+        yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
     yield from prior_warnings(found.prior_angles, stand.directions.pairs, images.names)
     there = np.flatnonzero(images.is_posed)
     yield from rule.check(gauge, there, images.centers[there])

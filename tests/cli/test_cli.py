@@ -543,7 +543,7 @@ def test_a_word_that_a_flag_does_not_take_is_refused_without_words_of_a_library(
 def test_json_in_the_place_of_a_model_or_graph_is_told_what_is_wanted(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text("{}\n")
-    assert "got 1 column; give the text file of a bare graph, or the folder" in run_refused("inspect", path)
+    assert "is a list of poses; place it with `locate`" in run_refused("inspect", path)
     assert "has no key 'frames'; give a transforms.json" in run_refused("locate", path, tmp_path / "out")
 
 

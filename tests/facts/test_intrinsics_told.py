@@ -92,7 +92,7 @@ def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     lens = Lens("SIMPLE_RADIAL", (1000.0, 600.0, 450.0, 0.0))
     every, nan = np.ones(3, bool), np.nan
     known = intrinsics_in_doubt(every, every, np.array([True, False, False]))
-    assert known.may_change
+    assert known.focal.any()
     assert [known.how(k) for k in (0, 1)] == ["view graph", "held"]
     free = Freedom(focal=every, distortion=every)
     after = known.after(estimate_of(free, [0.02, 0.1, nan], [False, False, False]), np.arange(3))

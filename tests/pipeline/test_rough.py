@@ -40,7 +40,7 @@ def test_rough_rotations_lead_to_the_model_of_map(found):
 
 
 def test_what_was_wrong_is_told_per_camera(found):
-    names = [found.images.names[k] for k in wrong_rotations(found.turned_deg).tolist()]
+    names = [found.images.names[k] for k in wrong_rotations(found.turned_deg, 2.0).tolist()]
     assert set(names) == set(WRONG)
     assert found.warnings[0].startswith("2 given rotations wrong and corrected: ")
     table = found.table("cameras")
@@ -80,5 +80,10 @@ def test_a_sigma_of_tenths_of_a_degree_and_fixed_images_go_the_usual_way(monkeyp
 
 
 def test_rotations_without_outliers_are_not_called_wrong():
-    turned = np.abs(np.random.default_rng(0).standard_normal((200, 3))) @ np.ones(3) / np.sqrt(3.0)
-    assert list(rotation_warnings(turned, [str(k) for k in range(200)])) == []
+    turned = np.linalg.norm(np.random.default_rng(0).standard_normal((1000, 100, 3)), axis=2)
+    names = [str(k) for k in range(100)]
+    # Of 1,000 rotations that are normal about each axis one is off by more than four deviations by chance.
+    assert sum(len(wrong_rotations(row, 1.0)) for row in turned) < 2.0 * 1e-3 * turned.size
+    assert list(rotation_warnings(1e-9 * turned[0], names, 1.0)) == []  # less than was said is no error
+    gross = np.append(turned[0, :98], [40.0, np.nan])
+    assert wrong_rotations(gross, 1.0)[0] == 98

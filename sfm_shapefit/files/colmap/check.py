@@ -98,7 +98,7 @@ def model_suffix(folder: Path) -> str:
             refuse_database(folder)
             raise InputError(
                 f"{folder} is a file; give the folder that holds cameras, images and points3D "
-                "(`convert` makes one of OpenSfM's reconstruction.json)"
+                "(`convert` makes one of OpenSfM's reconstruction.json; `locate` takes transforms.json)"
             )
         present = {entry.name for entry in folder.iterdir()}
     except FileNotFoundError:

@@ -33,7 +33,8 @@ class ListedModel(NamedTuple):
 
 def is_list(source: object) -> bool:
     """Return whether a source of a model is the file of a list."""
-    return isinstance(source, Path | str) and Path(source).suffix.lower() in _READERS
+    is_named_so = isinstance(source, Path | str) and Path(source).suffix.lower() in _READERS
+    return is_named_so and not Path(str(source)).is_dir()
 
 
 def read_list(file: Path, database: Path | str | None) -> ListedModel:
@@ -95,10 +96,13 @@ def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
 def _find(listed: tuple[str, ...], names: tuple[str, ...]) -> IntArray:
     """Return which image (n,) each listed name is of; -1 where none, or not one alone.
 
-    By the name without more leading folders than needed, else without suffix, else by the number that it is.
+    By the name without more leading folders than needed, else without suffix, else, where all images have
+    different numbers for names, by the number that it is. The first of two entries of an image counts.
     """
     found = np.full(len(listed), -1)
-    for keys_of in (_tails, _stem, _number):
+    numbers = {_number(name)[0] for name in names}
+    are_numbers = len(numbers) == len(names) and not any(np.isnan(number) for number in numbers)
+    for keys_of in (_tails, _stem, _number) if are_numbers else (_tails, _stem):
         keys = [keys_of(name)[0] for name in names]
         once = {key for key, count in Counter(keys).items() if count == 1}
         row_of = {key: row for row, key in enumerate(keys) if key in once}
