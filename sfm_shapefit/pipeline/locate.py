@@ -38,6 +38,7 @@ from sfm_shapefit.pipeline.rough import settle_rough
 from sfm_shapefit.pipeline.settle import settle
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
+_NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
 
 
 def locate(
@@ -122,6 +123,10 @@ def locate(
         )
         place = partial(settle, options=options, clock=clock)
         sigma_rad = pull_of_rotations(options.rotations)
-        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf and not rigid.fixed.any():
-            place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
+        if sigma_rad is None or not _ROUGH_RAD <= sigma_rad < np.inf:
+            return act(place, told, source, options)
+        if rigid.fixed.any():
+            found = act(place, told, source, options)
+            return replace(found, warnings=(_NOT_CORRECTED, *found.warnings))
+        place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
         return act(place, told, source, options)

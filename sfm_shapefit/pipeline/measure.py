@@ -91,6 +91,8 @@ def measure(
         for batch in source.view.batches(without=without, advance=clock.advance):
             parts.append(estimate_directions(batch, options, clock.threads))
             beside.add(batch, parts[-1])
+    if not parts and without is not None:
+        raise UnsolvableError("no image that is not fixed shares matches with another; match the new images")
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"

@@ -76,7 +76,8 @@ def test_a_sigma_of_tenths_of_a_degree_and_fixed_images_go_the_usual_way(monkeyp
     monkeypatch.setattr("sfm_shapefit.pipeline.locate.settle_rough", None)
     sfm_shapefit.locate(TRUTH, DATABASE, rotations=0.2)
     (tmp_path / "names.txt").write_text("0001.jpg\n0002.jpg\n")
-    sfm_shapefit.locate(TRUTH, DATABASE, rotations=2.0, fix=str(tmp_path / "names.txt"))
+    found = sfm_shapefit.locate(TRUTH, DATABASE, rotations=2.0, fix=str(tmp_path / "names.txt"))
+    assert found.warnings[0].startswith("rough rotations beside fixed images are not corrected")
 
 
 def test_rotations_without_outliers_are_not_called_wrong():
