@@ -21,7 +21,7 @@ from sfm_shapefit.tracks.filter import keypoint_errors_px
 _WITNESSES = 2  # observations of a point that a keypoint matches; one may be as false as its pair
 _FEWEST_FITTING = 15  # keypoints; the six unknowns of a pose fit fewer by chance
 _OUTNUMBERED = 2.0  # fitting keypoints over those that miss; right cameras have far more
-_FITTING_PX = 4.0  # pixels; what misses its point by more does not fit, as COLMAP has it
+FITTING_PX = 4.0  # pixels; what misses its point by more does not fit, as COLMAP has it
 
 
 def are_confirmed(
@@ -64,6 +64,6 @@ def _fit(
     points = points.seen_by(doubted, *matches, least=_WITNESSES)
     own = doubted[points.images]
     frames = images.frame_of[points.images[own]]
-    fits = keypoint_errors_px(points, images, pictures)[own] <= _FITTING_PX
+    fits = keypoint_errors_px(points, images, pictures)[own] <= FITTING_PX
     fitting, missing = (np.bincount(frames[part], minlength=len(images.frames.ids)) for part in (fits, ~fits))
     return np.asarray((fitting >= _FEWEST_FITTING) & (fitting >= _OUTNUMBERED * missing))

@@ -135,13 +135,16 @@ def check_source(
         clock: what it takes is added to its seconds.
         other: for a second opinion.
     """
-    quality, fits = _measure(model, matches, options, clock)
+    with clock("points"):
+        structure = _structure(model)
+        quality = image_quality(*structure[:3])
+    fits = _measure(model, matches, options, clock)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
-    evidence = _question(model, matches, fits, clock)
+    with clock("evidence"):
+        evidence = gather_evidence(matches, fits, structure, clock.threads)
+        if fits is not None and other is not None:
+            evidence = replace(evidence, second=_compare(matches, fits, structure, other))
     cameras = _judge_cameras(model, quality, pairs, evidence)
-    if fits is not None and other is not None:
-        with clock("evidence"):
-            evidence = replace(evidence, second=_compare(model, matches, fits, other))
     verdict = _grade(model, cameras, fits, evidence)
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
@@ -153,32 +156,25 @@ def check_source(
 
 def _measure(
     model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
-) -> tuple[ImageQuality, PairFits | None]:
-    """Return how well points hold the images, and how pairs fit; None where no pair shares matches."""
-    with clock("points"):
-        quality = image_quality(*_structure(model)[:3])
+) -> PairFits | None:
+    """Return how pairs fit where cameras stand; None where no pair shares matches."""
     with clock("directions"):
         try:
-            return quality, fit_pairs(model.images.centers, measure(matches, options, clock).directions)
+            return fit_pairs(model.images.centers, measure(matches, options, clock).directions)
         except UnsolvableError:
-            return quality, None
-
-
-def _question(model: ColmapModel, matches: MatchSource, fits: PairFits | None, clock: Clock) -> ModelEvidence:
-    """Return the evidence against a model that its fit did not use."""
-    with clock("evidence"):
-        return gather_evidence(matches, fits, _structure(model), clock.threads)
+            return None
 
 
 def _compare(
-    model: ColmapModel, matches: MatchSource, fits: PairFits, other: OtherModel
+    matches: MatchSource, fits: PairFits, structure: Structure, other: OtherModel
 ) -> SecondOpinion | None:
     """Return how another model compares; a single camera elsewhere is not, if the pixels confirm it here."""
-    second = compare_models(model.images, fits, *other)
+    images = structure.images
+    second = compare_models(images, fits, *other)
     elsewhere = [] if second is None else [*second.wrong, *second.undecided]
     if second is None or len(elsewhere) != 1:  # several that are wrong together see false points together
         return second
-    sure = ask_pixels(matches, _structure(model), np.isin(np.arange(model.images.num_images), elsewhere))
+    sure = ask_pixels(matches, structure, np.isin(np.arange(images.num_images), elsewhere))
     return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
 
 
@@ -216,8 +212,7 @@ def _judge_cameras(
     degrees = Counter(name for pair in pairs if pair.direction for name in (pair.name1, pair.name2))
     contradicted = {one.camera: one for one in evidence.contradicted}
     rows = []
-    for k, name in enumerate(names):
-        weak = list(_weaknesses(model.images, quality, k))
+    for k, (name, weak) in enumerate(zip(names, _weaknesses(model.images, quality), strict=True)):
         if one := contradicted.get(k):
             weak.append(f"{one.num_against} of its {one.num_pairs} pairs contradict where it stands")
         center = tuple(model.images.centers[k].tolist())
@@ -229,18 +224,25 @@ def _judge_cameras(
     return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
 
 
-def _weaknesses(images: Images, quality: ImageQuality, k: int) -> Iterator[str]:
-    """Yield what is weak about how points hold an image, in words; a frame is held by one of its images."""
-    frame = images.frame_of == images.frame_of[k]
+def _weaknesses(images: Images, quality: ImageQuality) -> Iterator[list[str]]:
+    """Yield what is weak about how points hold each image, in words; a frame is held by one of its images."""
     usual_px = _median(quality.errors_px[np.isfinite(quality.errors_px)].tolist())
-    if len(quality.point_errors_px) == 0:
-        pass  # said of the whole model
-    elif quality.num_points[frame].max() < _FEWEST_POINTS:
-        yield f"it sees {f'only {quality.num_points[k]}' if quality.num_points[k] else 'no'} 3D points"
-    elif quality.coverage[frame].max() < _LEAST_COVERAGE:
-        yield f"its points cover only {quality.coverage[k]:.0%} of the picture"
-    if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
-        yield f"its reprojection error is {quality.errors_px[k]:.1f} px, where {usual_px:.1f} px is usual"
+    num_points, coverage = np.zeros((2, len(images.frames.ids)))
+    np.maximum.at(num_points, images.frame_of, quality.num_points)
+    np.maximum.at(coverage, images.frame_of, quality.coverage)
+    for k, frame in enumerate(images.frame_of.tolist()):
+        weak = []
+        if len(quality.point_errors_px) == 0:
+            pass  # said of the whole model
+        elif num_points[frame] < _FEWEST_POINTS:
+            seen = f"only {quality.num_points[k]}" if quality.num_points[k] else "no"
+            weak.append(f"it sees {seen} 3D points")
+        elif coverage[frame] < _LEAST_COVERAGE:
+            weak.append(f"its points cover only {quality.coverage[k]:.0%} of the picture")
+        if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
+            error_px = quality.errors_px[k]
+            weak.append(f"its reprojection error is {error_px:.1f} px, where {usual_px:.1f} px is usual")
+        yield weak
 
 
 def _grade(

@@ -8,7 +8,7 @@ from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.grade import LEAST_HELD
 from sfm_shapefit.judgement.seams import Cut, Seam, find_seams, tied_by_points
-from sfm_shapefit.judgement.witnesses import are_confirmed
+from sfm_shapefit.judgement.witnesses import FITTING_PX, are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -16,7 +16,6 @@ from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
-_FITTING_PX = 4.0  # pixels, largest reprojection error of a point that ties; COLMAP keeps as large ones
 _MOST_POINTS = 40  # points per image that are asked what they hold; a few of each suffice
 
 
@@ -53,7 +52,7 @@ def gather_evidence(
     held = fits.held(images)
     cuts, num_held = fits.cuts(held), int(held.sum())
     if cuts or num_held < LEAST_HELD * images.num_images:
-        fitting = keypoint_errors_px(points, images, pictures) <= _FITTING_PX
+        fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
         cuts = tuple(tied_by_points(cut, points, fitting, images.num_images) for cut in cuts)
         if num_held < LEAST_HELD * images.num_images:
             step = max(points.num_points // (_MOST_POINTS * images.num_images), 1)

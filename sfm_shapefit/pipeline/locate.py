@@ -122,7 +122,7 @@ def locate(
             known=known,
         )
         place = partial(settle, options=options, clock=clock)
-        sigma_rad = pull_of_rotations(options.rotations)
+        sigma_rad = told.pull_rad
         if sigma_rad is None or not _ROUGH_RAD <= sigma_rad < np.inf:
             return act(place, told, source, options)
         if rigid.fixed.any():
