@@ -30,27 +30,27 @@ FLOORS = [
 ]
 # Arrows that still go up or across, type checking counted. The list may only become shorter.
 STILL_UPWARD: set[tuple[str, str]] = set()
-MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only become shorter
+MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only become shorter
 
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4680,
-    "base": 2210,
+    "adjustment": 4670,
+    "base": 2290,
     "cli": 1770,
     "facts": 3400,
-    "files": 4760,
-    "graph": 1260,
+    "files": 4740,
+    "graph": 1340,
     "judgement": 3290,
-    "laplacian": 2080,
-    "pairs": 1610,
-    "pipeline": 6390,
+    "laplacian": 2050,
+    "pairs": 1530,
+    "pipeline": 6370,
     "placement": 2660,
     "refinement": 2100,
-    "report": 1700,
+    "report": 1680,
     "rotations": 2290,
-    "scene": 2070,
-    "solver": 4360,
+    "scene": 2080,
+    "solver": 4380,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
     "tracks": 1150,

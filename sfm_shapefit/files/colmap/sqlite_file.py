@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from sfm_shapefit.base.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.lines import refuse_irregular_file
+from sfm_shapefit.base.paths import refuse_irregular_file
 
 _SIDECARS = ("-wal", "-journal")
 _WAL_VERSION = 2  # bytes 18 and 19 of the header; they are 2 where the file has a write-ahead log
