@@ -50,6 +50,19 @@ def is_between(value: object, least: int, bound: int) -> bool:
     return isinstance(value, int) and least <= value < bound
 
 
+def database_in(path: Path) -> Path:
+    """Return the database of a folder, which is its database.db; any other path is that of a database.
+
+    Raises:
+        InputError: if the folder has none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / "database.db").is_file():
+        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
+    return path / "database.db"
+
+
 class DatabaseFile:
     """An open database; neither the file nor its folder is changed."""
 
