@@ -210,6 +210,35 @@ def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(
     assert certify(graph, *single).equality_residual < 1e-12
 
 
+def lengths(x):
+    """Norms of the rows."""
+    return np.linalg.norm(x, axis=1)
+
+
+@pytest.mark.parametrize("is_dense", [False, True])
+def test_both_starts_take_their_dual_from_the_residuals_where_they_begin(is_dense):
+    graph, _ = draw_graph(3, n=30, sigma=0.05, weighted=True)
+    problem, iterate, _, step = steps.allocate(graph)
+    started = approach(problem, iterate, step) if is_dense else steps.start_from(problem, problem.c, iterate)
+    assert started
+    residuals = across(differences(iterate.t, graph.edges), graph.directions)
+    assert lengths(iterate.r) == pytest.approx(lengths(residuals), rel=1e-9)
+    shares, along = lengths(iterate.y) / graph.weights, np.sum(iterate.y * iterate.r, axis=1)
+    assert along == pytest.approx(lengths(iterate.y) * lengths(iterate.r), rel=1e-12)  # y_e points along r_e
+    if is_dense:  # smoothed: the longer the residual, the nearer to the surface of the ball
+        assert np.all(np.diff(shares[np.argsort(lengths(residuals))]) >= -1e-12)
+        assert 0.0 < shares.min() < shares.max() < 1.0
+    else:  # one factor for all: the longest touches its ball
+        assert shares == pytest.approx(lengths(residuals) / lengths(residuals).max(), rel=1e-9)
+
+
+def test_what_is_within_a_bound_has_no_larger_entry_and_no_nan():
+    x = np.array([[1.0, -2.0], [0.5, 0.0]])
+    assert steps.is_within(x, 2.0)
+    assert not steps.is_within(x, 1.9)
+    assert not steps.is_within(x * [[1.0, np.nan]], 2.0)
+
+
 @pytest.mark.parametrize("weighted", [False, True])
 def test_on_a_dense_graph_the_start_is_near_the_optimum(weighted):
     graph, _ = draw_graph(5, n=40, p=0.5, q=0.25, weighted=weighted)
