@@ -221,7 +221,8 @@ def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray]
         forces = pulls[start:stop] @ part.transpose(0, 2, 1)
         if start == 0:
             total = np.zeros((n, *forces.shape[1:]))
-        total += adjoint(forces.reshape(len(part), -1), edges[start:stop], n).reshape(total.shape)
+        flat = forces.reshape(len(part), total.shape[1] * total.shape[2])  # a part may be empty
+        total += adjoint(flat, edges[start:stop], n).reshape(total.shape)
         start = stop
     return total
 
