@@ -54,7 +54,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "program": (("solver/program.py", "solver/options.py"), ("solver", "newton")),
     "solve": (("solver/solve.py",), ("solver", "certificate", "splitting")),
     "angular": (("refinement/angular.py",), ("angular",)),
-    "rigs": (("solver/rigs/*.py",), ("rigid_groups",)),
+    "reduction": (("solver/reduction.py", "solver/tied.py"), ("rigid_groups",)),
 }
 """Files of the package, and the names of the tests that are to notice their mutants."""
 LONGEST_TEST_S = 2.0

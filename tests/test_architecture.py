@@ -35,25 +35,25 @@ MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4670,
+    "adjustment": 4690,
     "base": 2290,
     "cli": 1770,
-    "facts": 3400,
+    "facts": 3410,
     "files": 4760,
     "graph": 1340,
-    "judgement": 3290,
-    "laplacian": 2050,
+    "judgement": 3270,
+    "laplacian": 2060,
     "pairs": 1530,
-    "pipeline": 6360,
+    "pipeline": 6380,
     "placement": 2660,
-    "refinement": 2100,
+    "refinement": 2110,
     "report": 1680,
     "rotations": 2290,
     "scene": 2080,
-    "solver": 4380,
+    "solver": 4160,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
-    "tracks": 1150,
+    "tracks": 1130,
 }
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered

@@ -38,10 +38,7 @@ POINTS = {
         "sfm_shapefit.scene.matches:View.between",
         "sfm_shapefit.scene.matches:View.links",
     ),
-    "solves": (
-        "sfm_shapefit.solver.certificate:certify",
-        "sfm_shapefit.solver.rigs.certificate:certify_groups",
-    ),
+    "solves": ("sfm_shapefit.solver.certificate:certify",),
     "assessments": ("sfm_shapefit.judgement.verdicts:assess",),
     "openings": ("sqlite3:connect", "pycolmap:Database.open"),
     "conversions": (

@@ -49,7 +49,7 @@ from sfm_shapefit.adjustment.lens_doubts import covariances_of_free_lenses, cova
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
@@ -133,8 +133,12 @@ class AdjustmentRun:
         poses = views_of(self.images).poses(self.images)
         assert self.links is not None
         if isinstance(self.links, ObservedTracks):
-            return self.links, triangulate_tracks(self.links, poses, limits)
-        return triangulate_matches(self.links, poses, limits, self.options.max_reprojection_error_px)
+            joined, found = self.links, triangulate_tracks(self.links, poses, limits)
+        else:
+            error_px = self.options.max_reprojection_error_px
+            joined, found = triangulate_matches(self.links, poses, limits, error_px)
+        frames = self.images.frame_of[views_of(self.images).images[joined.cameras]]
+        return joined, _without_lone_frames(found, frames, limits.min_length)
 
     def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
         """Return the problem of points that were triangulated from tracks, at the poses of the images."""
@@ -297,6 +301,20 @@ class AdjustmentRun:
 
 
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
+
+
+def _without_lone_frames(found: TriangulatedPoints, frames: IntArray, least: int) -> TriangulatedPoints:
+    """Return points of at least so many observations (m,), of which no frame (m,) has a single one.
+
+    Where it may move, such a frame and its point run into another camera of that point: nothing is missed
+    there, and as near to the camera the point would say more than all others together.
+    """
+    while True:
+        seen = found.points_seen >= 0
+        alone = seen & (np.bincount(frames[seen], minlength=int(frames.max(initial=0)) + 1)[frames] == 1)
+        if not alone.any():
+            return found
+        found = replace(found, points_seen=np.where(alone, -1, found.points_seen)).of_length(least)
 
 
 def begin(

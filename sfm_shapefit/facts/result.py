@@ -178,6 +178,8 @@ class LocateResult(Written):
     rotations saw."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
+    elsewhere: BoolArray | None = None
+    """(n,) images that stand in another model of `map` alone, and are not missing here; None if it is one."""
 
     @cached_property
     def facts(self) -> ModelFacts:
@@ -253,11 +255,12 @@ class LocateResult(Written):
     @cached_property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
+        elsewhere = self.elsewhere
         shares = Shares(
             self.agreeing_observations,
             self.contradicting_observations,
             float(np.mean(self.kept)),
-            float(np.mean(self.placed.is_posed)),
+            float(np.mean(self.placed.is_posed if elsewhere is None else self.placed.is_posed[~elsewhere])),
         )
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
         repeats = tuple(match_warnings(self.directions))[:1]

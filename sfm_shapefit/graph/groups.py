@@ -6,7 +6,8 @@ unit c(b) that its group shares with others, or has alone:
     t_k = f_b(k) + s_c(b(k)) o_k
 
 Unknown are the centers f_b of the groups and s_c, the lengths of the units in the scale of t. So t = A x is
-linear in x = (f, s), and dividing by s_c gives centers in the unit c.
+linear in x = (f, s), and dividing by s_c gives centers in the unit c. x has a row for each group, its f_b,
+and after these one for each unit, (s_c, 0, ..., 0).
 
     rig            a frame is a group; o_k = R_frame^T (center of the sensor in the rig), metric, one unit
     fixed cameras  all of them are one group; o_k = their given centers, in the unit of rigs
@@ -77,24 +78,24 @@ class RigidGroups:
         """Number of units, S."""
         return int(np.max(self.units, initial=0) + 1)
 
-    @property
-    def num_unknowns(self) -> int:
-        """Length of x, B d + S."""
-        return int(self.num_groups * self.offsets.shape[1] + self.num_units)
-
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return f (B, d) and s (S,) of an x = (f, s)."""
-        d = self.offsets.shape[1]
-        return x[: self.num_groups * d].reshape(-1, d), x[self.num_groups * d :]
+        """Return f (B, d) and s (S,) of an x."""
+        return x[: self.num_groups], x[self.num_groups :, 0]
+
+    def stack(self, centers: FloatArray, scales: FloatArray) -> FloatArray:
+        """Return the x (B + S, d) of f (B, d) and s (S,)."""
+        rows = np.zeros((len(scales), self.offsets.shape[1]))
+        rows[:, 0] = scales
+        return np.concatenate([centers, rows])
 
     def expand(self, x: FloatArray) -> FloatArray:
-        """Return A x, the locations (n, d) for x = (f, s)."""
+        """Return A x, the locations (n, d)."""
         centers, scales = self.split(x)
         return np.asarray(centers[self.group_of] + scales[self.units][:, None] * self.offsets)
 
     def reduce(self, g: FloatArray) -> FloatArray:
         """Return A^T g for g (n, d): its sums over groups, and its inner products with offsets by unit."""
-        return np.append(self._sum(g).ravel(), self.along_units(g))
+        return self.stack(self._sum(g), self.along_units(g))
 
     def along_units(self, g: FloatArray) -> FloatArray:
         """Return the inner products (S,) of g (n, d) with the offsets in each unit."""
@@ -112,7 +113,7 @@ class RigidGroups:
         sizes = np.bincount(self.group_of)[:, None]
         s = centered.along_units(locations) / np.where(spreads > 0.0, spreads, np.inf)
         left = self._sum(locations) - s[self.unit_of][:, None] * self._sum(self.offsets)
-        x = np.append((left / sizes).ravel(), s)
+        x = self.stack(left / sizes, s)
         apart = np.linalg.norm(self.expand(x) - locations, axis=1)
         return x, float(apart.max(initial=0.0))
 

@@ -16,6 +16,11 @@ orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
 F is the centroid and the scale of the cameras that are held and stand among the others; one that nearly
 nothing holds would lend its uncertainty to all, and one that stands far off would set the scale alone.
 
+Where nodes move in rigid groups, the unknowns are the centers of these, with the scale of their offsets held:
+it is the unit in which positions are given. H is the Laplacian of the graph of groups, N the translations
+alone, and F^T t the mean of the cameras, or one group that stays where it is. All nodes of a group share its
+covariance.
+
 Directions whose errors are correlated (`correlated_errors`) do not have the covariance A^-1. For them the
 errors are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and
 the standard deviations are those of the samples.
@@ -35,6 +40,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
@@ -80,6 +86,11 @@ class Information(NamedTuple):
     """(m, d, d) P Lambda P with P = I - u u^T, rad^-2: the scale stays exactly free."""
     blocks: FloatArray
     """(m, d, d) the same per length squared: the blocks of the Laplacian H."""
+
+    @property
+    def pulls(self) -> FloatArray:
+        """What an error of each direction pulls its ends by, (m, d, d)."""
+        return np.asarray(self.across / self.lengths[:, None, None])
 
     def ridged(self, share: float) -> FloatArray:
         """Return the blocks with a share of the trace of each added to its diagonal."""
@@ -140,9 +151,56 @@ def propagate(
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
-        pulls = terms.across / terms.lengths[:, None, None]
-        covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
+        right = _right_side(edges, terms.pulls, errors, n)
+        covariances = scatter(_moved(factor, right, *_gauge_pair(locations, gauge)))
     return CameraUncertainty(covariances=covariances, leverages=terms.leverages(inverse, edges), gauge=gauge)
+
+
+class GroupGauge(NamedTuple):
+    """Rigid groups, and what of them is held fixed."""
+
+    groups: RigidGroups
+    share: FloatArray
+    """(B,) not negative, with sum 1: the groups whose weighted mean is held fixed."""
+
+
+def propagate_groups(
+    locations: FloatArray,
+    edges: IntArray,
+    information: FloatArray,
+    gauge: GroupGauge,
+    errors: Iterable[FloatArray] | None = None,
+    max_bytes: int = DEFAULT_FACTOR_BYTES,
+) -> CameraUncertainty | None:
+    """Return the uncertainty of nodes of rigid groups, whose scale is held; the rest is as in `propagate`.
+
+    Args:
+        locations: (n, d) at the solution.
+        edges: (m, 2) pairs that tie the groups, each between two of them.
+        information: (m, d, d) of each direction.
+        gauge: the groups of the nodes, and what of them is held fixed.
+        errors: samples, as in `propagate`.
+        max_bytes: limit of the factor.
+    """
+    groups, share = gauge
+    terms, d = inform(locations, edges, information), locations.shape[1]
+    ends = np.ascontiguousarray(groups.group_of[edges])
+    plan = analyze(groups.num_groups, ends)
+    if plan.num_bytes(d) > max_bytes:
+        return None
+    factor = factorize(plan, terms.ridged(_RIDGES[0]))
+    inverse = selected_inverse(factor, ends)
+    null = np.tile(np.eye(d), (len(share), 1, 1))
+    fixed = share[:, None, None] * null
+    covariances = _in_gauge(factor, inverse, null, fixed)
+    if errors is not None:
+        right = _right_side(ends, terms.pulls, errors, len(share))
+        covariances = scatter(_moved(factor, right, null, fixed))
+    return CameraUncertainty(
+        covariances=covariances[groups.group_of],
+        leverages=terms.leverages(inverse, ends),
+        gauge=share[groups.group_of] > 0.0,
+    )
 
 
 def scatter(samples: FloatArray) -> FloatArray:
@@ -163,15 +221,15 @@ def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray]
         forces = pulls[start:stop] @ part.transpose(0, 2, 1)
         if start == 0:
             total = np.zeros((n, *forces.shape[1:]))
-        total += adjoint(forces.reshape(len(part), -1), edges[start:stop], n).reshape(total.shape)
+        flat = forces.reshape(len(part), total.shape[1] * total.shape[2])  # a part may be empty
+        total += adjoint(flat, edges[start:stop], n).reshape(total.shape)
         start = stop
     return total
 
 
-def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gauge: BoolArray) -> FloatArray:
-    """Return S A^-1 of the right sides (n, d, s), in the gauge of those nodes."""
+def _moved(factor: CholeskyFactor, right: FloatArray, null: FloatArray, fixed: FloatArray) -> FloatArray:
+    """Return S A^-1 of the right sides (n, d, s), in the gauge of N and F."""
     moved = factor.solve(right)
-    null, fixed = _gauge_pair(locations, gauge)
     drift = np.einsum("nak,nas->ks", fixed, moved)
     for a in range(moved.shape[1]):  # axis by axis: the samples are large
         moved[:, a] -= null[:, a] @ drift
@@ -200,7 +258,7 @@ def _fix_gauge(
     gauge = is_camera & _is_near(locations, is_camera)
     least = max(3, int(np.sum(is_camera)) // 2)
     for _ in range(_LOOSENING_ROUNDS):
-        covariances = _in_gauge(factor, inverse, locations, gauge)
+        covariances = _in_gauge(factor, inverse, *_gauge_pair(locations, gauge))
         sizes = np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
         largest = float(sizes[gauge].max())
         if largest <= _LOOSE * median_spread(locations[gauge]):
@@ -220,10 +278,9 @@ def _is_near(locations: FloatArray, is_camera: BoolArray) -> BoolArray:
 
 
 def _in_gauge(
-    factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, gauge: BoolArray
+    factor: CholeskyFactor, inverse: SelectedInverse, null: FloatArray, fixed: FloatArray
 ) -> FloatArray:
-    """Return the diagonal blocks of S A^-1 S^T with centroid and scale of the nodes in `gauge` fixed."""
-    null, fixed = _gauge_pair(locations, gauge)
+    """Return the diagonal blocks of S A^-1 S^T for N and F."""
     product = factor.solve(fixed)  # A^-1 F
     middle = np.einsum("nak,nal->kl", fixed, product)
     cross = null @ product.transpose(0, 2, 1)

@@ -16,14 +16,18 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
 from sfm_shapefit.judgement.trust import LOW_TRUST, PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubts
-from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
+from sfm_shapefit.judgement.uncertainty import (
+    GroupGauge,
+    propagate,
+    propagate_groups,
+    standard_deviations,
+)
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.placement.conditioning import LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
-from sfm_shapefit.solver.rigs.tied import largest_tied
+from sfm_shapefit.solver.tied import largest_tied
 
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _PART = 2_000  # directions whose error samples are worked on at a time; bounds the memory
@@ -252,7 +256,7 @@ def _propagate_groups(
     nodes = np.flatnonzero(inside)
     edges = np.searchsorted(nodes, graph.edges[rows])
     share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
-    samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
+    samples = None if sampled is None else sampled.parts(graph.directions, rows)
     gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum())
     try:
         found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, max_bytes)

@@ -317,7 +317,7 @@ def conjugate_gradients(
     *,
     tol: float = 1e-10,
     max_iterations: int = 500,
-    coupled: bool = False,
+    coupled: bool | int = False,
 ) -> GradientsResult:
     """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
 
@@ -330,9 +330,11 @@ def conjugate_gradients(
         rhs: (n, k); its column means are ignored, for L has no such vectors in its range.
         tol: stop when each residual is at most this, relative to its right-hand side.
         max_iterations: hard limit, reported in `converged`.
-        coupled: the k columns are one vector of an (nk x nk) system, not k separate systems.
+        coupled: the k columns are one vector of an (nk x nk) system, not k separate systems; a number: so
+            many rows, the first, are those of nodes, which constants move.
     """
-    r = rhs - rhs.mean(axis=0)
+    count = coupled if coupled > 1 else len(rhs)
+    r = _centered(rhs, count)
     x, p = np.zeros_like(r), np.zeros_like(r)
     scale = _norms(r, coupled)
     scale = np.where(scale > 0.0, scale, 1.0)
@@ -340,8 +342,7 @@ def conjugate_gradients(
     k, best, least = 0, x, float(np.max(_norms(r, coupled) / scale, initial=0.0))
     largest = least
     while (_norms(r, coupled) > tol * scale).any() and k < max_iterations and largest <= _DIVERGED * least:
-        z = preconditioner.solve(r)
-        z = z - z.mean(axis=0)
+        z = _centered(preconditioner.solve(r), count)
         rho = _products(r, z, coupled)
         p = z + (rho / rho_before if k else 0.0) * p
         q = operator(p)
@@ -354,15 +355,20 @@ def conjugate_gradients(
         largest = float(np.max(_norms(r, coupled) / scale, initial=0.0))
         if largest < least:
             best, least = x, largest
-    return GradientsResult(best - best.mean(axis=0), k, least, bool(least <= tol))
+    return GradientsResult(_centered(best, count), k, least, bool(least <= tol))
 
 
-def _products(a: FloatArray, b: FloatArray, coupled: bool) -> FloatArray:
+def _centered(x: FloatArray, count: int) -> FloatArray:
+    """Return x (n, k) with the mean of its first rows taken from these."""
+    return np.concatenate([x[:count] - x[:count].mean(axis=0), x[count:]])
+
+
+def _products(a: FloatArray, b: FloatArray, coupled: bool | int) -> FloatArray:
     """Return the inner products of the columns, (k,), or of the whole, (1,)."""
     products: FloatArray = np.einsum("ij,ij->j", a, b)
     return products.sum(keepdims=True) if coupled else products
 
 
-def _norms(a: FloatArray, coupled: bool) -> FloatArray:
+def _norms(a: FloatArray, coupled: bool | int) -> FloatArray:
     """Return the norms of the columns, (k,), or of the whole, (1,)."""
     return np.asarray(np.sqrt(_products(a, a, coupled)))

@@ -82,9 +82,12 @@ def _rigid_models(component: MappedModel, least: int) -> Iterator[MappedModel]:
 
     The pairs between them tell no scale, but a join may, and `locate` of one cannot.
     """
-    large = [piece for piece in component.located.further if int(piece.kept.sum()) >= least]
-    rest = tuple(piece for piece in component.located.further if piece not in large)
-    yield replace(component, located=replace(component.located, further=rest))
+    first = component.located
+    large = [piece for piece in first.further if int(piece.kept.sum()) >= least]
+    rest = tuple(piece for piece in first.further if piece not in large)
+    there = np.any([piece.placed.is_posed for piece in (first, *large)], axis=0)
+    first, *large = (replace(one, elsewhere=there & ~one.placed.is_posed) for one in (first, *large))
+    yield replace(component, located=replace(first, further=rest))
     for piece in large:
         rows = np.sort(piece.placement.cameras)
         names = tuple(component.names[k] for k in rows.tolist())

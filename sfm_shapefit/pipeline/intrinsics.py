@@ -37,7 +37,7 @@ def settle_intrinsics(
     Raises:
         InputError: if the database cannot be read.
     """
-    guessed = {} if file is None else find_uncalibrated(file, images)
+    guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
     if wanted in ("focal", "all"):
         lenses = [in_doubt(lens, Origin.CALIBRATION) for lens in lenses]
@@ -48,7 +48,7 @@ def settle_intrinsics(
     if file is not None and guessed and wanted != "held":
         by_database = calibrate_view_graph(file, [g.database_id for g in guessed.values()], left_out)
         for k, found in guessed.items():
-            factors[k] = by_database.get(found.database_id, 1.0)
+            factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
     is_free = [lens.origin is not None and lens.is_adjustable and wanted != "held" for lens in lenses]
     by_view_graph = factors != 1.0

@@ -26,8 +26,8 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, is_scaled, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.solver.rigs.solve import refuse_admm
-from sfm_shapefit.solver.rigs.tied import largest_tied
+from sfm_shapefit.solver.solve import refuse_admm
+from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
 _COINCIDENT = 1e-9  # extent of fixed centers over their distance from the origin; less is rounding

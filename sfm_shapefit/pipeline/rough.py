@@ -3,7 +3,8 @@
 Directions need rotations known to tenths of a degree; the relative rotations of pairs do not. Near what rough
 ones say of a pair its matches are fitted without a trial, and what fits is believed. Pairs that fit nothing
 near it are false, unless most matches of a camera say so: that is turned, and its pairs are tried as `map`
-tries all of them. Averaged, the rotations are as good as those of `map`, and go on as they do.
+tries all of them. Averaged, the rotations are as good as those of `map`, and go on as they do. Where the
+first placement finds lenses through which pairs turn otherwise, all of them are tried through these.
 """
 
 from dataclasses import replace
@@ -11,11 +12,12 @@ from functools import partial
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.warnings import rotation_warnings
+from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
     estimate_relative_rotations,
@@ -43,20 +45,33 @@ def settle_rough(
     given: Given, source: MatchSource, options: LocateOptions, clock: Clock, sigma_rad: float
 ) -> LocateResult:
     """Place images whose rotations are known to `sigma_rad` about each axis, but for gross errors."""
-    rough = source.images
+    rough, given = source.images, given._replace(pull_rad=np.inf)
     with clock("relative rotations"):
         relative, believed = measure_near(source, sigma_rad, clock)
-    with clock("rotation averaging"):
-        corrected = average_near(rough, relative.subset(believed), clock.threads)
-    source = replace(source.at(corrected), alone=relative)
-    given = given._replace(pull_rad=np.inf)
-    given, source, first = start_from_first(given, source, options, clock)
+    corrected = _averaged(source, relative, believed, clock)
+    given, corrected, first = start_from_first(given, corrected, options, clock)
+    if differ_in_rays(corrected.images, rough):
+        source = source.at(rough.with_lenses(corrected.images.lenses))
+        with clock("relative rotations"):
+            relative = _try_pairs(source, clock)
+        corrected = _averaged(source, relative, np.ones(len(relative.pairs), dtype=np.bool_), clock)
+        given, corrected, first = start_from_first(given, corrected, options, clock, lenses="known")
+    source = corrected
     found = settle(given, source, options, clock, first)
     told = _tell_changes(found, rough, given.images)
     assert told.turned_deg is not None
     wrong = rotation_warnings(told.turned_deg, rough.names, float(np.degrees(sigma_rad)))
     further = tuple(_tell_changes(piece, rough, given.images) for piece in found.further)
     return replace(told, further=further, warnings=(*wrong, *found.warnings))
+
+
+def _averaged(
+    source: MatchSource, relative: RelativeRotations, believed: BoolArray, clock: Clock
+) -> MatchSource:
+    """Return a source whose rotations are averaged from those pairs that are believed."""
+    with clock("rotation averaging"):
+        images = average_near(source.images, relative.subset(believed), clock.threads)
+    return replace(source.at(images), alone=relative)
 
 
 def _tell_changes(found: LocateResult, rough: Images, given: Images) -> LocateResult:
@@ -97,14 +112,19 @@ def measure_near(source: MatchSource, sigma_rad: float, clock: Clock) -> tuple[R
     fits = refined.are_sound() & (off_deg <= np.degrees(_NEAR * sigma_rad))
     turned = _turned(refined, fits, source.images.num_images)[refined.pairs].any(axis=1)
     kept = np.flatnonzero(~turned)
-    tried = [
-        estimate_relative_rotations(batch, clock.threads, num_pairs=view.num_pairs)
-        for batch in view.batches(LEAST_MATCHES, without=refined.pairs[kept])
-    ]
-    both = concatenate_rotations([refined.subset(kept), *tried])
+    both = concatenate_rotations([refined.subset(kept), _try_pairs(source, clock, refined.pairs[kept])])
     believed = np.append(fits[kept], np.ones(len(both.pairs) - len(kept), dtype=np.bool_))
     order = np.lexsort(both.pairs.T[::-1])
     return both.subset(order), believed[order]
+
+
+def _try_pairs(source: MatchSource, clock: Clock, without: IntArray | None = None) -> RelativeRotations:
+    """Return the relative rotations of pairs by trials, as `map` measures them, but for some of them."""
+    view = source.matches.at(source.images.apart(), source.inputs.left_out)
+    batches = view.batches(LEAST_MATCHES, without=without)
+    return concatenate_rotations(
+        [estimate_relative_rotations(batch, clock.threads, num_pairs=view.num_pairs) for batch in batches]
+    )
 
 
 def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Images:

@@ -1,7 +1,7 @@
 """Pieces in one world: ShapeFit over their scales and places, then all seven unknowns of each by the rays.
 
 With the turn R_g of each piece known, x = s_g R_g c + t_g is linear in its scale and place, so the pieces are
-rigid groups with units of their own (`graph.groups`), and the program is the certified one of `solver.rigs`,
+rigid groups with units of their own (`graph.groups`), and the program is the certified one of `solver`,
 over two kinds of directions:
 
     pairs   from a camera to a camera of another piece
@@ -29,7 +29,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.solve import solve
 
 _MOST_RAYS = 30  # rays from one camera of a pair to the other's points; more tell nothing new
 _LEAST_LENGTH = 1e-6  # share of the median; ends that nearly coincide would have all of the weight
@@ -89,7 +89,7 @@ def solve_pieces(
     pairs = frozen(renumbered.reshape(-1, 2))
     try:
         graph = ViewGraph(len(nodes), pairs, seen, weights)
-        locations = solve_groups(graph, groups, certified=False).locations
+        locations = solve(graph, groups=groups, certified=False).locations
         lengths = np.linalg.norm(differences(locations, pairs), axis=1)
         lengths = np.maximum(lengths, _LEAST_LENGTH * np.median(lengths))
         weights = _halved(np.concatenate([1.0 / sigmas, rays.weights]) / lengths, len(between))
@@ -113,9 +113,9 @@ def solve_pieces(
 def _certified(graph: ViewGraph, groups: RigidGroups) -> SolverResult:
     """Return the solve with its certificate; without one where the pairs are too few for a feasible dual."""
     try:
-        return solve_groups(graph, groups)
+        return solve(graph, groups=groups)
     except UnsolvableError:  # pairs that agree are counted all the same
-        return solve_groups(graph, groups, certified=False)
+        return solve(graph, groups=groups, certified=False)
 
 
 class _Rays(NamedTuple):

@@ -26,9 +26,8 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.solve import refuse_admm, solve_groups
-from sfm_shapefit.solver.rigs.tied import largest_tied
-from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.solve import refuse_admm, solve
+from sfm_shapefit.solver.tied import largest_tied
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
@@ -255,10 +254,7 @@ def _solve_part(
         return None if on_iteration is None else on_iteration(info)
 
     watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
-    if part.groups is not None:
-        solved = solve_groups(part.graph, part.groups, options, watched, certified=how.certified)
-    else:
-        solved = solve(part.graph, options, on_iteration=watched, certified=how.certified)
+    solved = solve(part.graph, options, groups=part.groups, on_iteration=watched, certified=how.certified)
     return solved, tuple(history)
 
 
@@ -315,7 +311,7 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
 def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
     """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
     assert part.groups is not None
-    unit = float(part.groups.fit(locations)[0][-1])
+    unit = float(part.groups.split(part.groups.fit(locations)[0])[1][0])
     size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())
     baseline = float(np.median(np.linalg.norm(differences(locations, part.graph.edges), axis=1)))
     if not unit * size > _LEAST_UNIT * baseline:

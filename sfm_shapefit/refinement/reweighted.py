@@ -84,7 +84,7 @@ def solve_reweighted(
     None too where most directions, weighed as usual, point against it: it has no scale then.
 
     Args:
-        measured: a parallel-rigid piece of nodes that move by themselves.
+        measured: a parallel-rigid piece of nodes, or rigid groups that are tied to one another.
         usual: (n, d) the usual answer.
         options: of the solver.
         refine: refines locations in the angles of a graph's directions.
@@ -101,11 +101,12 @@ def solve_reweighted(
     return found if projected_length(measured.graph, found.locations) > 0.0 else None
 
 
-def can_be_reweighted(graph: ViewGraph) -> bool:
-    """Return whether a graph has so many pairs that a minority of them may determine all nodes."""
-    d = graph.dimension
-    unknowns = d * (graph.num_nodes - 1) - 1
-    return graph.num_nodes >= _FEWEST_NODES and (d - 1) * graph.num_edges >= _LEAST_REDUNDANCY * unknowns
+def can_be_reweighted(measured: MeasuredGraph) -> bool:
+    """Return whether a graph has so many pairs that a minority of them may determine all that moves."""
+    graph, groups = measured.graph, measured.groups
+    d, count = graph.dimension, graph.num_nodes if groups is None else groups.num_groups
+    unknowns = d * (count - 1) - 1
+    return count >= _FEWEST_NODES and (d - 1) * graph.num_edges >= _LEAST_REDUNDANCY * unknowns
 
 
 class _Search:
@@ -119,9 +120,9 @@ class _Search:
 
         None if each of their nodes is where most of its rays meet.
         """
-        graph, best = self._measured.graph, None
+        best = None
         for _ in range(_CONSENSUS_ROUNDS):
-            moved = put_by_consensus(graph, locations, mixture.log_odds, mixture.variances)
+            moved = self._put(locations, mixture.log_odds, mixture.variances)
             if best is None and np.array_equal(moved, locations):
                 return None
             there, least = fit_mixture(self._measured, moved), _more(mixture.evidence)
@@ -144,11 +145,11 @@ class _Search:
         for _ in range(_TRIANGLE_ROUNDS):
             weighted = self._weighted(weights)
             # Unrefined, noise draws the optimum together, and what it says of the pairs is too weak.
-            placed = self._refine(weighted, solve(weighted, self._options).locations).locations
+            placed = self._refine(weighted, self._solve(weighted).locations).locations
             residual = _weighted_median(residual_angles(graph, placed), weights)
             level, factor = float(np.clip(factor * residual, _LEAST_LEVEL_RAD, level)), _LEVEL
             odds, variances = np.full(graph.num_edges, logit(prior)), np.full(graph.num_edges, level**2)
-            moved = put_by_consensus(graph, placed, odds, variances, sweeps=1)
+            moved = self._put(placed, odds, variances, sweeps=1)
             candidates += [(t, fit_mixture(self._measured, t)) for t in (placed, moved)]
             heard = np.clip(log_ratio(residual_angles(graph, moved), variances, graph.dimension), *_HEARD)
             new = expit(triangles.log_odds + odds + heard)
@@ -159,6 +160,16 @@ class _Search:
         best, mixture = max(candidates, key=lambda candidate: candidate[1].evidence)
         return self.climb(best, mixture) or self._place(mixture.posterior)
 
+    def _put(self, t: FloatArray, odds: FloatArray, variances: FloatArray, **how: int) -> FloatArray:
+        """Return the locations by consensus; those of groups, where these lie nearest to them."""
+        groups = self._measured.groups
+        moved = put_by_consensus(self._measured.graph, t, odds, variances, **how)
+        stays = groups is None or np.array_equal(moved, t)
+        return moved if groups is None or stays else groups.expand(groups.fit(moved)[0])
+
+    def _solve(self, graph: ViewGraph) -> SolverResult:
+        return solve(graph, self._options, groups=self._measured.groups)
+
     def _weighted(self, posterior: FloatArray) -> ViewGraph:
         """Return the graph with the weights of a posterior (m,) on top of its own."""
         graph = self._measured.graph
@@ -167,7 +178,7 @@ class _Search:
     def _place(self, posterior: FloatArray) -> Reweighted:
         """Return the certified optimum at the weights of a posterior (m,), refined."""
         graph = self._weighted(posterior)
-        solved = solve(graph, self._options)
+        solved = self._solve(graph)
         refined = self._refine(graph, solved.locations)
         mixture = fit_mixture(self._measured, refined.locations)
         unrefined = fit_mixture(self._measured, solved.locations)

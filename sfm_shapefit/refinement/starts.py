@@ -8,6 +8,7 @@ Whether ShapeFit's optimum can be believed by itself is seen by how far both dis
 over cameras, of the log ratio of their node lengths, which are medians of the lengths of a camera's pairs.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -34,8 +35,7 @@ from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
-from sfm_shapefit.solver.rigs.reduced import RigidReduction
-from sfm_shapefit.solver.rigs.solve import lud_over_groups
+from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 
@@ -43,7 +43,7 @@ COLLAPSED = 0.3
 """Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
 
 _UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
-_LUD_STEPS = 50  # iterations; more change nothing after the refinement
+_LUD_STEPS, _GROUP_LUD_STEPS = 50, 150  # iterations; more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
 _LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
@@ -209,11 +209,11 @@ def _reweight(
 ) -> Reweighted | None:
     """Return the reweighted start where the usual answer explains few pairs and it explains them better."""
     solver, measured = problem.normal_solver, problem.measured
-    if solver is None or measured.groups is not None or options.objective != "auto":
+    if solver is None or options.objective != "auto":
         return None
     if mixture.shares[0] >= POOR_SHARE or not has_second_start(problem.graph):
         return None
-    if not can_be_reweighted(problem.graph):
+    if not can_be_reweighted(measured):
         return None
 
     def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
@@ -250,7 +250,7 @@ def _plan_normal_solver(
     if groups is None:
         return plan_refinement(graph, max_bytes)
     try:
-        return RigidReduction(graph.edges, groups.normalize(), max_bytes=max_bytes)
+        return Reduction.over(graph.edges, groups.normalize(), max_bytes=max_bytes)
     except UnsolvableError:
         return None
 
@@ -260,20 +260,22 @@ def _find_second_start(
 ) -> tuple[LudResult | None, FloatArray | None]:
     """Return LUD's solution after a few steps, which groups have none of, and its locations, if usable."""
     graph, classes, groups = measured.graph, measured.classes, measured.groups
+    if groups is None and not has_second_start(graph):
+        return None, None
     if groups is None:
-        if not has_second_start(graph):
-            return None, None
         certified = certified and graph.num_edges <= _LUD_CERTIFIED_PAIRS
-        weighted = _weight_points(graph, classes)
-        lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
+        weighted, resources = _weight_points(graph, classes), Resources(threads)
+        lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=resources)
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
-    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, OPENING_RAD)
-    candidates = []
+    metric, opening = Metric(None, classes), np.full(classes.max() + 1, OPENING_RAD)
+    rigid, candidates = Resources(factor=Reduction.over(graph.edges, groups.normalize())), []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
-        locations = lud_over_groups(_weight_points(graph, classes, point_weight), groups)
-        if locations is not None and projected_length(graph, locations) > 0.0:
-            candidates.append((robust_cost(graph, locations, metric, opening), locations))
+        weighted = _weight_points(graph, classes, point_weight)
+        with suppress(UnsolvableError):
+            found = solve_lud(weighted, _GROUP_LUD_STEPS, certified=False, resources=rigid).locations
+            if np.isfinite(found).all() and projected_length(graph, found) > 0.0:
+                candidates.append((robust_cost(graph, found, metric, opening), found))
     return None, min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 

@@ -31,6 +31,12 @@ pairs with ||y_e|| < w_e are parallel rigid.) The conditions are the null space 
     w_e P_e  where ||y_e|| < (1 - margin) w_e,      w_e (P_e - y_e y_e^T / ||y_e||^2)  elsewhere,
 
 and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells whether it is regular.
+
+Groups. Where t = A x places rigid groups (`solver.reduction`), the infimum of the Lagrangian is over x, and
+A^T D^T y = lambda A^T c takes the place of the equality: the balance at every camera summed over its group,
+and one equation for the scale of each unit. All else stays, with A^T D^T S D A in place of D^T S D. Fewer
+locations are admitted than without groups, so the bound is at least as high. A pair inside a group says
+nothing of x; it would only shift the objective by a multiple of s. Such pairs take no part, and have dual 0.
 """
 
 from collections.abc import Callable
@@ -41,19 +47,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.jit import array_address, kernel
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import factorize
+from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.dense import blas_of, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
+from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
@@ -63,14 +71,11 @@ _ROUND_REDUCTION = 0.1
 # The rounds end when the excess costs less than this share of the gap; the second share is that where the gap
 # misses what was asked for in any case.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
-RESIDUAL_FLOOR = 0.1
-"""Least residual that the metric takes seriously, relative to the mean one; exact pairs have none."""
-
+# Least residual that the metric takes seriously, relative to the mean one; exact pairs have none.
+_RESIDUAL_FLOOR = 0.1
 _ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away; see above
 _ON_SURFACE = 0.99  # ||y_e|| / w_e; from here on a pair counts as on the surface of its ball
-REPAIRS = 4
-"""Number of repairs: each shrinks the equality residual to the rounding of the previous one."""
-
+_REPAIRS = 4  # repairs; each shrinks the equality residual to the rounding of the previous one
 _CG_STEPS = 500  # conjugate gradient steps; 10 to 60 are needed on all but long chains
 _LARGE, _EDGE_BLOCKS = 200_000, 4  # pairs, and blocks; passes over more pairs run in parallel blocks
 _SEED = 1  # seed of the preconditioner; same input, same answer
@@ -80,16 +85,14 @@ _LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of that residual; rounding
 # to multiply the present excess by the second number: by 4 on boxes, by 1 to 2 on communities.
 _ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
 _UNREPAIRED = 1e-9  # equality residual relative to the largest degree; no bound may rest on a larger one
-STRICT = 1e-3
-"""Relative distance of ||y_e|| from w_e; a pair that is farther inside its ball counts as held by its fit."""
-
-REGULAR = 1e-9
-"""Least pivot of a regular matrix, relative to its diagonal entry; far above rounding."""
-
+# Relative distance of ||y_e|| from w_e; a pair that is farther inside its ball counts as held by its fit.
+_STRICT = 1e-3
+_REGULAR = 1e-9  # least pivot of a regular matrix, relative to its diagonal entry; far above rounding
 _REGULAR_SINGLE = 1e-3  # likewise in single precision; far above the rounding of the factor, n d eps
 _SINGLE_FROM = 450  # unknowns; from here on a float32 factor is tried first, which is faster
 # Pairs and operations; beyond, uniqueness is not examined: the ordering of more pairs alone takes seconds.
 _UNIQUENESS_EDGES, _UNIQUENESS_FLOPS = 500_000, 1e11
+_OFF_GROUPS = 1e-9  # share of the extent; locations off their rigid groups by less are off by rounding
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -103,7 +106,8 @@ class Certificate:
     dual: FloatArray
     """(m, d) the feasible dual point that proves it."""
     equality_residual: float
-    """Largest violation of D^T y = dual_bound * c at a camera, relative to the largest weighted degree."""
+    """Largest violation of D^T y = dual_bound * c at a camera, relative to the largest weighted degree; with
+    groups, of A^T D^T y at a group, or in the equation for a scale with offsets of root mean square 1."""
     unique: bool | None = None
     """True: the dual proves that no other locations are optimal (up to translation and scale, and up to
     the gap). False: it does not prove that. None: not examined."""
@@ -120,30 +124,77 @@ def certify(
     locations: FloatArray,
     dual: FloatArray,
     *,
+    groups: RigidGroups | None = None,
     tol: float = 0.0,
     uniqueness: bool = False,
-    threads: int = 1,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
     Args:
         graph: a connected view graph.
-        locations: (n, d) camera centers, in any scale, with L(T) > 0.
+        locations: (n, d) camera centers, in any scale, with L(T) > 0; with groups, those of rigid groups.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
+        groups: groups of the nodes, if they do not move one by one.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        threads: threads of a repair; the bound does not depend on them.
 
     Raises:
-        InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
-        UnsolvableError: if the dual must be repaired and the graph is not connected.
+        InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0, or
+            are not those of the groups.
+        UnsolvableError: if the dual must be repaired and the graph or its groups are not connected.
     """
+    _refuse_arrays(graph, locations, dual)
     y = np.array(dual, dtype=np.float64, order="C")
-    found = certify_in_place(graph, locations, y, tol, np.inf, Resources(threads))
+    if groups is None:
+        return _certify(graph, locations, y, None, tol, uniqueness=uniqueness)
+    outer = groups.joins(graph.edges)
+    _refuse_groups(groups, locations, outer)
+    between, every = graph.subset(outer), np.zeros_like(y)
+    reduction = Reduction.over(between.edges, groups.normalize())
+    found = _certify(between, locations, y[outer], reduction, tol, uniqueness=uniqueness)
+    every[outer] = found.dual
+    return replace(found, dual=frozen(every))
+
+
+def _certify(
+    graph: ViewGraph,
+    locations: FloatArray,
+    y: FloatArray,
+    reduction: Reduction | None,
+    tol: float,
+    *,
+    uniqueness: bool,
+) -> Certificate:
+    """Return the certificate of y, made feasible in place, for locations of nodes, or of a reduction."""
+    found = certify_in_place(graph, locations, y, tol, np.inf, Resources(factor=reduction))
     assert found is not None, "no gap is above infinity"
     if not uniqueness:
         return found
-    return replace(found, unique=_is_unique(graph, locations - locations.mean(axis=0), found.dual))
+    t = locations - locations.mean(axis=0)
+    return replace(found, unique=_is_unique(graph, t, found.dual, reduction))
+
+
+def _refuse_arrays(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:
+    """Raise InputError for arrays of wrong shapes, or that are not finite."""
+    shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
+    if locations.shape != shapes[0] or dual.shape != shapes[1]:
+        raise InputError(
+            f"locations and dual have shapes {locations.shape} and {dual.shape}; this graph needs "
+            f"{shapes[0]} and {shapes[1]}"
+        )
+    if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
+        raise InputError("locations and dual must be finite to be certified")
+
+
+def _refuse_groups(groups: RigidGroups, locations: FloatArray, outer: BoolArray) -> None:
+    """Raise InputError for groups that the locations (n, d) do not have, or that no pair joins."""
+    if groups.offsets.shape != locations.shape:
+        raise InputError(f"offsets have shapes {groups.offsets.shape}, and locations {locations.shape}")
+    if not outer.any():
+        raise InputError("no pair joins two groups, so there is nothing to certify")
+    apart = groups.fit(locations)[1]
+    if apart > _OFF_GROUPS * float(np.abs(locations).max()):
+        raise InputError(f"the locations are not those of rigid groups: a node is {apart:.1e} off its group")
 
 
 @one_blas_thread()
@@ -152,25 +203,32 @@ def certify_in_place(
 ) -> Certificate | None:
     """Return what `certify` does, with y itself made feasible; None if the gap is above `hopeless`.
 
-    A factor among the resources is a preconditioner, and cannot make the bound wrong. A hopeless gap shows
-    early: on loosely joined communities, where a proof takes as long as hundreds of iterations of a solver,
-    that saves more than half of it.
+    A factor among the resources is a preconditioner, and cannot make the bound wrong; a `Reduction` says over
+    which unknowns it is, and each pair then joins two of its groups. A hopeless gap shows early: on loosely
+    joined communities, where a proof takes as long as hundreds of iterations of a solver, that saves more
+    than half of it.
     """
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
-    value = _checked_objective(graph, locations, t, y)
+    value = objective(graph, t)
+    if not value < np.inf:
+        raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
     n, d, w = graph.num_nodes, graph.dimension, graph.weights
     c, total, degrees = np.zeros((n, d)), np.zeros((n, d)), np.zeros(n)
     worst = _project(graph.edges, graph.directions, w, y, c, total, degrees)
+    x, groups = t, resources.factor.groups if isinstance(resources.factor, Reduction) else None
+    if groups is not None:
+        x, c, total = groups.fit(t)[0], groups.reduce(c), groups.reduce(total)
+        degrees = np.asarray(np.bincount(groups.group_of, degrees))
     degree = float(degrees.max())
-    multiplier = _multiplier(total, c, t)
+    multiplier = _multiplier(total, c, x)
     if _unbalanced(total, c, multiplier) > degree * _exact(value - multiplier / max(1.0, worst)):
         repair = _repair(graph, t, y, resources)
-        gap = _clip_in_rounds(repair, c, t, value, tol, hopeless)
+        gap = _clip_in_rounds(repair, c, x, value, tol, hopeless)
         if gap > hopeless:
             return None
         allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
-        worst = _restore_exactly(repair, c, t, degree * allowed)
-        total = adjoint(y, graph.edges, n)
+        worst = _restore_exactly(repair, c, x, degree * allowed)
+        total = repair.total()
     scale = 1.0 / max(1.0, worst)
     if scale < 1.0:
         with np.errstate(invalid="ignore"):  # sums that overflowed prove nothing below
@@ -188,9 +246,9 @@ def certify_in_place(
     )
 
 
-def _multiplier(total: FloatArray, c: FloatArray, t: FloatArray) -> float:
-    """Return lambda = <y, D T> / <c, T> from total = D^T y."""
-    return float(np.vdot(total, t) / np.vdot(c, t))
+def _multiplier(total: FloatArray, c: FloatArray, x: FloatArray) -> float:
+    """Return lambda = <y, D A x> / <A^T c, x> from total = A^T D^T y, c being reduced too."""
+    return float(np.vdot(total, x) / np.vdot(c, x))
 
 
 @kernel
@@ -236,17 +294,26 @@ class _Repair(NamedTuple):
     workers: Workers
     parts: FloatArray
     """(blocks, n, d) scratch: the sums of each block of pairs."""
+    groups: RigidGroups | None
 
     def product(self, x: FloatArray) -> FloatArray:
-        """Return D^T S D x; the blocks, and so the sums, are the same for any number of threads."""
-        blocks = len(self.parts)
+        """Return A^T D^T S D A x; the blocks, and so the sums, are the same for any number of threads."""
+        blocks, t = len(self.parts), x if self.groups is None else self.groups.expand(x)
         cuts = [len(self.metric.w) * k // blocks for k in range(blocks + 1)]
 
         def job(k: int) -> Callable[[], object]:
-            return lambda: _apply(self.metric, cuts[k], cuts[k + 1], x, self.parts[k])
+            return lambda: _apply(self.metric, cuts[k], cuts[k + 1], t, self.parts[k])
 
         self.workers.run([job(k) for k in range(blocks)])
-        return np.asarray(self.parts.sum(axis=0))
+        return self.reduce(np.asarray(self.parts.sum(axis=0)))
+
+    def reduce(self, g: FloatArray) -> FloatArray:
+        """Return A^T g, for g (n, d)."""
+        return g if self.groups is None else self.groups.reduce(g)
+
+    def total(self) -> FloatArray:
+        """Return A^T D^T y."""
+        return self.reduce(adjoint(self.metric.y, self.metric.edges, self.parts.shape[1]))
 
 
 def _repair(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources) -> _Repair:
@@ -256,26 +323,27 @@ def _repair(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources
     normal, axes = np.zeros(graph.num_edges, np.float32), tuple(range(graph.dimension))
     metric = _Metric(edges, v, graph.weights, stiffness, y, normal, axes)
     blocks = _EDGE_BLOCKS if graph.num_edges >= _LARGE else 1
-    precondition = _preconditioner(graph, stiffness, resources)
-    return _Repair(metric, precondition, Workers(resources.threads), np.empty((blocks, *t.shape)))
+    precondition, workers = _preconditioner(graph, stiffness, resources), Workers(resources.threads)
+    groups = resources.factor.groups if isinstance(resources.factor, Reduction) else None
+    return _Repair(metric, precondition, workers, np.empty((blocks, *t.shape)), groups)
 
 
 def _clip_in_rounds(
-    repair: _Repair, c: FloatArray, t: FloatArray, value: float, tol: float, hopeless: float
+    repair: _Repair, c: FloatArray, x: FloatArray, value: float, tol: float, hopeless: float
 ) -> float:
     """Clip y and restore the equality roughly, in turns; return about the gap that the dual proves.
 
-    The rounds end when the excess costs little of the gap to `value`, the objective at t; somewhat below the
+    The rounds end when the excess costs little of the gap to `value`, the objective at x; somewhat below the
     gap `tol` in any case; and above `hopeless`, for from the second clipping on lambda hardly rises again.
     """
     gap = value
     for k in range(_ROUNDS):
         _clip(repair.metric)
-        multiplier, violation = _violation(repair.metric, c, t)
+        multiplier, violation = _violation(repair, c, x)
         if k > 0 and value - multiplier > hopeless:
             return value - multiplier
         worst = _restore(repair, violation, _ROUND_REDUCTION)
-        multiplier = _violation(repair.metric, c, t)[0]
+        multiplier = _violation(repair, c, x)[0]
         gap = value - multiplier / max(1.0, worst)
         expected = value - multiplier / max(1.0, 1.0 + _EXCESS_GROWTH * (worst - 1.0))
         share = _NEGLIGIBLE_MISSED if 0.0 < tol < value - multiplier else _NEGLIGIBLE
@@ -284,7 +352,7 @@ def _clip_in_rounds(
     return gap
 
 
-def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: float) -> float:
+def _restore_exactly(repair: _Repair, c: FloatArray, x: FloatArray, allowed: float) -> float:
     """Move y to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e.
 
     The metric is H_e P_e here, with which the conjugate gradients need half of the steps.
@@ -292,29 +360,31 @@ def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: flo
     repair.metric.normal[:] = 0.0
     fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
     worst = 1.0
-    for _ in range(REPAIRS):
-        violation = _violation(repair.metric, c, t)[1]
+    for _ in range(_REPAIRS):
+        violation = _violation(repair, c, x)[1]
         reduction = fine / max(float(np.linalg.norm(violation)), fine)
         worst = _restore(repair, violation, reduction)
-        if _unbalanced(_violation(repair.metric, c, t)[1], c, 0.0) <= allowed:
+        if _unbalanced(_violation(repair, c, x)[1], c, 0.0) <= allowed:
             break
     return worst
 
 
-def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, FloatArray]:
-    """Return lambda and D^T y - lambda c, (n, d)."""
-    total = adjoint(metric.y, metric.edges, len(c))
-    multiplier = _multiplier(total, c, t)
+def _violation(repair: _Repair, c: FloatArray, x: FloatArray) -> tuple[float, FloatArray]:
+    """Return lambda and A^T D^T y - lambda A^T c, in the shape of x; c is reduced."""
+    total = repair.total()
+    multiplier = _multiplier(total, c, x)
     return multiplier, total - multiplier * c
 
 
 def _restore(repair: _Repair, violation: FloatArray, tol: float) -> float:
     """Move y by S D h so that `violation` shrinks to `tol` times itself; return max_e ||y_e|| / w_e."""
     product, precondition, tol = repair.product, repair.precondition, min(tol, 0.5)
+    coupled = True if repair.groups is None else repair.groups.num_groups
     found = conjugate_gradients(
-        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled=True
+        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled=coupled
     )
-    return float(_move(repair.metric, found.x))
+    h = found.x if repair.groups is None else repair.groups.expand(found.x)
+    return float(_move(repair.metric, h))
 
 
 def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -324,7 +394,7 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
     mean = float(np.vdot(graph.weights, residuals) / graph.weights.sum())
     if not mean > 0.0:
         return graph.weights
-    np.maximum(residuals, RESIDUAL_FLOOR * mean, out=residuals)
+    np.maximum(residuals, _RESIDUAL_FLOOR * mean, out=residuals)
     np.divide(graph.weights, residuals, out=residuals)  # in place: on large graphs memory is short here
     residuals *= mean
     return residuals
@@ -332,9 +402,7 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Resources) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
-    if (
-        resources.factor is None
-    ):  # whoever has a factor has looked, and on large graphs the look takes much memory
+    if resources.factor is None:  # who has one has looked, and on large graphs the look takes much memory
         components = int(graph.components().max()) + 1
         if components > 1:
             raise UnsolvableError(
@@ -343,10 +411,25 @@ def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Re
     factor = laplacian_factor(graph, resources)
     try:
         factor.refactor(stiffness)
-    except UnsolvableError:  # connected, but too long for the precision of the factor
+    except UnsolvableError as error:  # connected, but too long for the precision of the factor
+        if isinstance(factor, Reduction):
+            message = "the dual cannot be repaired: the pairs do not determine the groups"
+            raise UnsolvableError(message) from error
         neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
         return approximate_cholesky(neighbors, stiffness, _SEED)
+    if isinstance(factor, Reduction):
+        return _OverGroups(factor)
     return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
+
+
+class _OverGroups(NamedTuple):
+    """A preconditioner of equations for x."""
+
+    reduction: Reduction
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Return the x of a reduced right-hand side."""
+        return self.reduction.solve_reduced(rhs)
 
 
 @kernel
@@ -443,32 +526,35 @@ def _move(metric: Any, h: Any) -> float:
     return worst
 
 
-def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
+def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduction | None) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
     n, d, v = graph.num_nodes, graph.dimension, graph.directions
     order = cache(lambda: best_order(adjacency(n, graph.edges)))
-    is_dense = prefers_dense_factor(graph, lambda: order().flops * d**3)
-    if not is_dense and order().flops * d**3 > _UNIQUENESS_FLOPS:
+    is_dense = reduction is None and prefers_dense_factor(graph, lambda: order().flops * d**3)
+    if reduction is None and not is_dense and order().flops * d**3 > _UNIQUENESS_FLOPS:
         return None
     longest = int(np.argmax(along(differences(t, graph.edges), v)))
     blocks = np.empty((graph.num_edges, d, d))
     _set_conditions(v, graph.weights, y, longest, blocks)
     if is_dense:
         return _is_regular_dense(graph, blocks)
-    symbolic = plan_factorization(adjacency(n, graph.edges), graph.edges, order())
+    if reduction is None:
+        plan = plan_factorization(adjacency(n, graph.edges), graph.edges, order())
+        reduction = Reduction(allocate_factor(plan, d))
     try:
-        return factorize(symbolic, blocks).smallest_pivot > REGULAR
+        reduction.refactor(blocks)
     except UnsolvableError:
         return False
+    return reduction.smallest_pivot > _REGULAR
 
 
 def _is_regular_dense(graph: ViewGraph, blocks: FloatArray) -> bool:
     """Return whether the Laplacian of the blocks is regular, by a dense factor of it."""
     n, d = graph.num_nodes, graph.dimension
     diagonal = np.zeros((n, d, d))
-    for dtype, regular in ((np.float32, _REGULAR_SINGLE), (np.float64, REGULAR)):
+    for dtype, regular in ((np.float32, _REGULAR_SINGLE), (np.float64, _REGULAR)):
         if n * d >= _SINGLE_FROM or dtype is np.float64:
             matrix = np.zeros((n * d) ** 2, dtype)
             if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(dtype)) > regular:
@@ -484,7 +570,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
         square = 0.0
         for k in range(d):
             square += y[e, k] ** 2
-        bend = w[e] / square if np.sqrt(square) >= (1.0 - STRICT) * w[e] else 0.0
+        bend = w[e] / square if np.sqrt(square) >= (1.0 - _STRICT) * w[e] else 0.0
         for k in range(d):
             for q in range(d):
                 x = w[e] if k == q else 0.0
@@ -529,19 +615,3 @@ def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any)
         for k in range(d):
             least = min(least, matrix[(i * d + k) * (order + 1)] ** 2 / diagonal[i, k, k])
     return least
-
-
-def _checked_objective(graph: ViewGraph, locations: FloatArray, t: FloatArray, dual: FloatArray) -> float:
-    """Return the objective at the locations, t when centered, or raise InputError."""
-    shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
-    if locations.shape != shapes[0] or dual.shape != shapes[1]:
-        raise InputError(
-            f"locations and dual have shapes {locations.shape} and {dual.shape}; this graph needs "
-            f"{shapes[0]} and {shapes[1]}"
-        )
-    if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
-        raise InputError("locations and dual must be finite to be certified")
-    value = objective(graph, t)
-    if not value < np.inf:
-        raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
-    return value

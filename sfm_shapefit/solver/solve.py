@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
 from sfm_shapefit.base.blas_threads import one_blas_thread
-from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -21,12 +23,15 @@ from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
 from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
+from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 
-_DIRECTIONS_CANCEL = 1e-9  # c relative to the sum of weights; smaller, the scale constraint says nothing
+# c relative to the sum of weights, of nodes and of groups; smaller, the scale constraint says nothing
+_DIRECTIONS_CANCEL, _DIRECTIONS_CANCEL_AT_GROUPS = 1e-9, 1e-12
 _LARGEST_RESIDUAL = 1e-9  # violation of the dual's equality; with more a bound is not called rigorous
 _ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 _LARGEST_NEWTON_FLOPS = 4e9  # operations of one block factorization; from here on splitting is faster
@@ -56,11 +61,12 @@ def solve(
     graph: ViewGraph,
     options: SolverOptions | None = None,
     *,
+    groups: RigidGroups | None = None,
     on_iteration: OnIteration | None = None,
     certified: bool = True,
     **overrides: Any,
 ) -> SolverResult:
-    """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
+    """Solve ShapeFit on a parallel-rigid view graph, or over rigid groups, with a certificate of optimality.
 
         graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
         result = solve(graph)
@@ -71,6 +77,8 @@ def solve(
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
         options: solver settings, see `help(SolverOptions)`; defaults if None.
+        groups: groups of the nodes, tied to one another by the pairs between them, if nodes do not move one
+            by one. Pairs inside a group take no part, and have dual 0; the methods are "newton" and "conic".
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
         certified: False proves nothing of the locations, for those that are only a start.
         **overrides: single options by name: `solve(graph, tol=1e-6)`.
@@ -80,41 +88,39 @@ def solve(
         Not reaching the tolerance is reported in `status`, not raised.
 
     Raises:
+        InputError: if a method is asked for that does not know groups.
         UnsolvableError: if the graph has fewer than two cameras, is not connected, is not parallel rigid,
-            or its directions cancel at every camera (the scale constraint is empty).
+            or its directions cancel at every camera (the scale constraint is empty); with groups, if the
+            pairs do not determine them, or a factor over them would take more than `factor_memory_mb`.
 
     Source: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = merge_options(options, SolverOptions, overrides)
     start = time.perf_counter()
-    _refuse_undetermined(graph)
-    choice, threads = choose_method(graph, options), options.num_threads()
-    prove = partial(certify, graph, tol=options.tol, uniqueness=options.uniqueness, threads=threads)
-    return run_choice(graph, choice, options, on_iteration, prove if certified else None, start)
-
-
-def run_choice(
-    graph: ViewGraph,
-    choice: Choice,
-    options: SolverOptions,
-    on_iteration: OnIteration | None,
-    prove: Callable[[FloatArray, FloatArray], Certificate] | None,
-    start: float,
-) -> SolverResult:
-    """Run the chosen solver and return its answer; the solve began at `start`, by `time.perf_counter()`.
-
-    `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d); None:
-    of none. UnsolvableError if the locations are not finite or point against the directions.
-    """
+    if groups is None:
+        between, outer = graph, None
+        _refuse_undetermined(graph)
+        choice = choose_method(graph, options)
+    else:
+        outer = groups.joins(graph.edges)
+        between, unit = graph.subset(outer), groups.normalize()
+        _refuse_open_groups(between, unit)
+        choice = _choose_over_groups(between, unit, options)
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)
-    run = SolverRun(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
-    locations = normalize_locations(graph, run.locations)
-    if prove is not None:
-        certificate = prove(locations, run.dual)
+    run = SolverRun(*choice.solve(between, options.tol, limit, watch if on_iteration else None))
+    locations = normalize_locations(between, run.locations)
+    if certified:
+        certificate = certify(
+            between, locations, run.dual, groups=groups, tol=options.tol, uniqueness=options.uniqueness
+        )
     else:  # nothing but what always holds
-        value, none = objective(graph, locations), np.zeros_like(run.dual)
+        value, none = objective(between, locations), np.zeros_like(run.dual)
         certificate = Certificate(objective=value, dual_bound=0.0, dual=none, equality_residual=0.0)
+    if outer is not None:
+        dual = np.zeros_like(graph.directions)
+        dual[outer] = certificate.dual
+        certificate = replace(certificate, dual=frozen(dual))
     status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
     if certificate.gap <= options.tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
         status = Status.CONVERGED
@@ -163,6 +169,30 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     return Choice("admm", partial(_split, resources, predict()), f"{predicted}: splitting is faster")
 
 
+def refuse_admm(options: SolverOptions) -> None:
+    """Raise InputError if the solver is asked for that does not know groups."""
+    if options.solver == "admm":
+        raise InputError("rigs and fixed cameras have no solver admm; choose auto, newton or conic")
+
+
+def _choose_over_groups(graph: ViewGraph, groups: RigidGroups, options: SolverOptions) -> Choice:
+    """Return the solver that is asked for, if it knows groups."""
+    refuse_admm(options)
+    by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    reason = by_size if options.solver == "auto" else "asked for"
+    if options.solver == "conic":
+        from sfm_shapefit.solver.conic import solve_conic
+
+        return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
+    threads, max_bytes = options.num_threads(), options.factor_bytes
+    reduction = Reduction.over(graph.edges, groups, threads=threads, max_bytes=max_bytes)
+
+    def newton(graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None) -> tuple[Any, ...]:
+        return solve_newton_reduced(graph, reduction, tol, limit, watch)
+
+    return Choice("newton", newton, reason)
+
+
 def _split(
     resources: Resources,
     prediction: Prediction | None,
@@ -206,3 +236,12 @@ def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
         return None
     neighbors = adjacency(measured.graph.num_nodes, edges)
     return plan_factorization(neighbors, edges, best_order(neighbors))
+
+
+def _refuse_open_groups(between: ViewGraph, unit: RigidGroups) -> None:
+    """Raise UnsolvableError where the pairs between groups say nothing of them."""
+    if not between.num_edges:
+        raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
+    c = unit.reduce(scale_functional(between))
+    if not np.linalg.norm(c) > _DIRECTIONS_CANCEL_AT_GROUPS * between.weights.sum():
+        raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")

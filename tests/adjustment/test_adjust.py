@@ -25,10 +25,12 @@ from sfm_shapefit.adjustment import (
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
+from sfm_shapefit.adjustment.run import _without_lone_frames
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.adjustment.made import LENSES, disturb, look_at, observed, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)
@@ -299,6 +301,18 @@ def test_a_frame_that_was_led_away_from_a_better_pose_is_told_from_those_that_ga
     np.testing.assert_array_equal(
         np.flatnonzero(frames_not_gained(start, replace(found, centers=away), 2.0)), [3]
     )
+
+
+def test_a_frame_that_sees_a_single_point_has_no_part_in_it_and_the_point_stays_where_others_see_it():
+    # Frame 3 sees point 1 alone, which is then left to frame 2, and this with point 2 alone.
+    found = TriangulatedPoints(
+        points=np.eye(3), tracks=np.arange(3), points_seen=np.array([0, 0, 1, 1, 2, 2, 2, -1])
+    )
+    frames = np.array([0, 1, 2, 3, 0, 1, 2, 3])
+    kept = _without_lone_frames(found, frames, 2)
+    assert kept.points_seen.tolist() == [0, 0, -1, -1, 1, 1, -1, -1]
+    assert kept.tracks.tolist() == [0, 2]
+    assert _without_lone_frames(kept, frames, 2) is kept
 
 
 def test_points_of_one_view_do_no_harm():

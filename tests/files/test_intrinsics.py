@@ -84,6 +84,20 @@ def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
     assert images.lenses[0].parameters[0] == 1150.0
 
 
+@pytest.mark.parametrize("listed", [950.0, 1300.0])
+def test_what_a_list_guesses_gives_way_to_what_the_view_graph_knows(tmp_path, listed):
+    path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
+    images = read_from(path, read_images).images
+    guess = with_focal_length(images.lenses[0], listed / 1150.0)
+    images = images.with_lenses([guess])
+    ids = frozenset({guess.id})
+    found, _ = read_from(path, lambda file: settle_intrinsics(images, file, "auto", listed=ids))
+    np.testing.assert_allclose(found.lenses[0].parameters, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
+    edit_database(path, "UPDATE two_view_geometries SET config = 3, F = NULL")  # which then knows nothing
+    found, _ = read_from(path, lambda file: settle_intrinsics(images, file, "auto", listed=ids))
+    assert found.lenses[0].parameters == guess.parameters
+
+
 def test_pairs_without_depth_say_nothing_of_focal_lengths(tmp_path):
     path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
     # Of 16 pairs 4 have depth: five are wanted, and three tenths.

@@ -477,6 +477,8 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     placed = {row.name for model in found.models for row in model.located.cameras if row.placed}
     assert len(placed) == found.num_placed == 8
     assert not found.left_out
+    # The images of the other are not missing in either.
+    assert not any("are placed" in why for one in found.models for why in one.located.verdict.reasons)
     (told,) = found.joins
     assert "1 pair of images cannot tell how large it is and where" in told.reason
     sfm_shapefit.write_result(found, tmp_path / "out")

@@ -1,5 +1,7 @@
 """Rough rotations: corrected by the matches, wrong ones named, and as little tried as they allow."""
 
+import shutil
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,9 +9,11 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.facts.warnings import rotation_warnings, wrong_rotations
 from sfm_shapefit.pipeline import rough
+from sfm_shapefit.pipeline.convert import convert
 from tests.models import posed
-from tests.scenes import COURTYARD
+from tests.scenes import BUNDLED, COURTYARD, edit_database
 
+PHOTOGRAPHED = BUNDLED / "photographed"
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
 WRONG = ("0003.jpg", "0011.jpg")
 
@@ -63,6 +67,29 @@ def test_only_pairs_of_turned_images_are_tried(spoiled, monkeypatch):
     pairs = np.concatenate(tried)
     assert 0 < len(pairs) < len(found.directions.pairs) / 2
     assert np.isin(pairs, rows).any(axis=1).all()
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+def test_lists_with_focal_lengths_off_and_no_distortion_lead_to_the_model_of_map(tmp_path, factor):
+    database, poses = tmp_path / "database.db", tmp_path / "transforms.json"
+    shutil.copyfile(PHOTOGRAPHED / "database.db", database)
+    guess = np.array([1.05 * 480.0, 320.0, 240.0, 0.0, 0.0], dtype="<f8").tobytes().hex()
+    edit_database(database, f"UPDATE cameras SET params = x'{guess}', prior_focal_length = 0")
+    mapped = sfm_shapefit.map_database(database).models[0].located
+    rng = np.random.default_rng(1)
+
+    def change(_name, rotation, _center):
+        turn = Rotation.from_rotvec(np.radians(2.0) * rng.standard_normal(3))
+        return turn.as_matrix() @ rotation, rng.standard_normal(3)
+
+    spoilt = posed(PHOTOGRAPHED / "truth", change)
+    for camera in spoilt.cameras.values():
+        camera.params = [factor * 480.0, 320.0, 240.0, 0.0, 0.0]
+    convert(spoilt, poses)
+    found = sfm_shapefit.locate(poses, database, rotations=2.0)
+    errors = [sfm_shapefit.evaluate(one, PHOTOGRAPHED / "truth").position.mean for one in (found, mapped)]
+    assert found.reconstruction.num_reg_images() == 16
+    assert errors[0] <= 1.01 * errors[1]
 
 
 def test_moved_is_not_told_where_the_given_centers_are_no_places(spoiled):

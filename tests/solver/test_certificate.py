@@ -103,7 +103,7 @@ def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(mon
     assert len(steps) < most
     assert_feasible(graph, found)
     assert best.gap < found.gap <= enough
-    again = certify(graph, split.locations, split.dual, tol=enough, threads=2)
+    again = certify_in_place(graph, split.locations, split.dual.copy(), enough, np.inf, Resources(threads=2))
     assert np.array_equal(again.dual, found.dual)
 
 

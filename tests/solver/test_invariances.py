@@ -10,8 +10,9 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions
-from sfm_shapefit.solver.rigs.solve import lud_over_groups, solve_groups
+from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from tests.problems import outer, rig_problem, shape
 
@@ -32,6 +33,11 @@ def refine(problem):
     return refine_angles(graph, solve(graph).locations, metric, plan_refinement(graph)).locations
 
 
+def lud_over(graph, groups):
+    factor = Resources(factor=Reduction.over(graph.edges, groups.normalize()))
+    return solve_lud(graph, 5000, certified=False, resources=factor).locations
+
+
 METHODS = {
     "newton dense": lambda p: solve_newton_dense(p.graph, 1e-9, 100)[0],
     "newton sparse": lambda p: solve_newton_sparse(p.graph, 1e-9, 100)[0],
@@ -39,9 +45,9 @@ METHODS = {
     "conic": lambda p: solve(p.graph, SolverOptions(solver="conic", tol=1e-9)).locations,
     "lud": lambda p: solve_lud(p.graph, 5000, tol=1e-12, certified=False).locations,
     "angles": refine,
-    "groups, newton": lambda p: solve_groups(p.graph, p.groups, SolverOptions(tol=1e-9)).locations,
-    "groups, conic": lambda p: solve_groups(p.graph, p.groups, SolverOptions(solver="conic")).locations,
-    "groups, lud": lambda p: lud_over_groups(p.graph, p.groups, 5000),
+    "groups, newton": lambda p: solve(p.graph, SolverOptions(tol=1e-9), groups=p.groups).locations,
+    "groups, conic": lambda p: solve(p.graph, SolverOptions(solver="conic"), groups=p.groups).locations,
+    "groups, lud": lambda p: lud_over(p.graph, p.groups),
 }
 
 

@@ -11,17 +11,15 @@ from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
+from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
-from sfm_shapefit.solver.rigs import solve as groups_solve
-from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.reduced import RigidReduction
-from sfm_shapefit.solver.rigs.solve import lud_over_groups, solve_groups
-from sfm_shapefit.solver.rigs.tied import largest_tied
+from sfm_shapefit.solver.reduction import Pin, Reduction, factor_pinned
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
+from sfm_shapefit.solver.tied import largest_tied
 from tests.problems import outer, rig_problem
 
 
@@ -29,10 +27,17 @@ def centered(t):
     return t - t.mean(axis=0)
 
 
+def lud_over(graph, groups, steps=150):
+    """LUD's locations over groups, which its splitting sees through the linear solve alone."""
+    factor = Reduction.over(graph.edges, groups.normalize())
+    return solve_lud(graph, steps, tol=1e-8, certified=False, resources=Resources(factor=factor)).locations
+
+
 def test_reducing_is_the_adjoint_of_expanding_and_fitting_its_inverse():
     groups = rig_problem(0)[1]
     rng = np.random.default_rng(1)
-    x, g = rng.normal(size=groups.num_unknowns), rng.normal(size=groups.offsets.shape)
+    x = groups.stack(rng.normal(size=(groups.num_groups, 3)), rng.normal(size=groups.num_units))
+    g = rng.normal(size=groups.offsets.shape)
     t = groups.expand(x)
     assert np.vdot(t, g) == pytest.approx(np.vdot(x, groups.reduce(g)), rel=1e-13)
     found, apart = groups.fit(t)
@@ -70,7 +75,8 @@ def test_groups_that_make_no_sense_are_refused(labels, offsets, message):
 def written_out(edges, groups, blocks):
     """A^T D^T S D A and A, dense."""
     n, d = groups.offsets.shape
-    expand = np.stack([groups.expand(x).ravel() for x in np.eye(groups.num_unknowns)], axis=1)
+    rows = groups.num_groups + groups.num_units
+    expand = np.stack([groups.expand(x.reshape(rows, d)).ravel() for x in np.eye(rows * d)], axis=1)
     baselines = np.zeros((len(edges), n))
     baselines[np.arange(len(edges)), edges[:, 0]] = 1.0
     baselines[np.arange(len(edges)), edges[:, 1]] -= 1.0
@@ -91,7 +97,7 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     roots = rng.normal(size=(len(edges), 3, 3))
     blocks = np.eye(3) + roots @ roots.transpose(0, 2, 1)
     matrix, expand = written_out(edges, unit, blocks)
-    factor = RigidReduction(edges, unit)
+    factor = Reduction.over(edges, unit)
     factor.refactor(blocks)
     g = adjoint(rng.normal(size=v.shape), edges, n)
     x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
@@ -99,18 +105,11 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     # Of one pinned pair, tau v v^T is taken away again.
     tau, pinned = 2.5, 4
     c = unit.reduce(scale_functional(between))
-    i, j = edges[pinned]
     system = factor_pinned(factor, blocks.copy(), c, Pin(pinned, edges[pinned], v[pinned], tau))
     right = unit.reduce(g)
     multiplier, x = system.solve(right, 0.7)
-    np.testing.assert_allclose(matrix @ x, multiplier * c + right, atol=1e-9)
-    assert c @ x == pytest.approx(0.7, rel=1e-10)
-    multiplier, h = system.balance(right)
-    moved = matrix @ h + tau * system.rows[1] * (system.rows[1] @ h)
-    np.testing.assert_allclose(moved, right - multiplier * c, atol=1e-9)
-    assert abs(system.rows[1] @ h) < 1e-10
-    at = unit.expand(h)
-    assert (at[i] - at[j]) @ v[pinned] == pytest.approx(0.0, abs=1e-10)
+    np.testing.assert_allclose(matrix @ x.ravel(), (multiplier * c + right).ravel(), atol=1e-9)
+    assert np.vdot(c, x) == pytest.approx(0.7, rel=1e-10)
 
 
 def mixed_problem(wrong=0.2):
@@ -132,8 +131,8 @@ def mixed_problem(wrong=0.2):
 
 def test_rigs_pieces_with_scales_of_their_own_and_single_cameras_are_one_program():
     graph, groups, t, lengths = mixed_problem()
-    assert (groups.num_units, groups.num_unknowns) == (3, 24)
-    result = solve_groups(graph, groups, SolverOptions(uniqueness=True))
+    assert (groups.num_units, groups.num_groups) == (3, 7)
+    result = solve(graph, SolverOptions(uniqueness=True), groups=groups)
     assert result.status is Status.CONVERGED
     assert result.unique
     x, apart = groups.fit(result.locations)
@@ -141,9 +140,9 @@ def test_rigs_pieces_with_scales_of_their_own_and_single_cameras_are_one_program
     assert apart < 1e-12
     np.testing.assert_allclose(scales / scales[0], lengths / lengths[0], rtol=1e-6)
     np.testing.assert_allclose(centered(result.locations) / scales[0] * lengths[0], centered(t), atol=1e-6)
-    conic = solve_groups(graph, groups, SolverOptions(solver="conic"))
+    conic = solve(graph, SolverOptions(solver="conic"), groups=groups)
     np.testing.assert_allclose(conic.locations, result.locations, atol=1e-6)
-    lud = lud_over_groups(graph, groups)
+    lud = lud_over(graph, groups)
     assert groups.fit(lud)[1] < 1e-9
     found = groups.split(groups.fit(lud)[0])[1]
     np.testing.assert_allclose(found / found[0], lengths / lengths[0], rtol=0.2)
@@ -160,7 +159,7 @@ def test_a_matrix_with_several_units_is_factored_as_it_is_written_out():
         + 0.5 * graph.directions[:, :, None] * graph.directions[:, None]
     )
     matrix, expand = written_out(edges, unit, blocks)
-    factor = RigidReduction(edges, unit)
+    factor = Reduction.over(edges, unit)
     factor.refactor(blocks)
     g = adjoint(np.random.default_rng(0).normal(size=graph.directions.shape), edges, graph.num_nodes)
     x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
@@ -169,14 +168,14 @@ def test_a_matrix_with_several_units_is_factored_as_it_is_written_out():
     assert part.unit_of.tolist() == [0, 1]
     alone = part.restricted_to(np.array([0, 8]))  # one node of each: nothing tells a scale
     with pytest.raises(UnsolvableError, match="do not determine a scale"):
-        RigidReduction(np.array([[0, 1]]), alone.center()).refactor(np.eye(3)[None])
+        Reduction.over(np.array([[0, 1]]), alone.center()).refactor(np.eye(3)[None])
 
 
 def test_a_scale_that_nothing_holds_is_refused():
     graph, groups, _ = rig_problem(13, frames=5, wrong=0.0)
     between = outer(graph, groups)[0]
     edges, v = between.edges, between.directions
-    factor = RigidReduction(edges, groups.normalize())
+    factor = Reduction.over(edges, groups.normalize())
     with pytest.raises(UnsolvableError, match="do not determine a scale"):  # all may grow along the solution
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
@@ -185,23 +184,23 @@ def test_a_scale_that_nothing_holds_is_refused():
 
 def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
     graph, groups, t = rig_problem(1)
-    result = solve_groups(graph, groups)
+    result = solve(graph, groups=groups)
     x, apart = groups.fit(result.locations)
     assert result.status is Status.CONVERGED
     assert result.unique
     assert apart < 1e-12
     # Certified to 1e-8 in an objective of 0.1; errors are of that order.
-    np.testing.assert_allclose(centered(result.locations) / x[-1], centered(t), atol=1e-6)
+    np.testing.assert_allclose(centered(result.locations) / groups.split(x)[1], centered(t), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
     graph, groups, _ = rig_problem(2, noise=noise)
-    result = solve_groups(graph, groups)
+    result = solve(graph, groups=groups)
     locations, dual, _ = solve_conic(outer(graph, groups)[0], 1e-9, 200, groups)
     every = np.zeros_like(graph.directions)
     every[groups.joins(graph.edges)] = dual
-    reference = certify_groups(graph, groups, centered(locations), every)
+    reference = certify(graph, centered(locations), every, groups=groups)
     assert reference.gap < 1e-9  # so the two optima agree to the sum of both gaps
     assert result.objective == pytest.approx(reference.objective, abs=1e-8)
     # The objective is sharp here: locations agree to a few times its error.
@@ -210,17 +209,17 @@ def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
 
 def test_groups_of_one_node_are_the_plain_program_and_larger_ones_raise_the_optimum():
     graph, _, _ = rig_problem(3, noise=0.01)
-    result = solve_groups(graph, separate(graph.num_nodes, 3))
+    result = solve(graph, groups=separate(graph.num_nodes, 3))
     plain = solve(graph)
     assert result.objective == pytest.approx(plain.objective, abs=2e-8)
     np.testing.assert_allclose(result.locations, plain.locations, atol=1e-6)
     graph, groups, _ = rig_problem(4, noise=0.05)
-    assert solve_groups(graph, groups).dual_bound > solve(outer(graph, groups)[0]).objective + 1e-4
+    assert solve(graph, groups=groups).dual_bound > solve(outer(graph, groups)[0]).objective + 1e-4
 
 
 def test_the_dual_balances_over_each_group_and_for_the_scale():
     graph, groups, _ = rig_problem(5, noise=0.02)
-    result = solve_groups(graph, groups)
+    result = solve(graph, groups=groups)
     between, kept = outer(graph, groups)
     y, w = result.dual[kept], between.weights
     total = groups.reduce(adjoint(y, between.edges, graph.num_nodes))
@@ -237,18 +236,18 @@ def test_the_dual_balances_over_each_group_and_for_the_scale():
 
 def test_a_dual_that_balances_is_kept_and_any_gives_a_bound_below_the_optimum_a_near_one_a_close_one():
     graph, groups, _ = rig_problem(6, noise=0.02)
-    result = solve_groups(graph, groups)
+    result = solve(graph, groups=groups)
     rng = np.random.default_rng(0)
     for size, loss in ((0.0, 1e-13), (1e-4, 1e-2), (1.0, np.inf)):
         spoilt = result.dual + size * rng.normal(size=result.dual.shape)
-        found = certify_groups(graph, groups, result.locations, spoilt)
+        found = certify(graph, result.locations, spoilt, groups=groups)
         assert found.dual_bound <= result.objective
         assert found.equality_residual < 1e-11
         assert result.dual_bound - found.dual_bound < loss
         if size == 0.0:
             np.testing.assert_allclose(found.dual, result.dual, atol=1e-13)
-    assert certify_groups(graph, groups, result.locations, 0.0 * result.dual).dual_bound == 0.0
-    large = certify_groups(graph, groups, result.locations, 3.0 * result.dual)  # is shrunk into its balls
+    assert certify(graph, result.locations, 0.0 * result.dual, groups=groups).dual_bound == 0.0
+    large = certify(graph, result.locations, 3.0 * result.dual, groups=groups)  # is shrunk into its balls
     assert (np.linalg.norm(large.dual, axis=1) / graph.weights).max() == pytest.approx(1.0, abs=1e-12)
     largest = (np.linalg.norm(result.dual, axis=1) / graph.weights).max()
     assert large.dual_bound == pytest.approx(result.dual_bound / largest, rel=1e-9)
@@ -271,44 +270,43 @@ def test_what_cannot_be_certified_is_refused():
         ((graph, groups, -t, dual), "L\\(T\\) <= 0"),
     ):
         with pytest.raises(InputError, match=message):
-            certify_groups(*refused)
+            certify(refused[0], *refused[2:], groups=refused[1])
     with pytest.raises(UnsolvableError, match="no pair joins two groups"):
-        solve_groups(inner, groups)
+        solve(inner, groups=groups)
 
 
 def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_and_cancelled(monkeypatch):
     graph, groups, _ = rig_problem(6, noise=0.02)
     seen = []
-    whole = solve_groups(graph, groups, on_iteration=seen.append)
+    whole = solve(graph, groups=groups, on_iteration=seen.append)
     assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
     assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
     assert {info.limit for info in seen} == {100}
-    cancelled = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
+    cancelled = solve(graph, groups=groups, on_iteration=lambda info: info.iteration < 2)
     assert (cancelled.status, cancelled.iterations) == (Status.CANCELLED, 2)
-    early = solve_groups(graph, groups, SolverOptions(max_iterations=2))
+    early = solve(graph, SolverOptions(max_iterations=2), groups=groups)
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
-    certify = groups_solve.certify_groups
     monkeypatch.setattr(
-        groups_solve, "certify_groups", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
+        "sfm_shapefit.solver.solve.certify", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
     )
-    assert solve_groups(graph, groups).status is Status.INACCURATE
+    assert solve(graph, groups=groups).status is Status.INACCURATE
 
 
 def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
     graph, groups, _ = rig_problem(6, noise=0.02)
-    result = solve_groups(graph, groups)
-    conic = solve_groups(graph, groups, SolverOptions(solver="conic"))
+    result = solve(graph, groups=groups)
+    conic = solve(graph, SolverOptions(solver="conic"), groups=groups)
     assert (result.method, conic.method) == ("newton", "conic")
     assert conic.objective == pytest.approx(result.objective, abs=2e-8)
     for other in (SolverOptions(), SolverOptions(threads=2), SolverOptions(solver="newton")):
-        again = solve_groups(graph, groups, other)
+        again = solve(graph, other, groups=groups)
         np.testing.assert_array_equal(again.locations, result.locations)
         np.testing.assert_array_equal(again.dual, result.dual)
     with pytest.raises(InputError, match="have no solver admm"):
-        solve_groups(graph, groups, SolverOptions(solver="admm"))
+        solve(graph, SolverOptions(solver="admm"), groups=groups)
     with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
-        RigidReduction(outer(graph, groups)[0].edges, groups, max_bytes=1000)
+        Reduction.over(outer(graph, groups)[0].edges, groups, max_bytes=1000)
 
 
 def test_a_group_that_one_pair_holds_hangs_free_two_pairs_hold_it_and_without_offsets_nothing_is_tied():
@@ -343,7 +341,7 @@ def test_the_set_around_a_group_is_found_even_where_another_is_larger():
 def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_one_does_not():
     # Two frames, displaced along the line on which both sensors of each stand: all directions are equal.
     groups = RigidGroups(group_of=[0, 0, 1, 1], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
-    t = groups.expand(np.array([0.0, 0, 0, 5, 0, 0, 1]))
+    t = groups.expand(np.array([[0.0, 0, 0], [5, 0, 0], [1, 0, 0]]))
     edges = np.array([[0, 2], [0, 3], [1, 2], [1, 3]])
     sizes = np.array([2, 2])
     assert len(largest_tied(edges, groups, sizes)) == 2
@@ -352,10 +350,10 @@ def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_on
 
 def test_lud_over_groups_stays_with_them_near_the_truth_and_over_single_nodes_is_lud():
     graph, groups, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
-    locations = lud_over_groups(outer(graph, groups)[0], groups)
+    locations = lud_over(outer(graph, groups)[0], groups)
     x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
-    errors = np.linalg.norm(locations / x[-1] - centered(t), axis=1)
+    errors = np.linalg.norm(locations / groups.split(x)[1] - centered(t), axis=1)
     assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centered(t), axis=1))
     graph, _, _ = rig_problem(14, noise=0.05)
 
@@ -365,7 +363,7 @@ def test_lud_over_groups_stays_with_them_near_the_truth_and_over_single_nodes_is
         return graph.weights @ np.linalg.norm(baselines - lengths[:, None] * graph.directions, axis=1)
 
     least = value(solve_lud(graph, 2000, tol=1e-9).locations)
-    ours = value(lud_over_groups(graph, separate(graph.num_nodes, 3), 1500))
+    ours = value(lud_over(graph, separate(graph.num_nodes, 3), 1500))
     assert ours == pytest.approx(least, rel=1e-5)
 
 
@@ -426,3 +424,13 @@ def test_offsets_that_the_directions_contradict_are_an_error_not_a_scale():
     mirrored = RigidGroups(group_of=groups.group_of, offsets=-groups.offsets)
     with pytest.raises(UnsolvableError, match="contradict the known offsets"):
         place(MeasuredGraph(graph, groups=mirrored))
+
+
+def test_where_four_of_five_pairs_are_wrong_groups_are_placed_at_the_weights_of_a_posterior():
+    graph, groups, t = rig_problem(50, frames=16, wrong=0.8, noise=0.002, share=0.6)
+    placed = place(MeasuredGraph(graph, groups=groups))
+    assert placed.refined.start == "reweighted ShapeFit"
+    assert placed.refined.reweighted.solved.gap < 1e-7
+    assert groups.fit(placed.locations)[1] < 1e-9
+    errors = np.linalg.norm(centered(placed.locations / placed.unit) - centered(t), axis=1)
+    assert np.median(errors) < 0.03  # the usual answer: 0.57

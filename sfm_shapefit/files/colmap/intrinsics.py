@@ -51,14 +51,19 @@ class Uncalibrated(NamedTuple):
     """Where its intrinsics come from."""
     database_id: int
     """Its id in the database."""
+    ratio: float
+    """Focal length in the database over that of the lens."""
 
 
-def find_uncalibrated(database: DatabaseFile, images: Images) -> dict[int, Uncalibrated]:
+def find_uncalibrated(
+    database: DatabaseFile, images: Images, listed: frozenset[int] = frozenset()
+) -> dict[int, Uncalibrated]:
     """Return the lenses of images that are the very ones which a database guessed, by their rows (l,).
 
     Args:
         database: has them.
         images: those of the database by name.
+        listed: ids of lenses that are those of the database but for their focal lengths.
 
     Raises:
         InputError: if the database cannot be read.
@@ -71,8 +76,13 @@ def find_uncalibrated(database: DatabaseFile, images: Images) -> dict[int, Uncal
         lens = images.lenses[number]
         if number not in found and name in rows:
             database_id, width, height, params, prior = rows[name]
-            if np.array(lens.parameters, dtype="<f8").tobytes() == params:
-                found[number] = Uncalibrated(_origin(camera_of(lens), width, height, prior), database_id)
+            is_same = np.array(lens.parameters, dtype="<f8").tobytes() == params
+            if is_same or lens.id in listed:
+                camera = camera_of(lens)
+                focal = camera.focal_length_idxs()[0]
+                ratio = float(np.frombuffer(params, "<f8")[focal] / lens.parameters[focal])
+                origin = _origin(camera, width, height, prior)
+                found[number] = Uncalibrated(origin, database_id, ratio)
     origins = [one.origin for one in found.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):

@@ -1,6 +1,6 @@
 """Newton cycles with a sparse block Cholesky factor of M, whose analysis is done once on the n cameras.
 
-Lifting by c c^T would fill the matrix; one pair is pinned instead, see `newton.reduction`. Over rigid groups
+Lifting by c c^T would fill the matrix; one pair is pinned instead, see `solver.reduction`. Over rigid groups
 a step of the unknowns is a step of their nodes, dT = A dx, and everything per pair (residuals, the
 linearization, the dual y+, the two step lengths) stays as it is. Only the equations for the step differ:
 
@@ -20,10 +20,10 @@ from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.newton import steps
-from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_pinned
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
+from sfm_shapefit.solver.reduction import Pin, Reduction, System, factor_pinned
 
 _RIDGES = 0.0, 1e-12, 1e-10  # added to the blocks, per stiffness of the edge; in turn until M is definite
 

@@ -20,7 +20,7 @@ from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.reduced import RigidReduction
+from sfm_shapefit.solver.reduction import Reduction
 
 _EPSILON = 1e-10  # shift of the matrix, relative; null vectors grow by its inverse per step
 _STEPS = 4  # steps of inverse iteration; after these nothing but null vectors is left
@@ -69,9 +69,9 @@ def largest_tied(
 def general_positions(groups: RigidGroups) -> FloatArray:
     """Return random locations of the groups, at distances comparable to the size of their offsets."""
     unit = groups.normalize()
-    x = np.random.default_rng(_SEED).standard_normal(unit.num_unknowns)
-    x[-1] = 1.0
-    return unit.expand(x)
+    rng = np.random.default_rng(_SEED)
+    centers = rng.standard_normal((unit.num_groups, unit.offsets.shape[1]))
+    return unit.expand(unit.stack(centers, np.ones(unit.num_units)))
 
 
 def _components(ends: IntArray, count: int) -> list[IntArray]:
@@ -87,7 +87,7 @@ def _null_motions(edges: IntArray, groups: RigidGroups, locations: FloatArray) -
     still = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(locations))
     u = normalized(differences(locations, edges))  # NaN where two nodes coincide, which says nothing
     blocks = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :])
-    factor = RigidReduction(edges, still)
+    factor = Reduction.over(edges, still)
     try:
         factor.refactor(blocks + _EPSILON * np.eye(d))
     except UnsolvableError:  # regular but for rounding: nothing can be told apart
