@@ -42,7 +42,7 @@ from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.linear import IterativeSolver
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
@@ -89,8 +89,8 @@ def refine_in_angles(_folder: Path) -> None:
     graph = problem.view_graph
     plan = plan_refinement(graph)
     assert plan is not None
-    assert not isinstance(plan, IterativeNormal)
-    refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, dtype=np.int64)), plan)
+    for solver in (plan, IterativeNormal(graph, laplacian_factor(graph))):
+        refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, np.int64)), solver)
 
 
 def measure_pairs(folder: Path) -> None:

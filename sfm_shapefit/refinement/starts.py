@@ -28,6 +28,7 @@ from sfm_shapefit.refinement.angular import (
     residual_levels,
     robust_cost,
 )
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
@@ -168,17 +169,25 @@ def refine_starts(
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
+    reweighted, refining = None, problem
+    if isinstance(problem.normal_solver, IterativeNormal) and options.objective == "auto":
+        # Refinements are dear here: starts that are alike lead to one place, and others look for no weights.
+        candidates = candidates[:1] if apart is None or apart <= _UNEQUAL else candidates
+        usual = fit_mixture(measured, candidates[0][1])
+        reweighted = _reweight(problem, candidates[0][1], usual, options)
+        refining = problem if reweighted is None else problem._replace(normal_solver=None)
     starts: list[Start] = []
     for name, locations in candidates:
         fallback = locations if second is None else second
-        starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
+        starts.append(_refine_start(refining, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     chosen, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
-    usual = fit_mixture(measured, chosen.best)
-    reweighted = _reweight(problem, chosen.best, usual, options)
+    if reweighted is None:
+        usual = fit_mixture(measured, chosen.best)
+        reweighted = _reweight(problem, chosen.best, usual, options)
     if reweighted is not None:
         chosen, reason = _start_of(reweighted), _explain(usual, reweighted)
         if reweighted.refined is not None:
@@ -211,9 +220,7 @@ def _reweight(
     solver, measured = problem.normal_solver, problem.measured
     if solver is None or measured.groups is not None or options.objective != "auto":
         return None
-    if mixture.shares[0] >= POOR_SHARE or not has_second_start(problem.graph):
-        return None
-    if not can_be_reweighted(problem.graph):
+    if mixture.shares[0] >= POOR_SHARE or not can_be_reweighted(problem.graph):
         return None
 
     def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
@@ -248,7 +255,7 @@ def _plan_normal_solver(
     """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.solver.factor_bytes
     if groups is None:
-        return plan_refinement(graph, max_bytes)
+        return plan_refinement(graph, max_bytes, options.solver.num_threads())
     try:
         return RigidReduction(graph.edges, groups.normalize(), max_bytes=max_bytes)
     except UnsolvableError:
@@ -386,6 +393,8 @@ def _choose(
     by_name = {start.name: start for start in starts}
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
+    if apart is not None and len(starts) == 1:
+        return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.0%}, so that one was refined"
     if len(starts) == 1:
         wanted = ", which LUD would have been" if options.objective == "lud" else ""
         return by_name["ShapeFit"], f"the graph has no second start{wanted}"

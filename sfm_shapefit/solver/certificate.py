@@ -45,7 +45,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.jit import array_address, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
+from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorize
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
@@ -53,7 +53,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, preconditioner
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
 _ROUNDS = 8
@@ -339,13 +339,7 @@ def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Re
             raise UnsolvableError(
                 f"the graph falls into {components} connected components; certify each one separately"
             )
-    factor = laplacian_factor(graph, resources)
-    try:
-        factor.refactor(stiffness)
-    except UnsolvableError:  # connected, but too long for the precision of the factor
-        neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-        return approximate_cholesky(neighbors, stiffness, _SEED)
-    return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
+    return preconditioner(graph, laplacian_factor(graph, resources), stiffness)
 
 
 @kernel

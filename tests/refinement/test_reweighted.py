@@ -7,7 +7,7 @@ from sfm_shapefit import synthetic
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import reweighted, starts
+from sfm_shapefit.refinement import angular, reweighted, starts
 from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, put_by_consensus
 from sfm_shapefit.solver.solve import solve
 from tests.problems import shape_error
@@ -32,6 +32,19 @@ def test_recovery_is_exact_where_the_usual_starts_collapse(d, q, monkeypatch):
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
     monkeypatch.setattr(starts, "POOR_SHARE", 0.0)
     assert shape_error(place(problem.view_graph).locations, problem.locations) > 0.02
+
+
+def test_where_a_factor_is_dear_only_the_reweighted_start_is_refined(hopeless, monkeypatch):
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
+    refined = []
+    refine = starts.refine_angles
+    monkeypatch.setattr(starts, "refine_angles", lambda *a: refined.append(a[0]) or refine(*a))
+    found = place(hopeless.view_graph)
+    assert found.refined.start == "reweighted ShapeFit"
+    assert shape_error(found.locations, hopeless.locations) < 1e-9
+    assert all(graph.weights.min() < 1.0 for graph in refined)
+    place(corrupted(0.1, sigma=0.01).view_graph)
+    assert refined[-1].weights.min() == 1.0
 
 
 def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(hopeless):

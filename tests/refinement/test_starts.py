@@ -133,6 +133,15 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
         assert "no second start" in found.reason
 
 
+def test_of_starts_that_are_alike_one_is_refined_where_a_factor_is_dear(monkeypatch, expander):
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
+    found = finished(expander)
+    assert list(found.costs) == ["ShapeFit"]
+    assert found.lud is not None
+    assert "so that one was refined" in found.reason
+    assert list(finished(expander, objective="lud").costs) == ["ShapeFit", "LUD"]
+
+
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noise_free_answers_are_exact_and_not_made_worse(d):
     problem = synthetic.random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
