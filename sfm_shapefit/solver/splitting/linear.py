@@ -157,7 +157,7 @@ def laplacian_factor(
 
 
 def preconditioner(graph: ViewGraph, factor: LaplacianFactor, weights: FloatArray) -> Preconditioner:
-    """Return an approximate inverse of the Laplacian of `weights`, (m,), a linear map, from a factor of it."""
+    """Return an approximate inverse, a linear map, of the Laplacian of `weights`, (m,), from its factor."""
     try:
         factor.refactor(weights)
     except UnsolvableError:  # connected, but too long for the precision of the factor
