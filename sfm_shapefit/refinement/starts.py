@@ -33,7 +33,7 @@ from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import MANY_PAIRS, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.reduced import RigidReduction
 from sfm_shapefit.solver.rigs.solve import lud_over_groups
@@ -46,7 +46,6 @@ COLLAPSED = 0.3
 _UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
 _LUD_STEPS = 50  # iterations; more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
-_LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
@@ -226,7 +225,7 @@ def _reweight(
     def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
         return refine_angles(graph, locations, problem.metric, solver)
 
-    return solve_reweighted(measured, usual, options.solver, refine)
+    return solve_reweighted(measured, usual, options.solver.at_scale(measured.graph.num_edges), refine)
 
 
 def _start_of(reweighted: Reweighted) -> Start:
@@ -291,7 +290,7 @@ def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _P
 
 def has_second_start(graph: ViewGraph) -> bool:
     """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
-    return graph.num_edges <= _LUD_PAIRS and graph.num_nodes > 2
+    return graph.num_edges <= MANY_PAIRS and graph.num_nodes > 2
 
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
