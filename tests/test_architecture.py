@@ -50,7 +50,7 @@ MOST_LINES = {
     "report": 1680,
     "rotations": 2290,
     "scene": 2080,
-    "solver": 4380,
+    "solver": 4400,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
     "tracks": 1150,

@@ -41,11 +41,7 @@ from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
-<<<<<<< HEAD
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
-=======
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
->>>>>>> main
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
