@@ -51,7 +51,8 @@ PUBLISHED = {
     "ShapeFit by ADMM": ("1.50", "1.51"),
 }
 """Median and mean error for q = 0.8, sigma 0, seed 2025, as published."""
-LARGE = GraphSpec("geo", 10_000, 45.0, sigma=0.01, q=0.6)
+LARGE = {10_000: 5.0, 100_000: 60.0}
+"""Cameras, and processor seconds that the issue asks for."""
 OVER_ORACLE = 1.1
 
 
@@ -71,7 +72,7 @@ class Errors(NamedTuple):
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
-    """Return the cells with each ten seeds, a larger graph, and one of 1e4 cameras."""
+    """Return the cells with each ten seeds, a larger graph, and those of 1e4 and 1e5 cameras."""
     n, cells = (40, list(REACH)[4:5]) if args.quick else (100, list(REACH))
     found: dict[str, Case] = {
         f"{seeds} {model} {q:g} {sigma:g}": partial(measure, (model, q, sigma), n, seeds, args.repeats)
@@ -82,7 +83,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         found["published uniform 0.85 0, n = 300"] = partial(
             measure, ("uniform", 0.85, 0.0), 300, "published", 2
         )
-        found["large"] = measure_large
+        found |= {f"large {cameras}": partial(measure_large, cameras) for cameras in LARGE}
     return found
 
 
@@ -153,24 +154,32 @@ def measure(cell: tuple[str, float, float], n: int, seeds: str, count: int) -> R
     return Row(cells, at_most(median=(middle[2], limits[0]), mean=(middle[3], limits[1])))
 
 
-def measure_large() -> Row:
-    """Measure a graph of 1e4 cameras against the same with its right pairs alone."""
-    problem = draw(LARGE)
+def measure_large(cameras: int) -> Row:
+    """Measure a graph of many cameras against the same with its right pairs alone."""
+    sfm_shapefit.place(draw_published("uniform", 0.8, 0.0, 40, 1).graph)
+    problem = draw(large(cameras))
     right = ~problem.corrupted
     placed = time_call(partial(sfm_shapefit.place, problem.view_graph))
     oracle = time_call(partial(sfm_shapefit.place, problem.view_graph.subset(right)))
     found, best = (errors(one.found, problem.locations) for one in (placed, oracle))
     cells = {
-        "cameras": LARGE.n,
+        "cameras": cameras,
         "pairs": len(right),
-        "q": LARGE.q,
+        "q": float(np.mean(problem.corrupted)),
         "placed": f"{found.median:.3g} / {found.mean:.3g}",
         "oracle": f"{best.median:.3g} / {best.mean:.3g}",
         "oracle, s": oracle.cpu_s,
         "s": placed.cpu_s,
+        "elapsed, s": placed.wall_s,
     }
     over = found.median / best.median
-    return Row(cells, at_most(**{"over oracle": (over, OVER_ORACLE)}), table="Many cameras, 60 % wrong")
+    limits = {"over oracle": (over, OVER_ORACLE), "s": (placed.cpu_s, LARGE[cameras])}
+    return Row(cells, at_most(**limits), table="Many cameras, 60 % wrong")
+
+
+def large(cameras: int) -> GraphSpec:
+    """Return the graph of so many cameras in a box."""
+    return GraphSpec("geo", cameras, 45.0, sigma=0.01, q=0.6)
 
 
 BENCHMARK = Benchmark(

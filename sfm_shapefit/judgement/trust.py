@@ -45,7 +45,7 @@ from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Loosene
 
 _AGREEING_ANGLE_RAD = np.radians(3.0)  # radians; a pair agrees within this angle, or ...
 _AGREEING_SIGMAS = 5.0  # ... within this, in its standard deviations; a far point's direction is inexact
-_MAX_CLUSTERED_PAIRS = 1_000_000  # pairs; more take over ten seconds, and all cameras are the consensus
+_MAX_CLUSTERED_PAIRS = 5_000_000  # pairs; more take over ten seconds, and all cameras are the consensus
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements; see the header
 _PRIOR = 30.0  # matches that every camera has beforehand; half of them for it in a clean scene
 _LEAST_MEDIAN = 0.5  # median share of agreement; hardly anything agrees with a collapsed answer

@@ -88,8 +88,8 @@ def refine_in_angles(_folder: Path) -> None:
     graph = problem.view_graph
     plan = plan_refinement(graph)
     assert plan is not None
-    assert not isinstance(plan, IterativeNormal)
-    refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, dtype=np.int64)), plan)
+    for solver in (plan, IterativeNormal(graph, laplacian_factor(graph))):
+        refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, np.int64)), solver)
 
 
 def measure_pairs(folder: Path) -> None:

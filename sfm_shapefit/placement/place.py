@@ -247,7 +247,7 @@ def _solve_part(
 ) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
     """Return the optimum of the convex program, and the iterations that led to it."""
     history: list[IterationInfo] = []
-    options = how.options.solver
+    options = how.options.solver.at_scale(part.graph.num_edges)
 
     def watch(info: IterationInfo) -> bool | None:
         history.append(info)

@@ -25,7 +25,6 @@ from sfm_shapefit.refinement.angular import (
     plan_refinement,
     take_angular_step,
 )
-from sfm_shapefit.refinement.cg_normal_solver import GraphShape
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.program import adjoint
 
@@ -75,11 +74,14 @@ def refine_anchored(
     return t
 
 
-def _join(graph: ViewGraph, anchors: KnownPositions) -> GraphShape:
+def _join(graph: ViewGraph, anchors: KnownPositions) -> ViewGraph:
     """Return the pairs of the graph, and those of the anchors' nodes with the origin, the last node."""
     n = graph.num_nodes
     links = np.stack([anchors.indices, np.full(len(anchors.indices), n)], axis=1)
-    return GraphShape(n + 1, np.concatenate([graph.edges, links]), graph.dimension)
+    no_directions = np.broadcast_to(np.eye(graph.dimension)[0], (len(links), graph.dimension))
+    return ViewGraph(
+        n + 1, np.concatenate([graph.edges, links]), np.concatenate([graph.directions, no_directions])
+    )
 
 
 class _AnchoredTerms(AngularTerms):

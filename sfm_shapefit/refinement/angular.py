@@ -37,12 +37,16 @@ from sfm_shapefit.base.scipy_parts import chdtri
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorization
-from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor
+from sfm_shapefit.solver.splitting.linear import (
+    LaplacianFactor,
+    Resources,
+    laplacian_factor,
+    predict_factor,
+)
 
 KERNEL_WIDTH = 3.0
 """k, in standard deviations; a residual of k counts half of what it can."""
@@ -59,10 +63,12 @@ _SHORTEST = 1e-3
 _SETTLED = 0.03  # relative change of a level; a smaller one counts as none
 _CONVERGED = 1e-9  # relative decrease of the cost; a smaller one counts as none
 _STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the nodes counts as none
+# Likewise by level, where a step is dear: noise of a level moves the nodes of boxes of 1e4 by .03 of it.
+_STILL_PER_LEVEL = 1e-3
 _ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
 _HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
 _MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
-_MAX_FLOPS = 3e10  # operations of one factorization in blocks; they take about a second per step
+_MAX_FLOPS = 1e10  # operations of one factorization in blocks; they take a third of a second per step
 
 
 class Metric(NamedTuple):
@@ -89,17 +95,16 @@ class AngularResult:
 
 
 def plan_refinement(
-    graph: ViewGraph | GraphShape, max_bytes: int = DEFAULT_FACTOR_BYTES
+    graph: ViewGraph, max_bytes: int = DEFAULT_FACTOR_BYTES, threads: int = 1
 ) -> SymbolicFactor | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 
-    Where a factor is much work, the graph is well connected, and conjugate gradients need few steps.
+    Where a factor in blocks is much work the graph is well connected, and conjugate gradients need few steps.
     """
-    neighbors = adjacency(graph.num_nodes, graph.edges)
-    tree = best_order(neighbors)
-    if tree.flops * graph.dimension**3 > _MAX_FLOPS:
-        return IterativeNormal(graph)
-    plan = plan_factorization(neighbors, graph.edges, tree)
+    prediction = predict_factor(graph)
+    if prediction.tree is None or prediction.flops * graph.dimension**3 > _MAX_FLOPS:
+        return IterativeNormal(graph, laplacian_factor(graph, Resources(threads, max_bytes), prediction))
+    plan = plan_factorization(adjacency(graph.num_nodes, graph.edges), graph.edges, prediction.tree)
     return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
 
@@ -128,6 +133,7 @@ def refine_angles(
     first = _unit(start)
     other = None if other is None else _unit(other)
     t, damping, steps = first, DAMPING.first, 0
+    still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
@@ -136,9 +142,11 @@ def refine_angles(
         information = _information(graph, spread, levels[metric.classes])
         terms = AngularTerms(graph, information, steep=not settled)
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)
-        still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
+        is_still = (
+            _motion(t, moved) <= max(_STILL, still * levels.min()) or before - after <= _CONVERGED * before
+        )
         t, steps = moved, steps + 1
-        if settled and still:
+        if settled and is_still:
             break
         if settled and other is not None and _is_decided(before, after, terms.cost(other)):
             break

@@ -29,11 +29,12 @@ from sfm_shapefit.refinement.angular import (
     residual_levels,
     robust_cost,
 )
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import MANY_PAIRS, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
@@ -45,7 +46,6 @@ COLLAPSED = 0.3
 _UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
 _LUD_STEPS, _GROUP_LUD_STEPS = 50, 150  # iterations; more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
-_LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
 _TIE = 1e-3  # relative difference of costs; a smaller one says nothing where the starts disagree
 _POINT_LENGTH = 1e-6  # share of the mean length of all pairs; the cameras of a shorter one stand in one place
@@ -168,17 +168,25 @@ def refine_starts(
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
+    reweighted, refining = None, problem
+    if isinstance(problem.normal_solver, IterativeNormal) and options.objective == "auto":
+        # Refinements are dear here: starts that are alike lead to one place, and others look for no weights.
+        candidates = candidates[:1] if apart is None or apart <= _UNEQUAL else candidates
+        usual = fit_mixture(measured, candidates[0][1])
+        reweighted = _reweight(problem, candidates[0][1], usual, options)
+        refining = problem if reweighted is None else problem._replace(normal_solver=None)
     starts: list[Start] = []
     for name, locations in candidates:
         fallback = locations if second is None else second
-        starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
+        starts.append(_refine_start(refining, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     chosen, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
-    usual = fit_mixture(measured, chosen.best)
-    reweighted = _reweight(problem, chosen.best, usual, options)
+    if reweighted is None:
+        usual = fit_mixture(measured, chosen.best)
+        reweighted = _reweight(problem, chosen.best, usual, options)
     if reweighted is not None:
         chosen, reason = _start_of(reweighted), _explain(usual, reweighted)
         if reweighted.refined is not None:
@@ -211,15 +219,13 @@ def _reweight(
     solver, measured = problem.normal_solver, problem.measured
     if solver is None or options.objective != "auto":
         return None
-    if mixture.shares[0] >= POOR_SHARE or not has_second_start(problem.graph):
-        return None
-    if not can_be_reweighted(measured):
+    if mixture.shares[0] >= POOR_SHARE or not can_be_reweighted(measured):
         return None
 
     def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
         return refine_angles(graph, locations, problem.metric, solver)
 
-    return solve_reweighted(measured, usual, options.solver, refine)
+    return solve_reweighted(measured, usual, options.solver.at_scale(measured.graph.num_edges), refine)
 
 
 def _start_of(reweighted: Reweighted) -> Start:
@@ -248,7 +254,7 @@ def _plan_normal_solver(
     """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.solver.factor_bytes
     if groups is None:
-        return plan_refinement(graph, max_bytes)
+        return plan_refinement(graph, max_bytes, options.solver.num_threads())
     try:
         return Reduction.over(graph.edges, groups.normalize(), max_bytes=max_bytes)
     except UnsolvableError:
@@ -286,7 +292,7 @@ def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _P
 
 def has_second_start(graph: ViewGraph) -> bool:
     """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
-    return graph.num_edges <= _LUD_PAIRS and graph.num_nodes > 2
+    return graph.num_edges <= MANY_PAIRS and graph.num_nodes > 2
 
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
@@ -388,6 +394,8 @@ def _choose(
     by_name = {start.name: start for start in starts}
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
+    if apart is not None and len(starts) == 1:
+        return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.0%}, so that one was refined"
     if len(starts) == 1:
         wanted = ", which LUD would have been" if options.objective == "lud" else ""
         return by_name["ShapeFit"], f"the graph has no second start{wanted}"

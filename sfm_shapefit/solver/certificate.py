@@ -53,7 +53,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.jit import array_address, kernel
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
+from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.dense import blas_of, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
@@ -62,7 +62,7 @@ from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.reduction import Reduction
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor, preconditioner
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
 _ROUNDS = 8
@@ -409,17 +409,14 @@ def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Re
                 f"the graph falls into {components} connected components; certify each one separately"
             )
     factor = laplacian_factor(graph, resources)
+    if not isinstance(factor, Reduction):
+        return preconditioner(graph, factor, stiffness)
     try:
         factor.refactor(stiffness)
-    except UnsolvableError as error:  # connected, but too long for the precision of the factor
-        if isinstance(factor, Reduction):
-            message = "the dual cannot be repaired: the pairs do not determine the groups"
-            raise UnsolvableError(message) from error
-        neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-        return approximate_cholesky(neighbors, stiffness, _SEED)
-    if isinstance(factor, Reduction):
-        return _OverGroups(factor)
-    return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
+    except UnsolvableError as error:
+        message = "the dual cannot be repaired: the pairs do not determine the groups"
+        raise UnsolvableError(message) from error
+    return _OverGroups(factor)
 
 
 class _OverGroups(NamedTuple):

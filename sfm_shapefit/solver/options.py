@@ -4,7 +4,7 @@ import enum
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.settings import Settings, explained, option
@@ -16,6 +16,11 @@ Solver = Literal["auto", "newton", "admm", "conic"]
 
 NO_FACTOR = 0
 """Megabytes for `factor_memory_mb`: nothing is factored that can be left out."""
+
+MANY_PAIRS = 1_000_000
+"""Pairs of a view graph; with more, a solve to the last digit or a second one takes a minute or more."""
+
+_TOL_OF_MANY = 1e-6  # gap of a start with more than `MANY_PAIRS`; the noise of any directions is far above it
 
 MAX_THREADS = 256
 """Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
@@ -85,7 +90,11 @@ class SolverOptions(Settings):
         'gap needs them) for large graphs, "conic" the generic conic program through cvxpy and Clarabel; '
         '"auto" picks by size and predicted fill, and says why.',
     )
-    tol: float = option(1e-8, "Certified gap, objective - dual_bound, at which a solve counts as converged.")
+    tol: float = option(
+        1e-8,
+        "Certified gap, objective - dual_bound, at which a solve counts as converged. Placed with more than "
+        "a million pairs 1e-6 does where this is left as it is: rounding would hold it up for minutes.",
+    )
     max_iterations: int | None = option(
         None, "Hard limit; by default the solver's own. Reaching it is reported, never silent."
     )
@@ -110,6 +119,11 @@ class SolverOptions(Settings):
             self.check_range("max_iterations", 1)
         self.check_range("factor_memory_mb", NO_FACTOR)
         self.check_range("threads", 0, MAX_THREADS)
+
+    def at_scale(self, num_pairs: int) -> Self:
+        """Return the options for the start of a placement of so many pairs; see `tol`."""
+        is_left = self.tol == type(self)().tol
+        return replace(self, tol=_TOL_OF_MANY) if is_left and num_pairs > MANY_PAIRS else self
 
     @property
     def factor_bytes(self) -> int:

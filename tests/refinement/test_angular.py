@@ -17,6 +17,7 @@ from sfm_shapefit.refinement.angular import (
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.splitting.linear import laplacian_factor
 from tests.problems import fit_angles, shape, shape_error
 
 
@@ -240,6 +241,28 @@ def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
     assert plan_refinement(graph, max_bytes=10) is None
     monkeypatch.setattr(angular, "_MAX_FLOPS", 10.0)
     assert isinstance(plan_refinement(graph), IterativeNormal)
+
+
+def test_without_the_factor_of_the_blocks_the_answer_is_the_same_but_for_a_share_of_the_noise(monkeypatch):
+    problem = synthetic.box_graph_problem(200, 30.0, sigma=0.01, q=0.4, seed=2)
+    graph, start = problem.view_graph, shaken(problem, 0.05)
+    by_factor = refined(graph, start).locations
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 10.0)
+    iterative = refined(graph, start)
+    assert shape_error(iterative.locations, by_factor) < 0.05 * shape_error(by_factor, problem.locations)
+    assert iterative.iterations < 25
+
+
+def test_a_scalar_factor_serves_until_the_weights_have_changed(monkeypatch):
+    graph = graph_of(synthetic.random_graph_problem(20, 0.8, seed=1))
+    factor, taken = laplacian_factor(graph), []
+    monkeypatch.setattr(type(factor), "refactor", lambda _, weights: taken.append(weights))
+    normal, blocks = IterativeNormal(graph, factor), np.tile(np.eye(3), (graph.num_edges, 1, 1))
+    for scales, count in ((1.0, 1), (7.0, 1), (np.linspace(1.0, 1.1, graph.num_edges), 1)):
+        normal.refactor(blocks * np.reshape(scales, (-1, 1, 1)))
+        assert len(taken) == count
+    normal.refactor(blocks * np.linspace(0.1, 2.0, graph.num_edges)[:, None, None])
+    assert len(taken) == 2
 
 
 def test_the_answer_is_a_stationary_point_of_the_robust_cost():

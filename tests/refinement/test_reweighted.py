@@ -7,8 +7,10 @@ from sfm_shapefit import synthetic
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
-from sfm_shapefit.refinement import reweighted, starts
+from sfm_shapefit.refinement import angular, reweighted, starts
 from sfm_shapefit.refinement.consensus import fit_mixture, penalty_of_strays, put_by_consensus
+from sfm_shapefit.solver import options as solver_options
+from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
 from tests.problems import shape_error
 
@@ -32,6 +34,19 @@ def test_recovery_is_exact_where_the_usual_starts_collapse(d, q, monkeypatch):
     np.testing.assert_array_equal(found.refined.posterior > 0.5, ~problem.corrupted)
     monkeypatch.setattr(starts, "POOR_SHARE", 0.0)
     assert shape_error(place(problem.view_graph).locations, problem.locations) > 0.02
+
+
+def test_where_a_factor_is_dear_only_the_reweighted_start_is_refined(hopeless, monkeypatch):
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
+    refined = []
+    refine = starts.refine_angles
+    monkeypatch.setattr(starts, "refine_angles", lambda *a: refined.append(a[0]) or refine(*a))
+    found = place(hopeless.view_graph)
+    assert found.refined.start == "reweighted ShapeFit"
+    assert shape_error(found.locations, hopeless.locations) < 1e-9
+    assert all(graph.weights.min() < 1.0 for graph in refined)
+    place(corrupted(0.1, sigma=0.01).view_graph)
+    assert refined[-1].weights.min() == 1.0
 
 
 def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(hopeless):
@@ -66,6 +81,20 @@ def test_a_graph_that_is_explained_is_left_alone_and_so_is_an_objective_that_was
     monkeypatch.setattr(starts, "solve_reweighted", lambda *_: pytest.fail("nothing is to be tried"))
     assert place(corrupted(0.2, sigma=0.02).view_graph).refined.reweighted is None
     assert place(hopeless.view_graph, objective="shapefit").refined.start == "ShapeFit"
+
+
+def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that_is_asked(
+    hopeless, monkeypatch
+):
+    for module in (solver_options, reweighted):
+        monkeypatch.setattr(module, "MANY_PAIRS", hopeless.view_graph.num_edges - 1)
+    asked = []
+    monkeypatch.setattr(reweighted, "solve", lambda graph, told: asked.append(told.tol) or solve(graph, told))
+    found = place(hopeless.view_graph)
+    assert set(asked) == {1e-6}
+    assert found.certified.converged
+    assert shape_error(found.locations, hopeless.locations) < 1e-6
+    assert SolverOptions(tol=1e-9).at_scale(10**7).tol == 1e-9
 
 
 def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch):

@@ -122,7 +122,7 @@ def test_a_start_whose_cameras_stand_in_one_point_is_not_kept_whatever_it_costs(
 
 
 def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypatch, expander):
-    monkeypatch.setattr(finishing, "_LUD_PAIRS", 10)
+    monkeypatch.setattr(finishing, "MANY_PAIRS", 10)
     for objective in ("auto", "lud"):
         found = finished(expander, objective=objective)
         assert found.start == "ShapeFit"
@@ -131,6 +131,15 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
         assert not found.collapsed
         assert found.is_refined
         assert "no second start" in found.reason
+
+
+def test_of_starts_that_are_alike_one_is_refined_where_a_factor_is_dear(monkeypatch, expander):
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 0.0)
+    found = finished(expander)
+    assert list(found.costs) == ["ShapeFit"]
+    assert found.lud is not None
+    assert "so that one was refined" in found.reason
+    assert list(finished(expander, objective="lud").costs) == ["ShapeFit", "LUD"]
 
 
 @pytest.mark.parametrize("d", [2, 3, 5])

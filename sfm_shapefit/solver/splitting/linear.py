@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
@@ -153,3 +154,12 @@ def laplacian_factor(
     if plan.num_bytes(1, dtype) > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
     return allocate_factor(plan, 1, dtype, threads=resources.threads)
+
+
+def preconditioner(graph: ViewGraph, factor: LaplacianFactor, weights: FloatArray) -> Preconditioner:
+    """Return an approximate inverse, a linear map, of the Laplacian of `weights`, (m,), from its factor."""
+    try:
+        factor.refactor(weights)
+    except UnsolvableError:  # connected, but too long for the precision of the factor
+        return approximate_cholesky(adjacency(graph.num_nodes, graph.edges), weights, _SEED)
+    return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
