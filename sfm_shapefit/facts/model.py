@@ -383,12 +383,11 @@ class CheckedFacts(FactsOfModel):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        path = shlex.quote(self.inputs.path)
-        if self.verdict.grade is Grade.GOOD:
-            return NextStep(
-                "Next: undistort the images for splatting or dense reconstruction.",
-                f"colmap image_undistorter --image_path IMAGES --input_path {path} --output_path dense",
-            )
+        path, second = shlex.quote(self.inputs.path), self.evidence.second
+        is_as_map_has_it = second is not None and not (second.wrong or second.undecided)
+        if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
+            step = next_of_model(self.verdict.grade, path, is_adjusted=True)
+            return step._replace(command=step.command.format(out=path, out_dense="dense"))
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         database = self.inputs.database
         by = f" --database {shlex.quote(_from_here(database))}" if database else ""

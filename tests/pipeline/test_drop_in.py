@@ -10,9 +10,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.synthetic.fixtures import assert_reconstruction_near
-from tests.scenes import COURTYARD, RING, ROOT
-
-PHOTOGRAPHED = ROOT / "data_synthetic/photographed"
+from tests.scenes import COURTYARD, PHOTOGRAPHED, RING
 
 
 def test_global_mapping_is_called_and_answers_as_pycolmaps(tmp_path):
