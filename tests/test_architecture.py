@@ -39,7 +39,7 @@ MOST_LINES = {
     "base": 2210,
     "cli": 1770,
     "facts": 3400,
-    "files": 4760,
+    "files": 4790,
     "graph": 1260,
     "judgement": 3290,
     "laplacian": 2080,

@@ -17,12 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import (
-    fit_similarity_l1,
-    mean_rotation_l1,
-    median_spread,
-    rotation_angles_deg,
-)
+from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
 from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
 from sfm_shapefit.scene.images import Images
 

@@ -45,11 +45,7 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import (
-    Grade,
-    ModelVerdict,
-    weigh_evidence,
-)
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict

@@ -14,7 +14,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
-from sfm_shapefit.facts.placed import KeyFigures
+from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
 from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
@@ -241,7 +241,12 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
         ("good", None, "Good: this model can be used", "image_undistorter"),
         ("good", ADJUSTED, "Good: this model can be used", "image_undistorter"),
         ("look", None, "Look at 2 cameras first", "image_undistorter"),
-        ("do not use", None, "Do not use this model", "inspect 'a folder/sparse/0'"),
+        (
+            "do not use",
+            None,
+            "Do not use this model",
+            "inspect 'a folder/sparse/0' --database 'a folder/d.db'",
+        ),
     ],
 )
 def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, headline, command):
@@ -252,7 +257,7 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
         facts,
         verdict=ModelVerdict(grade=Grade(grade), cameras=names, reasons=tuple(reasons)),
         bundle_adjustment=adjusted,
-        inputs=replace(facts.inputs, model="a folder/sparse/0"),
+        inputs=replace(facts.inputs, model="a folder/sparse/0", database="a folder/d.db"),
     )
     found = banner(drawing, facts)
     assert (found["grade"], found["headline"]) == (grade, headline)
@@ -263,6 +268,16 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
         "do not use": "Only 30% of the pairs agree.",
     }
     assert said[grade] in found["sentence"]
+
+
+def test_what_map_made_and_is_not_to_be_used_is_inspected_where_it_was_written():
+    _, facts = make_drawing()
+    bad = ModelVerdict(grade=Grade.DO_NOT_USE, cameras=(), reasons=("it is folded",))
+    inputs = replace(
+        facts.inputs, model=IN_MEMORY, database="scene/database.db"
+    )  # `inspect` takes no database
+    step = replace(facts, verdict=bad, inputs=inputs).next_step
+    assert step.command == "sfm-shapefit inspect {out} --database scene/database.db"
 
 
 def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are():
