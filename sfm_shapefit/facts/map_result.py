@@ -87,8 +87,7 @@ class JoinedModel(Written, Tabled):
     def told(self) -> Telling:
         """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
         told = self.facts.told(self.cameras, self.pairs)
-        joins = [row("join", one.statement) for one in self.joins]
-        return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
+        return told._replace(rows=[*self.facts.scene_rows(), *told.rows], elsewhere="see cameras.csv")
 
     def _headline(self) -> str:
         models = counted(len(self.models), "model")

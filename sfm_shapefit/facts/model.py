@@ -419,6 +419,10 @@ class JoinedFacts(CheckedFacts):
     ]
     datum: Annotated[EarthDatum | None, "Where the origin is on Earth; null if that is not known."]
 
+    def scene_rows(self) -> list[Row]:
+        """Return what came of joining the models."""
+        return [Row("join", [one.statement for one in self.joins])]
+
     @property
     def next_step(self) -> NextStep:
         """What to do next."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence
+from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
 from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
@@ -180,7 +180,16 @@ def doubted():
         return GroupApart(images=images, num_agreeing=1, num_contradicting=9, num_turned=0, turn_deg=None)
 
     place = AmbiguousPlace(image=names[9], num_here=2, num_there=5, offset=(1.0, 2.0, -0.5))
-    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])))
+    second = ToldOpinion(
+        num_common=25,
+        usual=1e-3,
+        wrong=(names[4], names[12]),
+        undecided=(),
+        num_for=0,
+        num_against=9,
+        ambiguous=(),
+    )
+    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])), second=second)
     return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
 
 
@@ -190,6 +199,7 @@ def test_a_group_that_stands_apart_and_another_place_reach_the_scene_and_are_tol
     columns, names = data["cameras"], drawing.cameras.names
     group = dict(zip(columns["names"], unpacked(columns["group"]).tolist(), strict=True))
     assert [group[name] for name in names[2:8]] == [-1, 1, 0, 0, 1, -1]
+    assert [group[name] for name in names[11:14]] == [-1, 2, -1]  # elsewhere in the second opinion alone
     others = unpacked(columns["other"]).reshape(-1, 3)
     row = columns["names"].index(names[9])
     assert np.flatnonzero(np.isfinite(others).all(axis=1)).tolist() == [row]
