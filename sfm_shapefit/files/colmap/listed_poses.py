@@ -101,8 +101,7 @@ def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
     turns, shifts = images.sensors.rotations[lenses], images.sensors.translations[lenses]
     own = np.swapaxes(turns, 1, 2) @ poses.rotations[found]
     places = poses.centers[found] + np.einsum("kba,kb->ka", poses.rotations[found], shifts)
-    rotations = np.full_like(images.frames.rotations, np.nan)
-    centers = np.full_like(images.frames.centers, np.nan)
+    rotations, centers = (np.full_like(a, np.nan) for a in (images.frames.rotations, images.frames.centers))
     order = np.argsort(frames, kind="stable")
     known, first = np.unique(frames[order], return_index=True)
     for frame, part in zip(known.tolist(), np.split(order, first[1:]), strict=True):
