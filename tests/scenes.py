@@ -18,6 +18,7 @@ from sfm_shapefit.scene.matches import View
 ROOT = Path(__file__).parents[1]
 BUNDLED = ROOT / "data_synthetic"
 COURTYARD, RING, FACADE = BUNDLED / "courtyard", BUNDLED / "ring8", BUNDLED / "facade9"
+PHOTOGRAPHED = BUNDLED / "photographed"
 SHARED = ROOT.parent / "shared" / "data"
 
 

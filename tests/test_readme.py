@@ -1,14 +1,20 @@
 """What README and docs say runs as it stands: commands one after the other, Python blocks, and every link."""
 
 import ast
+import json
 import re
 import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import figure
 import options_table
+import sfm_shapefit
 from sfm_shapefit.cli import app
 from tests.program import run
 from tests.scenes import ROOT
@@ -134,8 +140,56 @@ def test_the_docs_are_short_and_the_table_of_options_is_made_from_their_definiti
     assert TEXTS[ROOT / "docs/options.md"].endswith(f"{options_table.table()}\n")
 
 
-def test_the_dockerfile_installs_what_is_there_in_five_lines():
+def test_the_dockerfile_installs_what_is_there_in_five_lines(tmp_path):
+    """All but the daemon: what COPY takes is installed by RUN's pip, and has the command and its warm-up."""
     lines = (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 5
-    assert re.findall(r"sfm-shapefit ([\w-]+)", " ".join(lines)) == ["warm-up"]
-    assert {"FROM", "COPY", "RUN", "ENTRYPOINT"} <= {line.split()[0] for line in lines}
+    said = dict(line.split(maxsplit=1) for line in lines)
+    assert said.keys() == {"FROM", "COPY", "RUN", "WORKDIR", "ENTRYPOINT"}
+    assert said["COPY"] == ". /src"
+    assert said["RUN"] == "pip install --no-cache-dir /src && sfm-shapefit warm-up"
+    assert json.loads(said["ENTRYPOINT"]) == ["sfm-shapefit"]
+    left_out = (ROOT / ".dockerignore").read_text(encoding="utf-8").split()
+    assert {".git", ".venv"} <= set(left_out)  # gigabytes
+    heavy = shutil.ignore_patterns(*(line.removeprefix("**/") for line in left_out), "results", "tests")
+    shutil.copytree(ROOT, tmp_path / "src", ignore=heavy)
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--target"]
+    subprocess.run([*pip, tmp_path / "site", tmp_path / "src"], check=True)
+    (metadata,) = (tmp_path / "site").glob("*.dist-info")
+    assert "sfm-shapefit = sfm_shapefit.cli:main" in (metadata / "entry_points.txt").read_text()
+    assert said["FROM"].startswith("python:3.12")  # newer than what is required
+    assert "\nRequires-Python: >=3.11\n" in (metadata / "METADATA").read_text(encoding="utf-8")
+    here, there = ROOT / "sfm_shapefit", tmp_path / "site/sfm_shapefit"
+    files = {path.relative_to(here) for path in here.rglob("*") if "__pycache__" not in path.parts}
+    assert files <= {path.relative_to(there) for path in there.rglob("*")}
+
+
+ADDRESS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"][
+    "Repository"
+]
+
+
+def addresses_in(folder: Path) -> dict[str, str]:
+    """The address of the project in each file that has one."""
+    patterns = {"README.md": r"git clone (\S+)", "CITATION.cff": r'repository-code: "(.+)"'}
+    return {
+        name: re.search(pattern, (folder / name).read_text(encoding="utf-8"))[1]
+        for name, pattern in patterns.items()
+    }
+
+
+def test_the_address_stands_in_one_place_from_which_the_others_have_it(tmp_path):
+    assert set(addresses_in(ROOT).values()) == {ADDRESS}
+    host = re.search(r"//([^/]+)", ADDRESS)[1]
+    others = [path for path in PAGES[1:] if host in TEXTS[path]]
+    assert not others, "a page with an address that scripts/address does not write"
+    assert f"version: {sfm_shapefit.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    for name in ("pyproject.toml", *addresses_in(ROOT), "scripts/address"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    subprocess.run([tmp_path / "scripts/address", "https://fork.test/me/shapes.git"], check=True)
+    assert set(addresses_in(tmp_path).values()) == {"https://fork.test/me/shapes.git"}
+    assert "&& cd shapes  #" in (tmp_path / "README.md").read_text(encoding="utf-8")
+    before, after = ((folder / "README.md").read_text(encoding="utf-8") for folder in (ROOT, tmp_path))
+    changed = [a for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
+    assert len(changed) == 1

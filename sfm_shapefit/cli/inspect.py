@@ -8,13 +8,7 @@ import typer
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
-from sfm_shapefit.cli.console import (
-    print_json,
-    print_lines,
-    print_table,
-    report_errors,
-    show_progress,
-)
+from sfm_shapefit.cli.console import print_json, print_lines, print_table, report_errors, show_progress
 from sfm_shapefit.cli.flags import (
     Config,
     Database,
@@ -61,11 +55,12 @@ def inspect_command(
         if as_json:
             print_json(found.summary())
         else:
-            what = "node" if source.is_file() else "image"
+            what = "node" if source.is_file() and database is None else "image"
             told = found.told
             print_table(f"{counted(found.num_images, what)} of {source}", told.rows, told.elsewhere)
             if not found.diagnosis.obstacle:
                 command = "place" if what == "node" else "locate"
-                print_lines([f"next: sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
+                by = "" if database is None else f" --database {shlex.quote(str(database))}"
+                print_lines([f"next: sfm-shapefit {command} {shlex.quote(str(source))} OUT{by}"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)

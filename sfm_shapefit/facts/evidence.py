@@ -94,6 +94,9 @@ class ToldOpinion(Record):
     undecided: Annotated[tuple[str, ...], "Images that stand elsewhere there, where pairs support neither."]
     num_for: Annotated[int, "Pairs that support this model against the other, of wrong images."]
     num_against: Annotated[int, "Pairs of these that support the other."]
+    ambiguous: Annotated[
+        tuple[str, ...], "Images that stand there too, though matches suit another rotation."
+    ]
 
     @property
     def statement(self) -> str:
@@ -107,6 +110,9 @@ class ToldOpinion(Record):
             )
         if self.undecided:
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
+        if self.ambiguous:
+            where = f"{_cameras(self.ambiguous)} where they do {by}"
+            parts.append(f"{where}, but as many matches speak for another rotation")
         usual = f"{100.0 * self.usual:.2g} % of their spread apart in the median"
         if not parts and self.usual > _ALIKE:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
@@ -128,7 +134,7 @@ class ToldEvidence(Record):
         """A sentence for each."""
         seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
         lenses, second = (told.statement for told in self.lenses), self.second
-        differs = second is not None and (second.wrong or second.undecided)
+        differs = second is not None and (second.wrong or second.undecided or second.ambiguous)
         told = [*seams, *places, *lenses, *([second.statement] if second is not None and differs else [])]
         if self.contradicted:
             told.append(
@@ -175,8 +181,9 @@ def tell_evidence(
 
 
 def _tell_opinion(second: SecondOpinion, images: Images) -> ToldOpinion:
-    wrong, undecided = (
-        tuple(images.names[k] for k in rows.tolist()) for rows in (second.wrong, second.undecided)
+    wrong, undecided, ambiguous = (
+        tuple(images.names[k] for k in rows.tolist())
+        for rows in (second.wrong, second.undecided, second.ambiguous)
     )
     return ToldOpinion(
         num_common=second.num_common,
@@ -185,6 +192,7 @@ def _tell_opinion(second: SecondOpinion, images: Images) -> ToldOpinion:
         undecided=undecided,
         num_for=second.num_for,
         num_against=second.num_against,
+        ambiguous=ambiguous,
     )
 
 

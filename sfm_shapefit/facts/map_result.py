@@ -18,7 +18,7 @@ from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, JoinedFacts, MapFacts
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.judgement.grade import ModelVerdict
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
@@ -42,7 +42,7 @@ class MappedModel:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class JoinedModel(Written):
+class JoinedModel(Written, Tabled):
     """Models in one world, and the evidence for them together."""
 
     _PUBLIC = ("reconstruction", "models", "joins", "cameras", "pairs", "table", "warnings", "timings_s")
@@ -83,16 +83,11 @@ class JoinedModel(Written):
         """What the user should know."""
         return self.facts.warnings
 
-    def table(self, name: TableName) -> dict[str, Column]:
-        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
-        return table_of(self, name, 3)
-
     @property
     def told(self) -> Telling:
         """What the terminal says: how the models were joined, or why not, and what `check` says of them."""
         told = self.facts.told(self.cameras, self.pairs)
-        joins = [row("join", one.statement) for one in self.joins]
-        return told._replace(rows=[*joins, *told.rows], elsewhere="see cameras.csv")
+        return told._replace(rows=[*self.facts.scene_rows(), *told.rows], elsewhere="see cameras.csv")
 
     def _headline(self) -> str:
         models = counted(len(self.models), "model")

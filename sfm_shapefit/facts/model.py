@@ -33,12 +33,7 @@ from sfm_shapefit.facts.placed import (
     Warnings,
 )
 from sfm_shapefit.facts.rigs import RefinedSensor, describe_rigs
-from sfm_shapefit.facts.scene import (
-    DistanceFacts,
-    Loop,
-    describe_line,
-    describe_loops,
-)
+from sfm_shapefit.facts.scene import DistanceFacts, Loop, describe_line, describe_loops
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -65,6 +60,11 @@ class ModelInputs(InputFacts):
     def path(self) -> str:
         """Path of the model; one in memory, as of `map`, is named by its database."""
         return self.database if self.model == IN_MEMORY and self.database else self.model
+
+    @property
+    def database_flag(self) -> str:
+        """How a command is given the database, after a space; empty without one."""
+        return f" --database {shlex.quote(_from_here(self.database))}" if self.database else ""
 
 
 class EvidenceShares(Record):
@@ -291,7 +291,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=True)
+        return next_of_model(self.verdict.grade, self.inputs, is_adjusted=True)
 
     def scene_rows(self) -> list[Row]:
         """Return what is told of lenses, rigs, control points and the scene, where there is something."""
@@ -348,10 +348,11 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return [f"{usable} usable ({contradicting} contradict the solution)", *others]
 
 
-def next_of_model(grade: Grade, source: str, *, is_adjusted: bool) -> NextStep:
-    """Return what to do with a model of ours, made of a source."""
+def next_of_model(grade: Grade, inputs: ModelInputs, *, is_adjusted: bool) -> NextStep:
+    """Return what to do with a model of ours, by what it was made of."""
     if grade is Grade.DO_NOT_USE:
-        step = f"sfm-shapefit inspect {shlex.quote(source)}"
+        model = "{out}" if inputs.model == IN_MEMORY else shlex.quote(inputs.model)  # `map` has no other
+        step = f"sfm-shapefit inspect {model}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
     if not is_adjusted:
@@ -383,16 +384,13 @@ class CheckedFacts(FactsOfModel):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        path = shlex.quote(self.inputs.path)
-        if self.verdict.grade is Grade.GOOD:
-            return NextStep(
-                "Next: undistort the images for splatting or dense reconstruction.",
-                f"colmap image_undistorter --image_path IMAGES --input_path {path} --output_path dense",
-            )
+        path, second = shlex.quote(self.inputs.path), self.evidence.second
+        is_as_map_has_it = second is not None and not (second.wrong or second.undecided)
+        if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
+            step = next_of_model(self.verdict.grade, self.inputs, is_adjusted=True)
+            return step._replace(command=step.command.format(out=path, out_dense="dense"))
         text = "Next: place the cameras anew from their rotations and matches, and compare."
-        database = self.inputs.database
-        by = f" --database {shlex.quote(_from_here(database))}" if database else ""
-        return NextStep(text, f"sfm-shapefit locate {path} located{by}")
+        return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
         """Return what the terminal says.
@@ -406,10 +404,8 @@ class CheckedFacts(FactsOfModel):
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
         lines = self.told_lines("posed", (judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
-        second = (
-            [] if self.evidence.second is None else [row("second opinion", self.evidence.second.statement)]
-        )
-        return Telling(lines, [Row("weak", weak), *second], elsewhere="see the report", step=self.next_step)
+        second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
+        return Telling(lines, [Row("weak", weak), second], elsewhere="see the report", step=self.next_step)
 
 
 class JoinedFacts(CheckedFacts):
@@ -423,11 +419,15 @@ class JoinedFacts(CheckedFacts):
     ]
     datum: Annotated[EarthDatum | None, "Where the origin is on Earth; null if that is not known."]
 
+    def scene_rows(self) -> list[Row]:
+        """Return what came of joining the models."""
+        return [Row("join", [one.statement for one in self.joins])]
+
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
         is_adjusted = self.options.get("adjust") == "full" and "join" not in self.options
-        return next_of_model(self.verdict.grade, self.inputs.path, is_adjusted=is_adjusted)
+        return next_of_model(self.verdict.grade, self.inputs, is_adjusted=is_adjusted)
 
 
 class DatabaseInputs(Record):

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,7 +43,7 @@ from sfm_shapefit.facts.placed import (
 from sfm_shapefit.facts.rigs import RefinedSensor
 from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.facts.scene import Loop, told_distances
-from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
@@ -95,8 +95,34 @@ class Inputs:
         )
 
 
+class _Placed(Written, Tabled):
+    """A placed model or graph."""
+
+    placement: Judged
+
+    @property
+    def told(self: Any) -> Telling:
+        """What the terminal says."""
+        left_out = [f"{row.name}: {row.reason}" for row in self.cameras if not row.placed]
+        told: Telling = self.facts.told(left_out, self.placement.refined.statement())
+        return told
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        return report_in_notebook(self)
+
+    @property
+    def certified(self) -> SolverResult:
+        """The solve of the largest rigid piece, with its certificate, before any refinement."""
+        return self.placement.certified
+
+    @property
+    def _dimension(self) -> int:
+        return self.placement.graph.dimension
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class LocateResult(Written):
+class LocateResult(_Placed):
     """The placed model and the evidence for it: that of piece 0, the largest, and `further` ones."""
 
     _PUBLIC = (
@@ -225,22 +251,9 @@ class LocateResult(Written):
             bundle_adjustment=BundleAdjustment.of(self.adjusted),
         )
 
-    @property
-    def told(self) -> Telling:
-        """What the terminal says."""
-        return self.facts.told(_left_out(self.cameras), self.placement.refined.statement())
-
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
         return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
-
-    def _repr_html_(self) -> str:
-        """Return verdict, figures and warnings, and the report with its scene."""
-        return report_in_notebook(self)
-
-    def table(self, name: TableName) -> dict[str, Column]:
-        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
-        return table_of(self, name, 3)
 
     @property
     def told_evidence(self) -> ToldEvidence:
@@ -272,11 +285,6 @@ class LocateResult(Written):
     def database(self) -> Path | None:
         """The database whose matches were used, if any."""
         return self.inputs.database
-
-    @property
-    def certified(self) -> SolverResult:
-        """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.certified
 
     @property
     def pieces(self) -> list[RigidPiece]:
@@ -418,18 +426,13 @@ class LocateResult(Written):
         return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
 
 
-def _left_out(cameras: list[CameraRow]) -> list[str]:
-    """Return the cameras that are not placed, with the reason."""
-    return [f"{row.name}: {row.reason}" for row in cameras if not row.placed]
-
-
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
     """Return a pair's row with its direction in the output's axes."""
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class GraphResult(Written):
+class GraphResult(_Placed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
     _PUBLIC = ("cameras", "pairs", "table", "options", "timings_s", "placement", "further", "certified")
@@ -473,22 +476,9 @@ class GraphResult(Written):
         """The pairs of the largest piece that are taken for right, and the program restricted to them."""
         return examine_right_pairs(self.placement, self.options.solver)
 
-    @property
-    def told(self) -> Telling:
-        """What the terminal says."""
-        return self.facts.told(_left_out(self.cameras), self.placement.refined.statement())
-
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
         return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
-
-    def _repr_html_(self) -> str:
-        """Return verdict, figures and warnings, and the report with its scene."""
-        return report_in_notebook(self)
-
-    def table(self, name: TableName) -> dict[str, Column]:
-        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
-        return table_of(self, name, self.placement.graph.dimension)
 
     @property
     def image_names(self) -> tuple[str, ...]:
@@ -499,11 +489,6 @@ class GraphResult(Written):
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
         return judge_graph(self.placement)
-
-    @property
-    def certified(self) -> SolverResult:
-        """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.certified
 
     @cached_property
     def cameras(self) -> list[CameraRow]:

@@ -176,15 +176,24 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-def table_of(found: object, name: TableName, dimension: int) -> dict[str, Column]:
-    """Return the cameras or the pairs of a result, which it has as rows, as columns.
+class Tabled:
+    """A result with rows of `cameras` and `pairs`."""
 
-    Raises:
-        ValueError: if there is no table of this name.
-    """
-    if name not in _ROW_TYPES:
-        raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
-    return columns_of(getattr(found, name), _ROW_TYPES[name], dimension)
+    __slots__ = ()
+
+    @property
+    def _dimension(self) -> int:
+        return 3
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them.
+
+        Raises:
+            ValueError: if there is no table of this name.
+        """
+        if name not in _ROW_TYPES:
+            raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
+        return columns_of(getattr(self, name), _ROW_TYPES[name], self._dimension)
 
 
 def columns_of(

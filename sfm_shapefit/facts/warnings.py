@@ -60,9 +60,9 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
         assert refined.disagreement is not None
         yield (
-            f"lengths are poorly known: ShapeFit and LUD disagree by {refined.disagreement:.0%}, as on long "
-            f"chains and with many wrong pairs; kept: {refined.start}"
-            + ("" if refined.is_refined else ", unrefined; objective=auto refines both and compares")
+            f"lengths are poorly known: two ways to find them disagree by {refined.disagreement:.0%}, as on "
+            "long chains and with many wrong pairs"
+            + ("" if refined.is_refined else "; objective=auto refines both and compares")
         )
     yield from _uncertainty_warnings(placement)
     if rejected > _ALARMING_SHARE:

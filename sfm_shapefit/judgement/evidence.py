@@ -143,6 +143,8 @@ class SecondOpinion(NamedTuple):
     """Pairs that support this model against the other, of `wrong` cameras."""
     num_against: int
     """Pairs of these that support the other."""
+    ambiguous: IntArray
+    """Rows of cameras that stand where they do in the other model, which doubts them; none is `confirmed`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

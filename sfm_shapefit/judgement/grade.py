@@ -131,6 +131,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
     confirmed = set() if second is None else set(second.confirmed.tolist())
     doubted = [one.camera for one in evidence.contradicted if one.camera not in confirmed]
+    doubted += [] if second is None else second.ambiguous.tolist()
     count = int(images.is_posed.sum())
     suspicions: list[str] = []
     reasons: list[str] = []

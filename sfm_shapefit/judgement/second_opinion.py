@@ -17,12 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import (
-    fit_similarity_l1,
-    mean_rotation_l1,
-    median_spread,
-    rotation_angles_deg,
-)
+from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
 from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
 from sfm_shapefit.scene.images import Images
 
@@ -38,7 +33,7 @@ _NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the r
 
 
 def compare_models(
-    images: Images, fits: PairFits, others: Images, other_fits: PairFits
+    images: Images, fits: PairFits, others: Images, other_fits: PairFits, doubted: BoolArray
 ) -> SecondOpinion | None:
     """Return how images compare with others of the same names; None if too few are common.
 
@@ -47,6 +42,7 @@ def compare_models(
         fits: how the pairs of matches fit it.
         others: images of the other model, some of them posed.
         other_fits: how the pairs fit that.
+        doubted: (k,) others that may stand elsewhere by their own matches.
     """
     row_of = {name: k for k, name in enumerate(others.names) if others.is_posed[k]}
     mine = np.array([k for k, name in enumerate(images.names) if name in row_of], dtype=np.int64)
@@ -70,15 +66,17 @@ def compare_models(
     wrong = elsewhere & (there >= np.maximum(_OUTNUMBERED * here, _FEWEST_PAIRS))
     right = elsewhere & (here >= np.maximum(_OUTNUMBERED * there, _FEWEST_PAIRS))
     undecided = elsewhere & ~wrong & ~right & (here + there >= _FEWEST_PAIRS)
+    alike = ~(unlike[0] | unlike[1])
     num_for, num_against = _count_votes(*residuals, wrong).sum(axis=0).tolist()
     return SecondOpinion(
         num_common=len(mine),
         usual=usual,
         wrong=mine[wrong],
         undecided=mine[undecided],
-        confirmed=mine[~(unlike[0] | unlike[1])],
+        confirmed=mine[alike & ~doubted[theirs]],
         num_for=num_for,
         num_against=num_against,
+        ambiguous=mine[alike & doubted[theirs]],
     )
 
 

@@ -17,7 +17,7 @@ from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.trust import LOW_TRUST, PairFit, judge_cameras
-from sfm_shapefit.judgement.turns import Doubts
+from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (
     GroupGauge,
     propagate,
@@ -78,6 +78,12 @@ class Assessment:
     NaN, all of them, where the graph is too large for its factor."""
     doubts: Doubts | None = None
     """What the pairs' own rotations say of those given; None if they were not asked."""
+
+    @property
+    def ambiguous(self) -> BoolArray:
+        """(k,) cameras whose matches speak as much for another rotation, and which no pixels confirm."""
+        kinds = [None] * len(self.trust) if self.doubts is None else self.doubts.kinds
+        return np.array([kind is Doubt.AMBIGUOUS for kind in kinds]) & np.less(self.trust, LOW_TRUST)
 
     @property
     def sigmas(self) -> FloatArray:

@@ -45,25 +45,15 @@ def are_confirmed(
     asked = np.isin(images.frame_of, images.frame_of[doubted]) & images.is_posed
     left = asked
     while left.any():
-        found = left & _fit(points, images, pictures, left, matches)[images.frame_of]
-        if not found.any():
+        those = points.taken(points.paired(~left[points.images])).seen_by(left, *matches, least=_WITNESSES)
+        own = left[those.images]
+        frames = images.frame_of[those.images[own]]
+        fits = keypoint_errors_px(those, images, pictures)[own] <= FITTING_PX
+        fitting, missing = (
+            np.bincount(frames[part], minlength=len(images.frames.ids)) for part in (fits, ~fits)
+        )
+        is_right = (fitting >= _FEWEST_FITTING) & (fitting >= _OUTNUMBERED * missing)
+        if not (left & is_right[images.frame_of]).any():
             break
-        left = left & ~found
+        left = left & ~is_right[images.frame_of]
     return np.asarray(asked & ~left)
-
-
-def _fit(
-    points: Points,
-    images: Images,
-    pictures: Pictures,
-    doubted: BoolArray,
-    matches: tuple[IntArray, Sequence[KeypointMatches]],
-) -> BoolArray:
-    """Return the frames (f,) whose pixels fit the points of images that are not doubted (i,)."""
-    points = points.taken(points.paired(~doubted[points.images]))
-    points = points.seen_by(doubted, *matches, least=_WITNESSES)
-    own = doubted[points.images]
-    frames = images.frame_of[points.images[own]]
-    fits = keypoint_errors_px(points, images, pictures)[own] <= FITTING_PX
-    fitting, missing = (np.bincount(frames[part], minlength=len(images.frames.ids)) for part in (fits, ~fits))
-    return np.asarray((fitting >= _FEWEST_FITTING) & (fitting >= _OUTNUMBERED * missing))

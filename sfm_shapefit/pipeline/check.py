@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
@@ -58,4 +60,6 @@ def _map_anew(
     names = set(posed.images.names)
     models = [model.located for model in found.models]
     best = max(models, key=lambda one: len(names.intersection(one.placed.names)))
-    return OtherModel(best.placed, fit_pairs(best.placed.centers, best.directions))
+    doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
+    doubted[best.placement.cameras] = best.placement.assessment.ambiguous
+    return OtherModel(best.placed, fit_pairs(best.placed.centers, best.directions), doubted)

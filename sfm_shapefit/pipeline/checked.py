@@ -34,21 +34,18 @@ import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.evidence import tell_evidence
 from sfm_shapefit.facts.model import CheckedFacts
 from sfm_shapefit.facts.placed import KeyFigures
-from sfm_shapefit.facts.tables import CameraRow, Column, PairRow, TableName, table_of
+from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import (
-    Grade,
-    ModelVerdict,
-    weigh_evidence,
-)
+from sfm_shapefit.judgement.grade import Grade, ModelVerdict, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -72,7 +69,7 @@ _ROUNDING = 1e-9  # share of the largest coordinate; cameras no farther apart st
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class CheckResult(Reported):
+class CheckResult(Reported, Tabled):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
@@ -95,10 +92,6 @@ class CheckResult(Reported):
         """Whether the model can be used, and why."""
         return self.facts.verdict
 
-    def table(self, name: TableName) -> dict[str, Column]:
-        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
-        return table_of(self, name, 3)
-
     @cached_property
     def drawing(self) -> "Drawing":
         """The scene, with what the page shows of each image."""
@@ -117,6 +110,8 @@ class OtherModel(NamedTuple):
     """Where it has them."""
     fits: PairFits
     """How pairs fit it."""
+    doubted: BoolArray
+    """(n,) images that may stand elsewhere by their own matches."""
 
 
 def check_source(

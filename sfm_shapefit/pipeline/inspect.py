@@ -7,20 +7,14 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.inspected import Inspection
 from sfm_shapefit.facts.options import InspectOptions
-from sfm_shapefit.files.colmap.model import ModelSource, read_model
+from sfm_shapefit.files.colmap.listed_poses import is_list, read_source
+from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
-from sfm_shapefit.pipeline.measure import (
-    Wanted,
-    add_evidence,
-    build_graph,
-    count_work,
-    measure,
-    wants_points,
-)
+from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
 from sfm_shapefit.pipeline.memory import describe_work, forecast
 from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
@@ -37,8 +31,7 @@ def inspect(
     """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
 
     Args:
-        source: a reconstruction, a result or a model folder as for `locate`, or the text file of a
-            bare graph.
+        source: as for `locate`, or the text file of a bare graph.
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
         **overrides: single options by name.
@@ -53,9 +46,7 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = merge_options(options, InspectOptions, overrides)
-    if isinstance(source, Path | str) and Path(source).is_file():
-        if Path(source).suffix.lower() in (".json", ".tum"):
-            raise InputError(f"{source} is a list of poses; place it with `locate`, and inspect the model")
+    if isinstance(source, Path | str) and _is_graph(Path(source), database):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         graph = read_graph(source)
@@ -68,7 +59,7 @@ def inspect(
         )
     clock = Clock.of(progress, options.placement.solver)
     with clock("read"):
-        model = read_model(source)
+        model, _ = read_source(source, database)
         inputs = choose_inputs(source, database, options.source.directions)
         inputs = read_left_out(inputs, model.images.names, options.directions.without)
     images = model.images
@@ -92,3 +83,9 @@ def inspect(
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(images, grouped),
             )
+
+
+def _is_graph(source: Path, database: Path | str | None) -> bool:
+    """Return whether a source is a bare graph; a .txt is a trajectory if a database has its matches."""
+    may_be_graph = not is_list(source) or (source.suffix.lower() == ".txt" and database is None)
+    return source.is_file() and may_be_graph

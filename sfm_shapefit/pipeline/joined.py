@@ -89,7 +89,7 @@ def tell_group(
         k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
     }
     folder = f"joined_{first}" if located else "."
-    gauge = Gauge(scale="input", similarity=_SAME, statement="input: that of the first model")
+    gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
         gauge, rescale = _choose_scale(group, located[first].gauge, told.distances)
         group = _rescaled(group, rescale)

@@ -17,20 +17,15 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.files.colmap.listed_poses import is_list, read_list
-from sfm_shapefit.files.colmap.model import ModelSource, read_model
+from sfm_shapefit.files.colmap.listed_poses import read_source
+from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.given import Given
-from sfm_shapefit.pipeline.inputs import (
-    choose_inputs,
-    open_matches,
-    read_left_out,
-    see_matches,
-)
+from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
@@ -88,12 +83,7 @@ def locate(
     clock = Clock.of(progress, options.placement.solver, executor)
     with ExitStack() as stack:
         with clock("read"):
-            listed: frozenset[int] = frozenset()
-            if isinstance(reconstruction, Path | str) and is_list(reconstruction):
-                posed, listed = read_list(Path(reconstruction), database)
-                model = read_model(posed)
-            else:
-                model = read_model(reconstruction)
+            model, listed = read_source(reconstruction, database)
             given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
             inputs = read_left_out(inputs, given.names, options.directions.without)

@@ -24,7 +24,9 @@ from sfm_shapefit.scene.matches import MatchBatch, is_among
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 from sfm_shapefit.tracks.options import NodeOptions
 
-_CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_CHECK_ROTATIONS = (
+    "check that rotations and intrinsics belong to these matches; rough rotations need rotations=2"
+)
 _MAX_SAMPLED_PAIRS = 100_000  # pairs; beyond, standard deviations take them as independent, for memory
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",

@@ -30,7 +30,7 @@ MAX_ROTATION_ERROR_DEG = 10.0  # degrees; pairs off by more are taken for false,
 
 
 def place(
-    measured: MeasuredGraph | ViewGraph,
+    measured: MeasuredGraph | ViewGraph | Path | str,
     options: PlacementOptions | None = None,
     *,
     on_iteration: OnIteration | None = None,
@@ -46,8 +46,8 @@ def place(
     collapses on long chains and under heavy corruption.
 
     Args:
-        measured: any view graph with at least one edge, best with what is known of its directions; what its
-            largest rigid piece leaves out is not placed.
+        measured: any view graph with at least one edge, or its text file, best with what is known of its
+            directions; what its largest rigid piece leaves out is not placed.
         options: settings, see `help(PlacementOptions)`; defaults if None.
         on_iteration: as of `place_pieces`.
         **overrides: single options by name: `place(graph, refine=False)`.
@@ -56,6 +56,7 @@ def place(
         InputError, UnsolvableError: as `place_pieces`.
     """
     options = merge_options(options, PlacementOptions, overrides)
+    measured = read_graph(measured) if isinstance(measured, Path | str) else measured
     graph = MeasuredGraph(measured) if isinstance(measured, ViewGraph) else measured
     return judge(next(place_pieces(graph, options, on_iteration=on_iteration)), options)
 

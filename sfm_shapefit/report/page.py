@@ -203,6 +203,8 @@ def _doubts(drawing: Drawing, facts: Facts, order: IntArray, display: _Display) 
     groups = np.full(len(row_of), -1)
     for k in sorted(range(len(evidence.seams)), key=lambda k: -len(evidence.seams[k].images)):
         groups[[row_of[name] for name in evidence.seams[k].images]] = k  # the smallest wins
+    wrong = [] if evidence.second is None else [row_of[name] for name in evidence.second.wrong]
+    groups[[row for row in wrong if groups[row] < 0]] = len(evidence.seams)
     others, counts = np.full((len(row_of), 3), np.nan), np.zeros((len(row_of), 2))
     for place in evidence.places:
         row = row_of[place.image]

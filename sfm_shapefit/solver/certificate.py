@@ -78,7 +78,6 @@ _ON_SURFACE = 0.99  # ||y_e|| / w_e; from here on a pair counts as on the surfac
 _REPAIRS = 4  # repairs; each shrinks the equality residual to the rounding of the previous one
 _CG_STEPS = 500  # conjugate gradient steps; 10 to 60 are needed on all but long chains
 _LARGE, _EDGE_BLOCKS = 200_000, 4  # pairs, and blocks; passes over more pairs run in parallel blocks
-_SEED = 1  # seed of the preconditioner; same input, same answer
 _EXACT_PER_GAP = 1e-5  # equality residual per gap; it needs no repair, for the bound moves by 100 times it
 _LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of that residual; rounding, and what a bound may rest on
 # The rounds end where the gap is expected below this share of the one asked for. The exact repair is expected

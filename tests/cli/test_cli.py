@@ -543,8 +543,17 @@ def test_a_word_that_a_flag_does_not_take_is_refused_without_words_of_a_library(
 def test_json_in_the_place_of_a_model_or_graph_is_told_what_is_wanted(tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text("{}\n")
-    assert "is a list of poses; place it with `locate`" in run_refused("inspect", path)
-    assert "has no key 'frames'; give a transforms.json" in run_refused("locate", path, tmp_path / "out")
+    for command in (("inspect", path), ("locate", path, tmp_path / "out")):
+        assert "has no key 'frames'; give a transforms.json" in run_refused(*command)
+
+
+def test_a_list_of_poses_is_inspected_as_it_is_located_and_a_graph_stays_one(tmp_path):
+    for name in ("poses.json", "poses.txt"):
+        run("convert", RING_MODEL, tmp_path / name, "--format", "nerf" if name[-1] == "n" else "tum", code=0)
+        said = run("inspect", tmp_path / name, "--database", RING / "database.db", code=0).output
+        assert said.startswith("8 images of ")
+        assert f"--database {RING / 'database.db'}" in said.splitlines()[-1]
+    assert "40 nodes" in run("inspect", BUNDLED / "graph40.txt", code=0).output
 
 
 def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):

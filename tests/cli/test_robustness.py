@@ -138,6 +138,18 @@ def test_a_carriage_return_in_a_name_is_quoted_and_read_again(tmp_path):
     run("convert", tmp_path / "out", tmp_path / "scene.glb", code=0)
 
 
+def test_names_that_spreadsheets_take_for_formulas_stay_as_they_are_which_the_docs_say(tmp_path):
+    names = ["=1+1", "+2.jpg", "-3.jpg", "@sum"]
+    model = pycolmap.Reconstruction(RING / "sparse/0")
+    for k, name in enumerate(names, start=1):
+        model.images[k].name = name
+    model.write(tmp_path)
+    run("locate", tmp_path, tmp_path / "out", "-q", code=0)
+    with (tmp_path / "out/cameras.csv").open(newline="") as stream:
+        assert {row["name"] for row in csv.DictReader(stream)} >= set(names)
+    assert "begins with `=` for a formula" in (ROOT / "docs/commands.md").read_text(encoding="utf-8")
+
+
 def test_assertions_of_colmap_are_put_in_words_of_ours(monkeypatch):
     def fails(*_arguments):
         raise ValueError("[reconstruction.cc:12] Check failed: images_.count(id) (0 vs. 1)")

@@ -24,9 +24,7 @@ from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from tests.models import posed
 from tests.problems import turn
-from tests.scenes import BUNDLED, COURTYARD
-
-PHOTOGRAPHED = BUNDLED / "photographed"
+from tests.scenes import COURTYARD, PHOTOGRAPHED
 
 
 @cache

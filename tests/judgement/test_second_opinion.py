@@ -37,11 +37,12 @@ def in_other_axes(images):
     return replace(images, frames=replace(frames, centers=centers, rotations=frames.rotations @ turn.T))
 
 
-def compare(images, others, truth):
+def compare(images, others, truth, doubted=()):
     """Compare two models by directions that are those of the truth, each in its own axes."""
     fits = fit_pairs(images.centers, measured(truth.centers))
     others, truth = in_other_axes(others), in_other_axes(truth)
-    return compare_models(images, fits, others, fit_pairs(others.centers, measured(truth.centers)))
+    other_fits = fit_pairs(others.centers, measured(truth.centers))
+    return compare_models(images, fits, others, other_fits, np.isin(np.arange(N), doubted))
 
 
 @pytest.mark.parametrize("how", [{"shift": 2.0}, {"scale": 1.1}, {"turn_deg": 3.0}, {"turn_deg": 90.0}])
@@ -66,6 +67,13 @@ def test_models_that_agree_have_all_cameras_confirmed(images):
     assert (len(found.wrong), len(found.undecided)) == (0, 0)
 
 
+def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
+    found = compare(moved(images, [5], shift=2.0), images, images, doubted=[5, 7])
+    assert found.ambiguous.tolist() == [7]  # 5 stands elsewhere, where pairs support it
+    assert found.wrong.tolist() == [5]
+    assert sorted([*found.confirmed.tolist(), 5, 7]) == list(range(N))
+
+
 def test_where_pairs_support_neither_nobody_is_believed(images):
     one, other = moved(images, [5], shift=2.0), moved(images, [5], shift=-2.0)
     found = compare(one, other, images)
@@ -76,7 +84,8 @@ def test_where_pairs_support_neither_nobody_is_believed(images):
     ends = np.where((pairs == 5)[:, :, None], towards[:, None], images.centers[pairs])
     lies = ends[:, 0] - ends[:, 1]
     half = replace(half, directions=lies / np.linalg.norm(lies, axis=1, keepdims=True))
-    found = compare_models(one, fit_pairs(one.centers, half), other, fit_pairs(other.centers, half))
+    nobody = np.zeros(N, dtype=np.bool_)
+    found = compare_models(one, fit_pairs(one.centers, half), other, fit_pairs(other.centers, half), nobody)
     assert found.undecided.tolist() == [5]
 
 

@@ -10,11 +10,12 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.pipeline.check import check
+from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.facts.test_schema import problems
 from tests.program import run, run_refused
-from tests.scenes import COURTYARD, RING, fingerprint
+from tests.scenes import COURTYARD, PHOTOGRAPHED, RING, fingerprint
 from tests.structures import pictures_of
 
 
@@ -90,6 +91,19 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
     drawing, facts = found.drawing, found.facts
     assert image.name in facts.verdict.cameras
     assert "its reprojection error is" in drawing.cameras.reasons[drawing.cameras.names.index(image.name)]
+
+
+def test_what_map_doubts_check_does_not_call_good():
+    """Houses look the same: as many matches speak for another rotation of two cameras."""
+    mapped = map_database(PHOTOGRAPHED / "database.db")
+    doubted = mapped.models[0].located.verdict.cameras
+    assert doubted
+    for model in (mapped, PHOTOGRAPHED / "truth"):
+        found = check(model, PHOTOGRAPHED / "database.db", second_opinion=mapped)
+        assert found.verdict.cameras == doubted
+        assert found.facts.evidence.second.ambiguous == doubted
+        assert "as many matches speak for another rotation" in found.facts.evidence.second.statement
+        assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
 
 
 def spoiled(folder, place=None, *, points=True, num_posed=None, names=None):

@@ -10,9 +10,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.synthetic.fixtures import assert_reconstruction_near
-from tests.scenes import COURTYARD, RING, ROOT
-
-PHOTOGRAPHED = ROOT / "data_synthetic/photographed"
+from tests.scenes import BUNDLED, COURTYARD, PHOTOGRAPHED, RING
 
 
 def test_global_mapping_is_called_and_answers_as_pycolmaps(tmp_path):
@@ -63,6 +61,13 @@ def test_a_result_serves_wherever_a_model_does(tmp_path):
     mapped = sfm_shapefit.map_database(RING / "database.db")
     assert sfm_shapefit.evaluate(mapped, found).position.max < 1e-4
     assert sfm_shapefit.evaluate(mapped.models[0], found).position.max < 1e-4
+
+
+def test_a_graph_is_placed_from_its_file_and_is_no_model():
+    placed = sfm_shapefit.place(BUNDLED / "graph40.txt")
+    assert len(placed.cameras) == 40
+    with pytest.raises(sfm_shapefit.InputError, match="a Judged is no model; give a folder"):
+        sfm_shapefit.evaluate(placed, RING / "sparse/0")
 
 
 def test_results_write_themselves_and_show_at_most_twenty_attributes(tmp_path):

@@ -17,6 +17,7 @@ from sfm_shapefit.adjustment.bundle_adjustment import adjust_placement
 from sfm_shapefit.base.geometry import fit_similarity, rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
+from sfm_shapefit.files.colmap.listed_poses import read_list
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.files.colmap.template import template_of
@@ -25,6 +26,7 @@ from sfm_shapefit.pipeline import doubts as doubts_stage
 from sfm_shapefit.pipeline import measure as measure_stage
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.convert import convert
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.join import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
@@ -159,6 +161,18 @@ def test_bundle_adjustment_keeps_the_rigs_their_scale_and_the_origin_of_the_inpu
     centers = centers_of(located.reconstruction)
     assert abs(fit_similarity(centers, rigs.centers, rotate=False).scale - 1.0) < 1e-3
     np.testing.assert_allclose(np.median(rigs.centers - centers, axis=0), 0.0, atol=1e-9)
+
+
+def test_a_list_of_poses_keeps_the_rigs_of_its_database(workspace, rigs, tmp_path):
+    convert(workspace / "truth", tmp_path / "poses.json")
+    given = read_model(read_list(tmp_path / "poses.json", workspace / "database.db").reconstruction)
+    assert_rigs_equal(given.reconstruction, pycolmap.Reconstruction(workspace / "truth"), atol=1e-9)
+    np.testing.assert_allclose(given.images.centers, rigs.centers, atol=1e-9)
+    found = sfm_shapefit.locate(tmp_path / "poses.json", workspace / "database.db", rotations=2.0)
+    assert found.gauge.scale == "rig"
+    assert fit_similarity(centers_of(found.reconstruction), rigs.centers).scale == pytest.approx(
+        1.0, abs=0.01
+    )
 
 
 def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):

@@ -256,7 +256,12 @@ def test_groups_that_stand_apart_have_colors_and_another_place_is_a_ghost(driver
     path = tmp_path / "report.html"
     write_report(*doubted(), path)
     opened(driver, path)
-    assert driver.find_element("id", "legend").text.split("\n") == ["the rest", "group 1", "group 2"]
+    assert driver.find_element("id", "legend").text.split("\n") == [
+        "the rest",
+        "group 1",
+        "group 2",
+        "group 3",
+    ]
     layer = f"{SCENE} return scene.layers.find((one) => one.name === 'elsewhere').ghosts.instances;"
     assert driver.execute_script(layer) == 1
     seen = []

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence
+from sfm_shapefit.facts.evidence import AmbiguousPlace, GroupApart, ToldEvidence, ToldOpinion
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics
 from sfm_shapefit.facts.model import BundleAdjustment
-from sfm_shapefit.facts.placed import KeyFigures
+from sfm_shapefit.facts.placed import IN_MEMORY, KeyFigures
 from sfm_shapefit.facts.tables import CameraRow
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from sfm_shapefit.report import thumbnails
@@ -180,7 +180,16 @@ def doubted():
         return GroupApart(images=images, num_agreeing=1, num_contradicting=9, num_turned=0, turn_deg=None)
 
     place = AmbiguousPlace(image=names[9], num_here=2, num_there=5, offset=(1.0, 2.0, -0.5))
-    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])))
+    second = ToldOpinion(
+        num_common=25,
+        usual=1e-3,
+        wrong=(names[4], names[12]),
+        undecided=(),
+        num_for=0,
+        num_against=9,
+        ambiguous=(),
+    )
+    evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])), second=second)
     return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
 
 
@@ -190,6 +199,7 @@ def test_a_group_that_stands_apart_and_another_place_reach_the_scene_and_are_tol
     columns, names = data["cameras"], drawing.cameras.names
     group = dict(zip(columns["names"], unpacked(columns["group"]).tolist(), strict=True))
     assert [group[name] for name in names[2:8]] == [-1, 1, 0, 0, 1, -1]
+    assert [group[name] for name in names[11:14]] == [-1, 2, -1]  # elsewhere in the second opinion alone
     others = unpacked(columns["other"]).reshape(-1, 3)
     row = columns["names"].index(names[9])
     assert np.flatnonzero(np.isfinite(others).all(axis=1)).tolist() == [row]
@@ -241,7 +251,12 @@ def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_any
         ("good", None, "Good: this model can be used", "image_undistorter"),
         ("good", ADJUSTED, "Good: this model can be used", "image_undistorter"),
         ("look", None, "Look at 2 cameras first", "image_undistorter"),
-        ("do not use", None, "Do not use this model", "inspect 'a folder/sparse/0'"),
+        (
+            "do not use",
+            None,
+            "Do not use this model",
+            "inspect 'a folder/sparse/0' --database 'a folder/d.db'",
+        ),
     ],
 )
 def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, headline, command):
@@ -252,7 +267,7 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
         facts,
         verdict=ModelVerdict(grade=Grade(grade), cameras=names, reasons=tuple(reasons)),
         bundle_adjustment=adjusted,
-        inputs=replace(facts.inputs, model="a folder/sparse/0"),
+        inputs=replace(facts.inputs, model="a folder/sparse/0", database="a folder/d.db"),
     )
     found = banner(drawing, facts)
     assert (found["grade"], found["headline"]) == (grade, headline)
@@ -263,6 +278,16 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
         "do not use": "Only 30% of the pairs agree.",
     }
     assert said[grade] in found["sentence"]
+
+
+def test_what_map_made_and_is_not_to_be_used_is_inspected_where_it_was_written():
+    _, facts = make_drawing()
+    bad = ModelVerdict(grade=Grade.DO_NOT_USE, cameras=(), reasons=("it is folded",))
+    inputs = replace(
+        facts.inputs, model=IN_MEMORY, database="scene/database.db"
+    )  # `inspect` takes no database
+    step = replace(facts, verdict=bad, inputs=inputs).next_step
+    assert step.command == "sfm-shapefit inspect {out} --database scene/database.db"
 
 
 def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are():

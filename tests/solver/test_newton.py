@@ -89,6 +89,16 @@ def test_exact_directions_give_the_truth_and_a_zero_dual(solver):
 
 
 @SOLVERS
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_two_nodes_stand_along_their_direction_whatever_it_is(solver, d):
+    """The first guess fits to rounding, and no step may follow that."""
+    for direction in normalized(np.random.default_rng(d).standard_normal((100, d))):
+        graph = ViewGraph(2, [[0, 1]], direction[None])
+        t, _ = solved(graph, solver)
+        np.testing.assert_allclose(t[0] - t[1], direction, atol=1e-12)
+
+
+@SOLVERS
 def test_the_optimality_conditions_hold(solver):
     graph, _ = draw_graph(11, sigma=0.05, weighted=True)
     t, y = solved(graph, solver)

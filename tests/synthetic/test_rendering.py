@@ -23,10 +23,9 @@ from sfm_shapefit.synthetic import (
 from sfm_shapefit.synthetic.rendered_workspace import judge_matches
 from sfm_shapefit.synthetic.surfaces import Surfaces
 from tests.program import run
-from tests.scenes import BUNDLED
+from tests.scenes import PHOTOGRAPHED
 
 SMALL = SceneOptions(num_images=6, image_width=320, image_height=240, focal_length_px=280.0, seed=2)
-PHOTOGRAPHED = BUNDLED / "photographed"
 
 
 def small_scene(shape: str, **changes) -> RenderedScene:

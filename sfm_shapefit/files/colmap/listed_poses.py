@@ -1,7 +1,7 @@
 """Lists of poses, of NeRF's programs or SLAM, as models of a database's images.
 
-The images are found by their names. Lenses are those of the database; where it guessed one, the focal length
-is that of the list, the median of its images, which is a guess too.
+The images are found by their names. Rigs and lenses are those of the database; where it guessed a lens, the
+focal length is that of the list, the median of its images, which is a guess too.
 """
 
 from collections import Counter
@@ -14,11 +14,16 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.files.colmap.database_images import read_images
+from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.intrinsics import find_uncalibrated
+from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.posed_model import ListedPoses
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum}
 
@@ -37,6 +42,20 @@ def is_list(source: object) -> bool:
     return is_named_so and not Path(str(source)).is_dir()
 
 
+def read_source(source: ModelSource, database: Path | str | None) -> tuple[ColmapModel, frozenset[int]]:
+    """Return the model that a source is, or that a list of poses makes of the images of a database.
+
+    With it come the ids of the cameras whose focal lengths are those of the list.
+
+    Raises:
+        InputError: as `read_model` and `read_list`.
+    """
+    if isinstance(source, Path | str) and is_list(source):
+        listed = read_list(Path(source), database)
+        return read_model(listed.reconstruction), listed.guessed
+    return read_model(source), frozenset()
+
+
 def read_list(file: Path, database: Path | str | None) -> ListedModel:
     """Return the images of a database with the poses of a list; those that it lacks have none.
 
@@ -50,7 +69,7 @@ def read_list(file: Path, database: Path | str | None) -> ListedModel:
         raise InputError(f"{file} has poses but no matches; give the database that has them (database=FILE)")
     with closing(DatabaseFile(database)) as opened:
         read = read_images(opened)
-        images, model = read.images, read.reconstruction
+        images = read.images
         uncalibrated = find_uncalibrated(opened, images)
     rows = _find(poses.names, images.names)
     if np.sum(rows >= 0) < 2:
@@ -58,14 +77,8 @@ def read_list(file: Path, database: Path | str | None) -> ListedModel:
             f"{file} and {database} have fewer than two images in common: "
             f"{poses.names[0] if poses.names else 'none'} in the one, {images.names[0]} in the other"
         )
-    place = {int(row): k for k, row in enumerate(rows.tolist()) if row >= 0}
-    for row, image_id in enumerate(images.ids.tolist()):
-        frame_id = model.image(image_id).frame_id
-        if row not in place:
-            model.deregister_frame(frame_id)
-            continue
-        turn, center = poses.rotations[place[row]], poses.centers[place[row]]
-        model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ center)
+    model = read.template(images).build()
+    put_images(model, _pose(images, rows, poses))
     lens_of = np.where(rows >= 0, images.lens_of[rows], -1)
     guessed = {
         images.lenses[k].id
@@ -73,6 +86,28 @@ def read_list(file: Path, database: Path | str | None) -> ListedModel:
         if _set_focal_length(model.camera(images.lenses[k].id), poses.focal_shares[lens_of == k])
     }
     return ListedModel(model, frozenset(guessed))
+
+
+def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
+    """Return images with their frames where a list (n,) has images of them, NaN where it has none.
+
+    Args:
+        images: in their frames.
+        rows: (n,) which of them each pose is of; -1 where none.
+        poses: n of them.
+    """
+    found = np.flatnonzero(rows >= 0)
+    lenses, frames = images.lens_of[rows[found]], images.frame_of[rows[found]]
+    turns, shifts = images.sensors.rotations[lenses], images.sensors.translations[lenses]
+    own = np.swapaxes(turns, 1, 2) @ poses.rotations[found]
+    places = poses.centers[found] + np.einsum("kba,kb->ka", poses.rotations[found], shifts)
+    rotations, centers = (np.full_like(a, np.nan) for a in (images.frames.rotations, images.frames.centers))
+    order = np.argsort(frames, kind="stable")
+    known, first = np.unique(frames[order], return_index=True)
+    for frame, part in zip(known.tolist(), np.split(order, first[1:]), strict=True):
+        rotations[frame] = own[part[0]] if len(part) == 1 else mean_rotation_l1(own[part])
+        centers[frame] = places[part].mean(axis=0)
+    return images.posed(rotations, centers)
 
 
 def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:

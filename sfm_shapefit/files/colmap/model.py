@@ -81,6 +81,10 @@ def read_model(source: ModelSource) -> ColmapModel:
             pose.
     """
     is_checked, source = False, model_of(source)
+    if not isinstance(source, pycolmap.Reconstruction | Path | str):
+        raise InputError(
+            f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
+        )
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
     else:

@@ -73,7 +73,7 @@ const drawFacts = () => {
   fill("options", changed.length ? factTable(changed) : element("p", "None.", "muted"), rest);
 };
 const plainTable = (names, rows) => {
-  const table = element("table");
+  const table = element("table", "", "plain");
   const head = table.createTHead().insertRow();
   for (const name of names) head.append(element("th", name));
   const body = table.createTBody();

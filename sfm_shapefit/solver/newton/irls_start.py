@@ -37,6 +37,7 @@ _ROUNDS = 7
 _EPS, _SHRINK = 0.5, 0.7  # smoothing of the first weights, per mean residual; its factor per round
 # The first steps may leave this share of the energy; dense random graphs leave 1e-3, real ones 5e-2.
 _LEFT = 3e-3
+_ROUNDING = 1e-14  # energy per that of T; below, t fits, and steps would follow what rounding leaves
 
 
 @kernel
@@ -47,7 +48,8 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     scale_to(problem, problem.c, t)
     weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
-    if left > _LEFT * dot(t, gradient):
+    energy = dot(t, gradient)
+    if left > _LEFT * energy or energy <= _ROUNDING * degrees.max() * dot(t, t):
         return False
     mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     eps = _EPS
