@@ -44,7 +44,7 @@ MOST_LINES = {
     "judgement": 3290,
     "laplacian": 2080,
     "pairs": 1610,
-    "pipeline": 6390,
+    "pipeline": 6430,
     "placement": 2660,
     "refinement": 2100,
     "report": 1700,
@@ -53,7 +53,7 @@ MOST_LINES = {
     "solver": 4360,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
-    "tracks": 1150,
+    "tracks": 1130,
 }
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
 
