@@ -35,7 +35,7 @@ MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4680,
+    "adjustment": 4690,
     "base": 2210,
     "cli": 1770,
     "facts": 3400,
@@ -44,9 +44,9 @@ MOST_LINES = {
     "judgement": 3290,
     "laplacian": 2080,
     "pairs": 1610,
-    "pipeline": 6430,
+    "pipeline": 6490,
     "placement": 2660,
-    "refinement": 2100,
+    "refinement": 2110,
     "report": 1700,
     "rotations": 2290,
     "scene": 2070,

@@ -43,6 +43,7 @@ COLLAPSED = 0.3
 """Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
 
 _UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
+_SAME, _MANY_CAMERAS = 0.01, 1_000  # likewise, and cameras; of many starts nearer than that, one is refined
 _LUD_STEPS = 50  # iterations; more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
 _LUD_PAIRS = 1_000_000  # pairs; above, the second start takes as long as the first
@@ -162,12 +163,15 @@ def refine_starts(
     problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
+    many = measured.num_cameras >= _MANY_CAMERAS
     candidates = [("ShapeFit", solved.locations)]
     if second is not None:
         candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
+    elif apart is not None and options.objective != "lud" and apart <= _SAME and many:
+        candidates.pop()
     starts: list[Start] = []
     for name, locations in candidates:
         fallback = locations if second is None else second
@@ -386,12 +390,13 @@ def _choose(
     by_name = {start.name: start for start in starts}
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
-    if len(starts) == 1:
+    if apart is None:
         wanted = ", which LUD would have been" if options.objective == "lud" else ""
         return by_name["ShapeFit"], f"the graph has no second start{wanted}"
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
-    assert apart is not None
+    if len(starts) == 1:
+        return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
         return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
