@@ -153,7 +153,7 @@ def judge(model: ColmapModel, scene: Scene) -> tuple[PairDirections, Judged]:
     """Place the cameras of a model and judge them: `locate` without points."""
     rigid = find_rigid_parts(model.images, OPTIONS.placement)
     with measured(model, scene) as (source, told):
-        graph = add_evidence(rigid.apply(build_graph(source.images, told)), told)
+        graph = add_evidence(rigid.apply(build_graph(source.images, told, OPTIONS.nodes)), told)
         placed = next(place_cameras(graph, OPTIONS.placement, OPTIONS.nodes, Clock(threads=THREADS)))
         placement = judge_placement(placed, OPTIONS.placement)
         relative = ask_pairs(source, told.directions, THREADS)

@@ -18,6 +18,8 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
+# Frames from which the coarse solve is left out where poses are fine: it takes half of the time there.
+_MANY_FRAMES = 1_000
 _NOTHING_GIVEN = GivenPoses()
 LensesAtFirst = Literal["wanted", "free", "known"]
 
@@ -94,7 +96,8 @@ def adjust_thinly(
         if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run)
         return run.estimate(last, judged=lenses != "wanted")
-    run, last = steps.solve_coarsely(run)
+    if len(images.frames.ids) < _MANY_FRAMES or steps.are_coarse(run):
+        run, last = steps.solve_coarsely(run)
     problem = steps.fine_problem(run)
     if problem is not None:
         run = replace(run, links=None)  # all matches, at the peak of the memory

@@ -373,14 +373,19 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
 
 def solve_thinly_again(run: AdjustmentRun) -> Solved:
     """Return the run after a fine solve, where poses are fine but for a few, else after two as at first."""
-    fine, loose = (run.triangulate(limit, checked=True)[1] for limit in (1.0, _THIN_LIMIT))
-    problem = None if _are_coarse(fine, loose) else fine_problem(run)
+    problem = None if are_coarse(run) else fine_problem(run)
     return solve_twice_thinly(run) if problem is None else solve_finely(run, problem)
+
+
+def are_coarse(run: AdjustmentRun) -> bool:
+    """Return whether the poses are coarse, by the points that they let be found."""
+    return _are_coarse(*(run.triangulate(limit, checked=True)[1] for limit in (1.0, _THIN_LIMIT)))
 
 
 def _are_coarse(fine: TriangulatedPoints, loose: TriangulatedPoints) -> bool:
     """Return whether poses are coarse, by the points found at the threshold and at the wide limit."""
-    return bool(np.sum(fine.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0))
+    num_fine = np.sum(fine.points_seen >= 0)
+    return bool(num_fine < _FINE * np.sum(loose.points_seen >= 0) or num_fine == 0)
 
 
 def repeat_with_known_lenses(

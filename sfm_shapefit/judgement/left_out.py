@@ -98,6 +98,9 @@ def leave_one_out(
     """
     n = images.num_images
     believed = np.ones(n, dtype=np.bool_) if believed is None else believed
+    if asked is not None:
+        seen = np.bincount(points.points_seen(), asked[points.images], points.num_points) > 0.0
+        points = points.taken(seen[points.points_seen()])
     points, rays, on_plane = _look(points, images, pictures)
     order = np.argsort(points.images, kind="stable")
     begins = np.searchsorted(points.images[order], np.arange(n + 1))

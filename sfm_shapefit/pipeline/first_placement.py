@@ -59,7 +59,7 @@ def adjust_first_placement(
     """
     images, wanted = source.images, Wanted(tracks=wants_points(source, options.nodes))
     measured = measure(source, options.directions, clock, wanted)
-    graph, directions = given.rigid.apply(build_graph(images, measured)), measured.directions
+    graph, directions = given.rigid.apply(build_graph(images, measured, options.nodes)), measured.directions
     del measured  # arrays of all pairs
     placement = next(place_cameras(graph, options.placement, options.nodes, clock, certified=False))
     del graph

@@ -69,7 +69,7 @@ def inspect(
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
         with clock("diagnosis"):
-            with_points = add_evidence(build_graph(images, measured), measured)
+            with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
             grouped = group_frames(images, with_points)
             work = count_work(matches, directions)
             work = describe_work(grouped, work, options.placement, options.freedom)

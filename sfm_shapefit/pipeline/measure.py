@@ -10,6 +10,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
+from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.pairs.estimate import estimate_directions
@@ -19,6 +20,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
+from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
@@ -28,6 +30,12 @@ _CHECK_ROTATIONS = (
     "check that rotations and intrinsics belong to these matches; rough rotations need rotations=2"
 )
 _MAX_SAMPLED_PAIRS = 100_000  # pairs; beyond, standard deviations take them as independent, for memory
+# Cameras from which points are left out of the graph where pairs hold it: they treble the time of its solve.
+_MANY_CAMERAS = 1_000
+_FEW_CAMERAS = 0.01  # share of the cameras that may be held worse: the refinement judges each by itself
+_MANY_PAIRS = 15  # pairs of a camera; two hold it, and some are wrong
+# The `direction_spread` of the pairs of a camera; 0.5 in a plane, and 0.1 on a line with 15 % of pairs wrong.
+_WIDELY_SPREAD = 0.2
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -177,14 +185,26 @@ def wants_points(source: MatchSource, options: NodeOptions) -> bool:
     return options.uses_points(source.images.num_images) and source.economy.points
 
 
-def build_graph(images: Images, measured: Measured) -> MeasuredGraph:
-    """Return the graph of the usable directions, with 3D points as further nodes if there are tracks."""
+def build_graph(images: Images, measured: Measured, nodes: NodeOptions) -> MeasuredGraph:
+    """Return the graph of the usable directions, with 3D points as further nodes if there are tracks.
+
+    But many cameras that their pairs hold need none, unless they are wanted always.
+    """
     directions, tracks = measured.directions, measured.tracks
     graph, covariance = view_graph(images, directions), directions.covariance[directions.usable()]
-    if tracks is None:
+    if tracks is None or (nodes.points == "auto" and _is_held_by_pairs(graph)):
         return MeasuredGraph(graph, covariance=covariance)
     chosen = tracks.subset(covering_set(tracks, images.num_images))
     return join_points(graph, covariance, chosen, 1.0 / images.focal_lengths_px)
+
+
+def _is_held_by_pairs(graph: ViewGraph) -> bool:
+    """Return whether the pairs alone hold many cameras: rigidly, each by many pairs of many directions."""
+    if graph.num_nodes < _MANY_CAMERAS or np.quantile(graph.degrees(), _FEW_CAMERAS) < _MANY_PAIRS:
+        return False
+    spread = direction_spread(graph.num_nodes, graph.edges, graph.directions)
+    is_spread = np.quantile(spread, _FEW_CAMERAS) >= _WIDELY_SPREAD
+    return bool(is_spread) and is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension)
 
 
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:

@@ -96,6 +96,7 @@ def seed_points(
         limit_px, rotations = options.structure.max_reprojection_error_px, source.images.rotations
         num_keypoints, batches = source.view.num_keypoints, source.view.batches(without=source.pairs_of_fixed)
         counts = count_observations(points, images, num_keypoints, batches, rotations, limit_px)
+        source.view.give_back()
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:
             seen = np.where(unsupported, points.count_seen(len(seen)), seen)

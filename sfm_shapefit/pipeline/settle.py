@@ -95,7 +95,7 @@ def settle(
         measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions
     with clock("solve"):
-        graph = given.rigid.apply(build_graph(opened.images, measured))
+        graph = given.rigid.apply(build_graph(opened.images, measured, options.nodes))
         work = count_work(opened, directions)
         describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)

@@ -44,6 +44,7 @@ COLLAPSED = 0.3
 """Disagreement of the starts beyond which one has collapsed; see `disagreement`."""
 
 _UNEQUAL = 0.1  # disagreement of the starts; from here on LUD is likely to be the better one
+_SAME, _MANY_CAMERAS = 0.01, 1_000  # likewise, and cameras; of many starts nearer than that, one is refined
 _LUD_STEPS, _GROUP_LUD_STEPS = 50, 150  # iterations; more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # pairs; above, LUD's own bound would cost about 100 more iterations
 _POINT_WEIGHT = 10.0  # LUD's weight of a direction to a 3D point; one loss there serves every noise
@@ -162,16 +163,19 @@ def refine_starts(
     problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
+    is_iterative = isinstance(problem.normal_solver, IterativeNormal)
+    # Refinements of so many are dear, and starts that are so near to one another lead to one place.
+    near = _UNEQUAL if is_iterative else _SAME if measured.num_cameras >= _MANY_CAMERAS else 0.0
     candidates = [("ShapeFit", solved.locations)]
     if second is not None:
         candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
+    elif apart is not None and apart < near and options.objective != "lud":
+        candidates.pop()
     reweighted, refining = None, problem
-    if isinstance(problem.normal_solver, IterativeNormal) and options.objective == "auto":
-        # Refinements are dear here: starts that are alike lead to one place, and others look for no weights.
-        candidates = candidates[:1] if apart is None or apart <= _UNEQUAL else candidates
+    if is_iterative and options.objective == "auto":  # what the weights answer needs no other refinement
         usual = fit_mixture(measured, candidates[0][1])
         reweighted = _reweight(problem, candidates[0][1], usual, options)
         refining = problem if reweighted is None else problem._replace(normal_solver=None)
@@ -394,14 +398,13 @@ def _choose(
     by_name = {start.name: start for start in starts}
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
-    if apart is not None and len(starts) == 1:
-        return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.0%}, so that one was refined"
-    if len(starts) == 1:
+    if apart is None:
         wanted = ", which LUD would have been" if options.objective == "lud" else ""
         return by_name["ShapeFit"], f"the graph has no second start{wanted}"
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
-    assert apart is not None
+    if len(starts) == 1:
+        return by_name["ShapeFit"], f"the starts' lengths differ by {apart:.1%}, so that only one is refined"
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
         return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]

@@ -310,9 +310,7 @@ class View:
     def _consumed(self, links: Iterator[KeypointMatches]) -> Iterator[KeypointMatches]:
         """Yield the last matches of these for a while."""
         yield from links
-        self._forget_rays()  # by which those without a ray are told
-        if self.num_matches > MOST_BESIDE_TRACKS:
-            self.matches.forget()
+        self.give_back()  # rays too, by which those without one are told
 
     def between(self, labels: IntArray) -> Iterator[MatchBatch]:
         """Yield the matches of pairs whose images have different labels (n,), none of them negative."""
@@ -419,6 +417,12 @@ class View:
         """Give back the memory of all that is kept with rays; it is made again where it is needed."""
         self._kept.clear()
         self._forget_rays()
+
+    def give_back(self) -> None:
+        """Give back the memory of the rays of keypoints, and of very many matches."""
+        self._forget_rays()
+        if self.num_matches > MOST_BESIDE_TRACKS:
+            self.matches.forget()
 
     def _forget_rays(self) -> None:
         """Give back the memory of the rays of keypoints."""

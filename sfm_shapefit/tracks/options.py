@@ -19,7 +19,7 @@ class NodeOptions(Settings):
         "auto",
         "3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what "
         'directions between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 '
-        "cameras.",
+        "cameras, from 1,000 on only where many pairs of many directions do not hold nearly every camera.",
     )
 
     def uses_points(self, num_cameras: int) -> bool:
@@ -35,6 +35,8 @@ class NodeOptions(Settings):
         limit = f"{_MAX_CAMERAS_WITH_POINTS:,}"
         if not self.uses_points(num_cameras):
             return f"no: more than {limit} cameras, where they would multiply the time of the solve"
+        if not num_points:
+            return "no: the pairs hold the cameras, or no three cameras see a point together"
         return f"{num_points} tracks join as nodes: at most {limit} cameras, so they cost little"
 
 

@@ -180,8 +180,12 @@ def test_few_observations_say_nothing_and_nor_do_points_that_nobody_else_holds()
     assert (leave_one_out(pairs, scene.images, scene).num_observations == 0).all()
 
 
-def test_threads_change_no_bit():
+def test_neither_threads_nor_which_others_are_asked_change_a_bit():
     scene = Scene(factors=[0.8, 1.1])
     once, twice = scene.left_out(1), scene.left_out(5)
+    asked = np.arange(scene.images.num_images) == 1
+    alone = leave_one_out(scene.points, scene.images, scene, asked=asked)
     for name in ("num_observations", "log_factors", "sigmas", "free_shares", "noise_px"):
         assert getattr(once, name).tobytes() == getattr(twice, name).tobytes()
+        assert getattr(alone, name)[asked].tobytes() == getattr(once, name)[asked].tobytes()
+    assert alone.num_observations[~asked].sum() == 0

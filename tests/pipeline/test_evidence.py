@@ -5,7 +5,9 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.pipeline import evidence
 from sfm_shapefit.pipeline.check import check
 from tests.scenes import COURTYARD, RING
 
@@ -52,6 +54,18 @@ def test_a_sound_run_is_not_doubted():
     found = sfm_shapefit.locate(with_own_lenses(truth, {}), RING / "database.db")
     assert found.told_evidence.statements == []
     assert found.verdict.grade is Grade.GOOD
+
+
+def test_of_a_lens_that_took_many_images_only_some_are_asked(monkeypatch):
+    images = read_model(COURTYARD / "truth").images
+    n, own = images.num_images, np.arange(images.num_images) % 2 == 0
+    assert evidence._ask_some(images, None) is None
+    assert evidence._ask_some(images, own) is own
+    monkeypatch.setattr(evidence, "_MOST_ASKED", 4)
+    assert np.flatnonzero(evidence._ask_some(images, None)).tolist() == list(range(0, n, -(-n // 4)))
+    asked = evidence._ask_some(images, own)
+    assert 2 <= asked.sum() <= 4
+    assert not asked[~own].any()
 
 
 def spoiled(amount_deg=0.0, shift=0.0):

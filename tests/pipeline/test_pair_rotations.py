@@ -9,6 +9,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs import essential as door
@@ -50,6 +51,30 @@ def test_inlier_matches_are_enough_and_without_stored_poses_none_are_found(found
     path = edit_database(copied(COURTYARD, tmp_path) / "database.db", nothing)
     assert_same_bits(sfm_shapefit.relative_rotations(path), found)
     assert len(sfm_shapefit.relative_rotations(path, source="stored").pairs) == 0
+
+
+def test_of_very_many_pairs_few_are_tried_for_and_the_others_sought_near_their_average(found, monkeypatch):
+    tried, by_trials = [], door._start_by_trials
+
+    def count(matches, num_pairs):
+        tried.append(len(matches.pairs))
+        return by_trials(matches, num_pairs)
+
+    monkeypatch.setattr(door, "_start_by_trials", count)
+    sfm_shapefit.relative_rotations(DATABASE, threads=1)
+    usual, tried[:] = sum(tried), []
+    monkeypatch.setattr(module, "MANY_PAIRS", 0)
+    near = sfm_shapefit.relative_rotations(DATABASE, threads=1)
+    assert sum(tried) < 0.8 * usual
+    np.testing.assert_array_equal(near.pairs, found.pairs)
+    truth = read_model(COURTYARD / "truth").images
+    order = [truth.names.index(name) for name in near.names]
+    i, j = truth.rotations[order][near.pairs.T]
+    off_deg = [rotation_angles_deg(one.rotations @ (i @ j.transpose(0, 2, 1))) for one in (near, found)]
+    assert np.sum(off_deg[0] < 1.0) >= np.sum(off_deg[1] < 1.0)
+    assert_same_bits(sfm_shapefit.relative_rotations(DATABASE, threads=2), near)
+    with ThreadPoolExecutor(2) as pool:
+        assert_same_bits(sfm_shapefit.relative_rotations(DATABASE, executor=pool), near)
 
 
 @pytest.mark.parametrize("threads", [0, 2])

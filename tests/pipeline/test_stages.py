@@ -71,7 +71,7 @@ def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_grap
     assert angle_between_deg(usable, true).max() < 1e-3  # keypoints are stored as float32
     np.testing.assert_array_equal(bare.directions.directions, found.directions.directions)
     assert (bare.tracks, bare.errors) == (None, None)
-    graph = add_evidence(build_graph(TRUTH, found), found)
+    graph = add_evidence(build_graph(TRUTH, found, NodeOptions()), found)
     assert graph.num_cameras == 8 < graph.graph.num_nodes
     assert graph.graph.names[:8] == TRUTH.names
     np.testing.assert_array_equal(graph.graph.edges[: len(i)], np.stack([i, j], axis=1))
@@ -81,9 +81,27 @@ def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_grap
     assert len(graph.evidence.errors) == graph.graph.num_edges
     share = 1 + np.arange(len(bare.directions.pairs)) % 2  # every other pair loses half of its inliers
     uneven = replace(bare.directions, num_inliers=bare.directions.num_inliers // share)
-    weights = build_graph(TRUTH, replace(bare, directions=uneven)).graph.weights
+    weights = build_graph(TRUTH, replace(bare, directions=uneven), NodeOptions()).graph.weights
     assert np.ptp(weights) > 0.1
     np.testing.assert_array_equal(weights, uneven.weights()[uneven.usable()])
+
+
+def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypatch):
+    with opened() as source:
+        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks=True))
+    parallel = np.where(np.isfinite(found.directions.directions), [1.0, 0.0, 0.0], np.nan)
+    flat = replace(found, directions=replace(found.directions, directions=parallel))
+    degree = int(build_graph(TRUTH, found, NodeOptions(points="never")).graph.degrees().min())
+
+    def has_points(told, points="auto"):
+        return build_graph(TRUTH, told, NodeOptions(points=points)).num_points > 0
+
+    assert has_points(found)  # few
+    monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_CAMERAS", 8)
+    monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", 2)
+    assert [has_points(found), has_points(found, "always"), has_points(flat)] == [False, True, True]
+    monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", degree + 6)
+    assert has_points(found)
 
 
 def test_place_yields_the_rigid_pieces_the_largest_first():

@@ -54,6 +54,18 @@ def test_where_both_starts_agree_nothing_is_said_of_a_collapse_and_the_scale_is_
     np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
 
 
+def test_of_many_cameras_one_of_two_starts_that_agree_is_refined(chain, expander, monkeypatch):
+    both = finished(expander)
+    monkeypatch.setattr(finishing, "_MANY_CAMERAS", 40)
+    monkeypatch.setattr(finishing, "_SAME", 1.1 * both.disagreement)
+    found = finished(expander)
+    assert list(found.costs) == ["ShapeFit"]
+    assert "only one is refined" in found.reason
+    assert shape_error(found.locations, both.locations) < 1e-3
+    assert finished(expander, objective="lud").start == "LUD"
+    assert len(finished(chain).costs) == 2
+
+
 def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_chain(chain):
     graph = chain.view_graph
     options = PlacementOptions(objective="shapefit")
