@@ -89,7 +89,12 @@ def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that
     for module in (solver_options, reweighted):
         monkeypatch.setattr(module, "MANY_PAIRS", hopeless.view_graph.num_edges - 1)
     asked = []
-    monkeypatch.setattr(reweighted, "solve", lambda graph, told: asked.append(told.tol) or solve(graph, told))
+
+    def listen(graph, told, **how):
+        asked.append(told.tol)
+        return solve(graph, told, **how)
+
+    monkeypatch.setattr(reweighted, "solve", listen)
     found = place(hopeless.view_graph)
     assert set(asked) == {1e-6}
     assert found.certified.converged
@@ -99,7 +104,7 @@ def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that
 
 def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch):
     problem = corrupted(0.4, sigma=0.02)
-    monkeypatch.setattr(reweighted, "solve", lambda *_: pytest.fail("nothing is to be solved again"))
+    monkeypatch.setattr(reweighted, "solve", lambda *_, **__: pytest.fail("nothing is to be solved again"))
     assert place(problem.view_graph).refined.reweighted is None
 
 
