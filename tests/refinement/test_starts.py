@@ -150,7 +150,7 @@ def test_of_starts_that_are_alike_one_is_refined_where_a_factor_is_dear(monkeypa
     found = finished(expander)
     assert list(found.costs) == ["ShapeFit"]
     assert found.lud is not None
-    assert "so that one was refined" in found.reason
+    assert "so that only one is refined" in found.reason
     assert list(finished(expander, objective="lud").costs) == ["ShapeFit", "LUD"]
 
 
