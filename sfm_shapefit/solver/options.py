@@ -17,10 +17,10 @@ Solver = Literal["auto", "newton", "admm", "conic"]
 NO_FACTOR = 0
 """Megabytes for `factor_memory_mb`: nothing is factored that can be left out."""
 
-MANY_PAIRS = 1_000_000
+PAIRS_AT_SCALE = 1_000_000
 """Pairs of a view graph; with more, a solve to the last digit or a second one takes a minute or more."""
 
-# Gap and iterations of a start with more than `MANY_PAIRS`. A few cameras that hang by few right pairs creep
+# Gap and iterations of a start with more than `PAIRS_AT_SCALE`. A few cameras that hang by few right pairs creep
 # for hundreds of iterations: boxes of 1e5, 60 % wrong, come to 3e-6 in 36, to 2e-6 in 60, to 1.4e-6 in none.
 _TOL_OF_MANY, _ITERATIONS_OF_MANY = 1e-6, 60
 
@@ -126,7 +126,7 @@ class SolverOptions(Settings):
 
     def at_scale(self, num_pairs: int) -> Self:
         """Return the options for the starts of a placement of so many pairs; those that are told stay."""
-        if num_pairs <= MANY_PAIRS:
+        if num_pairs <= PAIRS_AT_SCALE:
             return self
         tol = _TOL_OF_MANY if self.tol == type(self)().tol else self.tol
         return replace(self, tol=tol, max_iterations=self.max_iterations or _ITERATIONS_OF_MANY)

@@ -87,7 +87,7 @@ def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that
     hopeless, monkeypatch
 ):
     for module in (solver_options, reweighted):
-        monkeypatch.setattr(module, "MANY_PAIRS", hopeless.view_graph.num_edges - 1)
+        monkeypatch.setattr(module, "PAIRS_AT_SCALE", hopeless.view_graph.num_edges - 1)
     asked = []
     monkeypatch.setattr(reweighted, "solve", lambda graph, told: asked.append(told) or solve(graph, told))
     found = place(hopeless.view_graph)
