@@ -20,8 +20,8 @@ NO_FACTOR = 0
 PAIRS_AT_SCALE = 1_000_000
 """Pairs of a view graph; with more, a solve to the last digit or a second one takes a minute or more."""
 
-# Gap and iterations of a start with more than `PAIRS_AT_SCALE`. A few cameras that hang by few right pairs creep
-# for hundreds of iterations: boxes of 1e5, 60 % wrong, come to 3e-6 in 36, to 2e-6 in 60, to 1.4e-6 in none.
+# Gap and iterations of a start at scale. A few cameras that hang by few right pairs creep for hundreds of
+# iterations: boxes of 1e5, 60 % wrong, come to 3e-6 in 36, to 2e-6 in 60, to 1.4e-6 in none of 186.
 _TOL_OF_MANY, _ITERATIONS_OF_MANY = 1e-6, 60
 
 MAX_THREADS = 256
