@@ -20,8 +20,8 @@ def find_bodies(num_nodes: int, pairs: IntArray, weights: FloatArray) -> IntArra
     The weights (m,) of node pairs (m, 2) are positive where two nodes belong together, negative where they do
     not; repeated pairs add up.
     """
-    ends = np.ascontiguousarray(np.sort(pairs.reshape(-1, 2), axis=1), dtype=np.int64)
-    into = _contract(num_nodes, ends, np.ascontiguousarray(weights, dtype=np.float64))
+    ends = np.sort(pairs.reshape(-1, 2), axis=1).astype(np.int64)
+    into = _contract(num_nodes, ends, np.array(weights, dtype=np.float64))
     while (into != into[into]).any():
         into = into[into]
     _, first, body, count = np.unique(into, return_index=True, return_inverse=True, return_counts=True)

@@ -33,7 +33,7 @@ from sfm_shapefit.refinement.consensus import (
     residual_angles,
 )
 from sfm_shapefit.refinement.posterior import TriangleEvidence, weigh_by_triangles
-from sfm_shapefit.solver.options import MANY_PAIRS, SolverOptions, SolverResult
+from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverOptions, SolverResult
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.solve import solve
 
@@ -121,7 +121,7 @@ class _Search:
         None if each of their nodes is where most of its rays meet.
         """
         best = None
-        for _ in range(_CONSENSUS_ROUNDS if self._measured.graph.num_edges <= MANY_PAIRS else 1):
+        for _ in range(_CONSENSUS_ROUNDS if self._measured.graph.num_edges <= PAIRS_AT_SCALE else 1):
             moved = self._put(locations, mixture.log_odds, mixture.variances)
             if best is None and np.array_equal(moved, locations):
                 return None

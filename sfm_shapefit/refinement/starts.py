@@ -34,7 +34,7 @@ from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
-from sfm_shapefit.solver.options import MANY_PAIRS, SolverResult
+from sfm_shapefit.solver.options import PAIRS_AT_SCALE, SolverResult
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
@@ -296,7 +296,7 @@ def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _P
 
 def has_second_start(graph: ViewGraph) -> bool:
     """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
-    return graph.num_edges <= MANY_PAIRS and graph.num_nodes > 2
+    return graph.num_edges <= PAIRS_AT_SCALE and graph.num_nodes > 2
 
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:

@@ -87,19 +87,20 @@ def test_starts_of_many_pairs_are_solved_to_less_than_the_last_digit_unless_that
     hopeless, monkeypatch
 ):
     for module in (solver_options, reweighted):
-        monkeypatch.setattr(module, "MANY_PAIRS", hopeless.view_graph.num_edges - 1)
+        monkeypatch.setattr(module, "PAIRS_AT_SCALE", hopeless.view_graph.num_edges - 1)
     asked = []
 
     def listen(graph, told, **how):
-        asked.append(told.tol)
+        asked.append(told)
         return solve(graph, told, **how)
 
     monkeypatch.setattr(reweighted, "solve", listen)
     found = place(hopeless.view_graph)
-    assert set(asked) == {1e-6}
+    assert {(told.tol, told.max_iterations) for told in asked} == {(1e-6, 60)}
     assert found.certified.converged
     assert shape_error(found.locations, hopeless.locations) < 1e-6
-    assert SolverOptions(tol=1e-9).at_scale(10**7).tol == 1e-9
+    told = SolverOptions(tol=1e-9, max_iterations=500)
+    assert told.at_scale(10**7) == told
 
 
 def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch):

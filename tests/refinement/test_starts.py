@@ -134,7 +134,7 @@ def test_a_start_whose_cameras_stand_in_one_point_is_not_kept_whatever_it_costs(
 
 
 def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypatch, expander):
-    monkeypatch.setattr(finishing, "MANY_PAIRS", 10)
+    monkeypatch.setattr(finishing, "PAIRS_AT_SCALE", 10)
     for objective in ("auto", "lud"):
         found = finished(expander, objective=objective)
         assert found.start == "ShapeFit"
