@@ -226,6 +226,15 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
 
 
+def _refuse_open_groups(between: ViewGraph, unit: RigidGroups) -> None:
+    """Raise UnsolvableError where the pairs between groups say nothing of them."""
+    if not between.num_edges:
+        raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
+    c = unit.reduce(scale_functional(between))
+    if not np.linalg.norm(c) > _DIRECTIONS_CANCEL_AT_GROUPS * between.weights.sum():
+        raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
+
+
 def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
     """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
     edges = np.ascontiguousarray(measured.graph.edges)
@@ -236,12 +245,3 @@ def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
         return None
     neighbors = adjacency(measured.graph.num_nodes, edges)
     return plan_factorization(neighbors, edges, best_order(neighbors))
-
-
-def _refuse_open_groups(between: ViewGraph, unit: RigidGroups) -> None:
-    """Raise UnsolvableError where the pairs between groups say nothing of them."""
-    if not between.num_edges:
-        raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
-    c = unit.reduce(scale_functional(between))
-    if not np.linalg.norm(c) > _DIRECTIONS_CANCEL_AT_GROUPS * between.weights.sum():
-        raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
