@@ -74,9 +74,9 @@ class Watch:
 @explained
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions(Settings):
-    """The certified program.
+    """The solver.
 
-    It has no unit: it fixes its own scale.
+    The program that it solves has no unit: it fixes its own scale.
     """
 
     solver: Solver = option(
