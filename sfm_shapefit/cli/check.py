@@ -65,17 +65,15 @@ def check_command(
     """
     source = one_path(model, input_path, "MODEL")
     with report_errors():
-        if images is not None and report is None:
-            raise InputError("pictures of the images go into a page; name it with --report")
-
         from sfm_shapefit.files.colmap.model import read_model
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.write import refuse_page
 
+        if images is not None and report is None:
+            raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
-            if report.exists():
-                read_model(source)  # what is wrong with that is said first
+            _ = report.exists() and read_model(source)  # what is wrong with that is said first
             refuse_page(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)
@@ -86,7 +84,7 @@ def check_command(
         elif not quiet:
             told = found.facts.told(found.cameras, found.pairs)
             print_answer(told)
-            written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
+            written = f"written to {report}; open {shlex.quote(str(report))}" if report else ""
             print_ending(found.verdict, written, told.step.command)
         if strict and found.verdict.is_bad:
             raise typer.Exit(EXIT_UNSOLVABLE)
