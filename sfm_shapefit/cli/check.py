@@ -84,7 +84,7 @@ def check_command(
         elif not quiet:
             told = found.facts.told(found.cameras, found.pairs)
             print_answer(told)
-            written = f"written to {report}; open {shlex.quote(str(report))}" if report else ""
-            print_ending(found.verdict, written, told.step.command)
+            written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
+            print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
         if strict and found.verdict.is_bad:
             raise typer.Exit(EXIT_UNSOLVABLE)
