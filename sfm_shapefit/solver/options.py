@@ -87,7 +87,8 @@ class SolverOptions(Settings):
     )
     tol: float = option(1e-8, "Certified gap, objective - dual_bound, at which a solve counts as converged.")
     max_iterations: int | None = option(
-        None, "Hard limit; by default the solver's own. Reaching it is reported, never silent."
+        None,
+        "Largest number of iterations; by default the solver's own. Reaching it is reported, never silent.",
     )
     uniqueness: bool = option(
         True,
@@ -95,7 +96,7 @@ class SolverOptions(Settings):
     )
     factor_memory_mb: int = option(
         2000,
-        "What one sparse factor may take. Larger ones are replaced by iterations in the solve, and left out "
+        "Memory of one sparse factor. Larger ones are replaced by iterations in the solve, and left out "
         "elsewhere: on long chains in the refinement, and for standard deviations.",
     )
     threads: int = option(
