@@ -40,9 +40,9 @@ def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycol
     database = out / "database.db"
     match(images, database, focal_length_px)
 
-    # Averaged rotations are a few tenths of a degree off; the adjustment after placing finds that out itself.
-    rotations = sfm_shapefit.average_database(database)
-    found = sfm_shapefit.locate(rotations, database)
+    # Rotations may be a degree off where the lens distorts and nobody said so: pairs then correct them.
+    averaged = sfm_shapefit.average_database(database)
+    found = sfm_shapefit.locate(averaged, database, rotations=1.0)
     found.write(out / "located")
     print(f"verdict: {found.verdict.statement}")
     for warning in found.warnings:

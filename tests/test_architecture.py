@@ -47,7 +47,7 @@ MOST_LINES = {
     "pipeline": 6470,
     "placement": 2660,
     "refinement": 2140,
-    "report": 1690,
+    "report": 1680,
     "rotations": 2290,
     "scene": 2080,
     "solver": 4190,

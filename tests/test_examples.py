@@ -38,10 +38,9 @@ def test_the_pycolmap_pipeline_places_the_cameras_of_drawn_images(drawn, tmp_pat
     scene, folder = drawn
     focal_px = scene.options.focal_length_px
     said = run_example("pycolmap_pipeline.py", folder / "images", tmp_path / "out", focal_px)
-    # COLMAP's verification is random; the untold distortion may leave a rotation more than a degree off.
-    assert re.search(r"^[78] cameras, \d{3,} points", said, flags=re.MULTILINE)
-    assert_near_truth(tmp_path / "out/sparse/0", folder, least=7)
-    assert_near_truth(tmp_path / "out/located", folder, least=7)
+    assert re.search(r"^8 cameras, \d{3,} points", said, flags=re.MULTILINE)
+    assert_near_truth(tmp_path / "out/sparse/0", folder, least=8)
+    assert_near_truth(tmp_path / "out/located", folder, least=8)
     assert (tmp_path / "out/located/report.html").stat().st_size > 0
 
 

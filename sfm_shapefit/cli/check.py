@@ -65,14 +65,15 @@ def check_command(
     """
     source = one_path(model, input_path, "MODEL")
     with report_errors():
-        if images is not None and report is None:
-            raise InputError("pictures of the images go into a page; name it with --report")
-
+        from sfm_shapefit.files.colmap.model import read_model
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.write import refuse_page
 
+        if images is not None and report is None:
+            raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
+            _ = report.exists() and read_model(source)  # what is wrong with that is said first
             refuse_page(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)

@@ -21,7 +21,9 @@ Command = TypeVar("Command", bound=Callable[..., None])
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
     Path | None,
-    typer.Argument(metavar="MODEL", help="COLMAP model folder, or for `locate` a list of poses."),
+    typer.Argument(
+        metavar="MODEL", help="COLMAP model folder; for `locate` and `inspect` also a list of poses."
+    ),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
@@ -69,7 +71,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but er
 ImageFolder = Annotated[
     Path | None,
     typer.Option(
-        "--images", metavar="DIR", help="Folder of the images: small pictures of them are in the report."
+        "--images", metavar="DIR", help="Folder of the images, small pictures of which are in the report."
     ),
 ]
 
@@ -127,7 +129,9 @@ class OutputFlags(Settings):
     config: str = option("", "Options from a TOML file; flags win over it.")
     overwrite: bool = option(False, "Replace an earlier output of this command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
-    images: str = option("", "Folder of the images: report.html has small pictures of them, 4 MB at most.")
+    images: str = option(
+        "", "Folder of the images, small pictures of which are in report.html; 4 MB at most."
+    )
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")

@@ -55,11 +55,12 @@ def inspect_command(
         if as_json:
             print_json(found.summary())
         else:
-            what = "node" if source.is_file() and database is None else "image"
+            what, command = (
+                ("node", "place") if source.is_file() and database is None else ("image", "locate")
+            )
             told = found.told
             print_table(f"{counted(found.num_images, what)} of {source}", told.rows, told.elsewhere)
             if not found.diagnosis.obstacle:
-                command = "place" if what == "node" else "locate"
                 by = "" if database is None else f" --database {shlex.quote(str(database))}"
                 print_lines([f"next: sfm-shapefit {command} {shlex.quote(str(source))} OUT{by}"])
         if found.diagnosis.obstacle:

@@ -42,8 +42,8 @@ class MemoryOptions(Settings):
 
     max_memory_mb: int = option(
         0,
-        "Peak memory in MB to stay below, 0 for no limit; what is given up for it is said, and `inspect` "
-        "forecasts it. If nothing is enough, the run is refused with the number needed.",
+        "Peak memory in MB to stay below, 0 for no limit; the output says what was given up for it, and "
+        "`inspect` forecasts the need. If nothing is enough, the run is refused with the number needed.",
     )
 
     def __post_init__(self) -> None:
@@ -66,7 +66,7 @@ class InspectOptions(Composed):
 @explained
 @dataclass(frozen=True, kw_only=True, init=False)
 class LocateOptions(Composed):
-    """What is given of a model that is to be located."""
+    """The given model."""
 
     fix: str = option(
         "",
@@ -77,9 +77,9 @@ class LocateOptions(Composed):
     )
     rotations: Rotations = option(
         "auto",
-        'What to make of the given rotations: "held", as measured by instruments, and not doubted; "free", '
-        "forgotten by the adjustment; a number, pulled to by that standard deviation about each axis in "
-        "degrees or, from 0.3 on, taken for rough and first corrected by the relative rotations of pairs; "
+        'How far the given rotations are believed: "held", as measured by instruments, not doubted; "free", '
+        "ignored by the adjustment; a number, their standard deviation about each axis in degrees, by which "
+        "the adjustment pulls, and which the relative rotations of pairs first correct from 0.3 on; "
         '"auto" asks the matches how far off they are, and which cameras are turned.',
     )
     source: SourceOptions = group(SourceOptions)

@@ -11,7 +11,7 @@ LEAST_MATCHES = 15
 @explained
 @dataclass(frozen=True, kw_only=True)
 class DirectionOptions(Settings):
-    """What a pair must show before its direction is believed."""
+    """Which pairs are believed."""
 
     min_inliers: int = option(
         15, "Least number of inlier matches with parallax whose point lies in front of both cameras."

@@ -81,7 +81,7 @@ def average_database(
     """Average the rotations of a database; what `map_database` does before it places any camera.
 
         rotations = sfm_shapefit.average_database("database.db")
-        found = sfm_shapefit.locate(rotations, "database.db")
+        found = sfm_shapefit.locate(rotations, "database.db", rotations=1.0)  # degrees that they may be off
 
     Args:
         database: as for `map_database`; it is never changed.

@@ -23,8 +23,8 @@ class GaugeOptions(Settings):
     )
     known_distance: tuple[KnownDistance, ...] = option(
         (),
-        "Two images by name, and how far apart they are in the output's units. May be repeated: of several "
-        "the scale is a robust fit, and each is told with what the model has.",
+        "Two images by name, and how far apart they are in the output's units. May be repeated; with "
+        "several, the scale is a robust fit, and the output compares each with the model.",
     )
     control_points: str = option(
         "",

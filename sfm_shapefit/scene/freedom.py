@@ -28,14 +28,14 @@ class FreedomOptions(Settings):
         'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
         'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
         'their distortion too; "held", nothing. What was given pulls by its own weight, and stays where the '
-        "matches do not tell it. Cameras that images share stay shared.",
+        "matches do not determine it. Cameras that images share stay shared.",
     )
     rigs: RigFreedom = option(
         "held",
         'Where sensors stand in their rigs: "held", where they are; "free", the adjustments change it, each '
         "by one pose for all frames. The reference sensors stay, and so does the mean distance of the others "
-        "from them: the scale is still that of the rigs. Refused where the matches do not tell a sensor's "
-        "pose.",
+        "from them: the scale is still that of the rigs. Refused where the matches do not "
+        "determine a sensor's pose.",
     )
 
     def __post_init__(self) -> None:

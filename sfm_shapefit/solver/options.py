@@ -81,9 +81,9 @@ class Watch:
 @explained
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions(Settings):
-    """The certified program.
+    """The solver.
 
-    It has no unit: it fixes its own scale.
+    The program that it solves has no unit: it fixes its own scale.
     """
 
     solver: Solver = option(
@@ -99,8 +99,8 @@ class SolverOptions(Settings):
     )
     max_iterations: int | None = option(
         None,
-        "Hard limit; by default the solver's own, and 60 for a placement of more than a million pairs. "
-        "Reaching it is reported, never silent.",
+        "Largest number of iterations; by default the solver's own, and 60 for a placement of more than a "
+        "million pairs. Reaching it is reported, never silent.",
     )
     uniqueness: bool = option(
         True,
@@ -108,7 +108,7 @@ class SolverOptions(Settings):
     )
     factor_memory_mb: int = option(
         2000,
-        "What one sparse factor may take. Larger ones are replaced by iterations in the solve, and left out "
+        "Memory of one sparse factor. Larger ones are replaced by iterations in the solve, and left out "
         "elsewhere: on long chains in the refinement, and for standard deviations.",
     )
     threads: int = option(

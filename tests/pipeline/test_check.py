@@ -68,6 +68,9 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     assert "Share of the picture in which it sees points" in page.read_text(encoding="utf-8")
     assert "exists already" in run_refused("check", RING / "sparse" / "0", "--report", page)
     assert "is a folder; give" in run_refused("check", RING / "sparse" / "0", "--report", tmp_path)
+    assert "none does not exist" in run_refused(
+        "check", tmp_path / "none", "--report", page
+    )  # before the page
     nowhere = tmp_path / "none" / "page.html"
     assert "does not exist; make it" in run_refused("check", RING / "sparse" / "0", "--report", nowhere)
     run("check", RING / "sparse" / "0", "--report", page, "--overwrite", code=0)
