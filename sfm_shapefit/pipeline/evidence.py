@@ -18,7 +18,7 @@ from sfm_shapefit.tracks.filter import keypoint_errors_px
 
 _MOST_POINTS = 40  # points per image that are asked what they hold; a few of each suffice
 
-_MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and the median of all tells
+_MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
 
 
 class Structure(NamedTuple):
