@@ -164,9 +164,7 @@ def refine_starts(
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
     many = measured.num_cameras >= _MANY_CAMERAS
-    candidates = [("ShapeFit", solved.locations)]
-    if second is not None:
-        candidates.append(("LUD", second))
+    candidates = [("ShapeFit", solved.locations), *([] if second is None else [("LUD", second)])]
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
