@@ -18,8 +18,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
-# Frames from which the coarse solve is left out where poses are fine: it takes half of the time there.
-_MANY_FRAMES = 1_000
+_MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
 _NOTHING_GIVEN = GivenPoses()
 LensesAtFirst = Literal["wanted", "free", "known"]
 

@@ -166,9 +166,7 @@ def refine_starts(
     is_iterative = isinstance(problem.normal_solver, IterativeNormal)
     # Refinements of so many are dear, and starts that are so near to one another lead to one place.
     near = _UNEQUAL if is_iterative else _SAME if measured.num_cameras >= _MANY_CAMERAS else 0.0
-    candidates = [("ShapeFit", solved.locations)]
-    if second is not None:
-        candidates.append(("LUD", second))
+    candidates = [("ShapeFit", solved.locations), *([] if second is None else [("LUD", second)])]
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
