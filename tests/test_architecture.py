@@ -38,13 +38,13 @@ MOST_LINES = {
     "adjustment": 4680,
     "base": 2210,
     "cli": 1770,
-    "facts": 3400,
+    "facts": 3404,
     "files": 4760,
     "graph": 1260,
-    "judgement": 3290,
+    "judgement": 3296,
     "laplacian": 2080,
     "pairs": 1610,
-    "pipeline": 6390,
+    "pipeline": 6445,
     "placement": 2660,
     "refinement": 2100,
     "report": 1700,
@@ -53,7 +53,7 @@ MOST_LINES = {
     "solver": 4360,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
-    "tracks": 1150,
+    "tracks": 1180,
 }
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
 
