@@ -30,31 +30,32 @@ FLOORS = [
 ]
 # Arrows that still go up or across, type checking counted. The list may only become shorter.
 STILL_UPWARD: set[tuple[str, str]] = set()
-MOST_ARROWS = 83  # between rooms, beside those to base/; the list may only become shorter
+MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only become shorter
 
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4680,
-    "base": 2210,
+    "adjustment": 4670,
+    "base": 2290,
     "cli": 1770,
-    "facts": 3404,
+    "facts": 3410,
     "files": 4760,
-    "graph": 1260,
-    "judgement": 3296,
-    "laplacian": 2080,
-    "pairs": 1610,
-    "pipeline": 6445,
+    "graph": 1340,
+    "judgement": 3300,
+    "laplacian": 2050,
+    "pairs": 1530,
+    "pipeline": 6420,
     "placement": 2660,
     "refinement": 2100,
-    "report": 1700,
+    "report": 1680,
     "rotations": 2290,
-    "scene": 2070,
-    "solver": 4360,
+    "scene": 2080,
+    "solver": 4380,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
     "tracks": 1180,
 }
+MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered
 
 ROOMS = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
@@ -139,6 +140,12 @@ def test_each_room_keeps_within_its_budget_of_lines():
     assert without == {"__main__", "synthetic/fixtures"} - set(MOST_LINES)
     assert {room: lines[room] for room, most in MOST_LINES.items() if lines[room] > most} == {}
     assert {room: lines[room] for room, most in MOST_LINES.items() if lines[room] < most - SLACK_LINES} == {}
+
+
+@pytest.mark.parametrize("command", ["locate", "map"])
+def test_the_pipeline_of_a_command_is_a_page(command):
+    text = (PACKAGE / f"pipeline/{command}.py").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= MOST_LINES_OF_A_PAGE
 
 
 def test_only_kernels_and_commands_have_many_parameters():

@@ -11,7 +11,7 @@ Sources
                     Monasse, Marlet, "Global fusion of relative motions", ICCV 2013, eq. 7
     LUD             Ozyesil, Singer, "Robust camera location estimation by convex programming", CVPR 2015
     1DSfM           Wilson, Snavely, "Robust global translations with 1DSfM", ECCV 2014, section 4
-    triangles       Shi, Lerman, CVPR 2018; the scores are those of `sfm_shapefit.pairs.triangles`
+    triangles       Shi, Lerman, CVPR 2018; the scores are those of `sfm_shapefit.graph.triangle_scores`
 """
 
 import numpy as np
@@ -21,9 +21,9 @@ from scipy.sparse.linalg import splu
 from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.triangle_scores import triangle_scores
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.solver.program import differences, projected_length
 from sfm_shapefit.solver.splitting.lud import solve_lud
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,17 +10,7 @@ from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
-
-
-class LensErrors(NamedTuple):
-    """What covariances take errors of the lenses for."""
-
-    score: float
-    """Standard score of smooth errors that all images of a lens share, the largest of all lenses'."""
-    own_px: float
-    """Root of the mean square of the smooth errors of an image of its own; 0 where the lenses fit."""
-    shared_px: float
-    """The same of those that all images of a lens share, the largest of all lenses'."""
+from sfm_shapefit.scene.lens import LensErrors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,8 +19,8 @@ from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import Values
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.geometry import fit_similarity
-from sfm_shapefit.laplacian.dense import one_blas_thread
 
 _DIMENSION = 7  # motions of a similarity; three shifts, three turns, one scaling
 _NONE = 1e-10  # share of the largest singular value; what holds less holds nothing

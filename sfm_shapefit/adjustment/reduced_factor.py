@@ -13,6 +13,7 @@ from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.schur import ReducedSystem
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.base.scipy_parts import dpotrf, dpotri, dpotrs
@@ -22,7 +23,6 @@ from sfm_shapefit.laplacian.cholesky import (
     allocate_factor,
     analyze,
 )
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.selected import selected_inverse
 
 _UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"

@@ -37,7 +37,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
-from sfm_shapefit.adjustment.estimate import LensErrors
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -47,6 +46,7 @@ from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import METRIC_SIGMA
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.scene.lens import LensErrors
 
 _MOST_GROUPS = 64  # groups of neighboring points; each is one more right side for the factor
 _FEWEST_OF_A_GROUP = 8  # points of a group; fewer would share no noise

@@ -84,6 +84,6 @@ def check_command(
             told = found.facts.told(found.cameras, found.pairs)
             print_answer(told)
             written = "" if report is None else f"written to {report}; open {shlex.quote(str(report))}"
-            print_ending(found.verdict, written, told.step.command)
+            print_ending(found.verdict.grade.value, found.verdict.statement, written, told.step.command)
         if strict and found.verdict.is_bad:
             raise typer.Exit(EXIT_UNSOLVABLE)

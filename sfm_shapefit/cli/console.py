@@ -21,7 +21,6 @@ from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
-    from sfm_shapefit.judgement.grade import ModelVerdict
     from sfm_shapefit.pipeline.clock import Progress
     from sfm_shapefit.pipeline.warm_up import Tell
 
@@ -293,9 +292,9 @@ def print_answer(told: Telling, time_taken: str = "") -> None:
         print_lines([f"{label}: {line}" for line in shown], _WARNING_STYLE if label == "warning" else "")
 
 
-def print_ending(verdict: "ModelVerdict", written: str, step: str) -> None:
+def print_ending(grade: str, verdict: str, written: str, step: str) -> None:
     """Print on stdout how good a model is, what was written, and the next command, which can be copied."""
-    print_lines([f"verdict: {verdict.statement}"], _GRADE_STYLES[verdict.grade.value])
+    print_lines([f"verdict: {verdict}"], _GRADE_STYLES[grade])
     print_lines([line for line in (written, f"next: {step}") if line])
 
 

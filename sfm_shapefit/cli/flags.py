@@ -338,7 +338,7 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
 
 def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options, or groups of them."""
-    from sfm_shapefit.files.lines import refuse_irregular_file
+    from sfm_shapefit.base.paths import refuse_irregular_file
 
     refuse_irregular_file(path)
     try:

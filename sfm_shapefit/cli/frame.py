@@ -80,11 +80,11 @@ class Run(Generic[S]):
         print_answer(told._replace(rows=[*told.rows, pictures]), self._describe_time())
         opened = f"; open {shlex.quote(str(page))}" if self.flags.report else ""
         step = self._with_folder(told.step.command, out / told.folder)
-        print_ending(found.verdict, f"written to {out}/{opened}", step)
+        print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _missing_pictures(self, names: Iterable[str]) -> str:
         """Warn if pictures were asked for, and the folder has none of the images."""
-        from sfm_shapefit.report.thumbnails import file_of
+        from sfm_shapefit.base.paths import file_of
 
         folder = Path(self.flags.images)
         if not self.flags.images or not self.flags.report or any(file_of(folder, name) for name in names):
@@ -148,7 +148,7 @@ def command_run(
         config = Path(flags.config) if flags.config else None
         options = read_options(settings, given, config)
         if flags.images:  # now, not when all is computed
-            from sfm_shapefit.report.thumbnails import refuse_no_folder
+            from sfm_shapefit.base.paths import refuse_no_folder
 
             refuse_no_folder(Path(flags.images))
         values = flat_values(options)

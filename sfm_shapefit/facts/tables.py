@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.lines import refuse_irregular_file
+from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.judgement.verdicts import Verdict
 
 TableName = Literal["cameras", "pairs"]

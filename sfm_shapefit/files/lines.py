@@ -2,7 +2,6 @@
 
 import csv
 import re
-import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,28 +10,13 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import refuse_irregular_file
 
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
 _MOST_BYTES = 8_000_000_000  # bytes of a text; the graph of a million cameras has one
 UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
-
-
-def refuse_irregular_file(path: Path) -> None:
-    """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
-
-    Raises:
-        InputError: if `path` is, or links to, a folder, a pipe, a socket or a device.
-    """
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):
-        return  # whoever opens it says why it cannot be read
-    if stat.S_ISDIR(mode):
-        raise InputError(f"{path} cannot be read: Is a directory")
-    if not stat.S_ISREG(mode):
-        raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
 
 
 def _is_huge(path: Path) -> bool:

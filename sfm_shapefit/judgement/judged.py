@@ -4,13 +4,13 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import LensErrors
 from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.judgement.verdicts import Assessment, assess
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.scene.lens import LensErrors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

@@ -30,9 +30,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel, multiply_in_lanes
-from sfm_shapefit.laplacian.dense import Blas, Block, blas_of, gemm, one_blas_thread, potrf, syrk, trsm
+from sfm_shapefit.laplacian.dense import Blas, Block, blas_of, gemm, potrf, syrk, trsm
 from sfm_shapefit.laplacian.operators import Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization

@@ -4,20 +4,13 @@ All matrices are column-major blocks, given by address and leading dimension, an
 read or written. A kernel is handed the `blas_of` the type, float32 or float64, and is compiled once for both.
 Addresses are arguments, so the compiled kernels stay cached on disk (`base/jit`). The arrays behind
 them must outlive the call.
-
-BLAS with two threads splits, and hence rounds, differently from BLAS with one. `one_blas_thread` holds it to
-one, so that results do not depend on the number of cores.
 """
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import ThreadpoolController
 
 from sfm_shapefit.base.arrays import IntArray, frozen
 from sfm_shapefit.base.jit import array_address, call_address, function_address, inner_kernel, kernel
@@ -33,31 +26,6 @@ _SCALARS: dict[str, npt.NDArray[Any]] = {
     "s": np.array([1.0, -1.0, 0.0], dtype=np.float32),
     "d": np.array([1.0, -1.0, 0.0], dtype=np.float64),
 }
-
-# One entry per thread of Python inside `one_blas_thread`; the first holds the limit.
-_limits: list[Any] = []
-_lock = threading.Lock()
-
-
-@lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    """Find the BLAS libraries of this process, once, after scipy's has been loaded."""
-    _addresses("d")
-    return ThreadpoolController()
-
-
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Hold BLAS to one thread; nested and concurrent uses share one limit, lifted by the last."""
-    with _lock:
-        _limits.append(None if _limits else _controller().limit(limits=1, user_api="blas"))
-    try:
-        yield
-    finally:
-        with _lock:
-            limit = _limits.pop(0) if len(_limits) == 1 else _limits.pop()
-            if limit is not None:
-                limit.restore_original_limits()
 
 
 @lru_cache(maxsize=2)

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.scipy_parts import dtrtri
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
 

@@ -10,9 +10,9 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.seed import build_seed
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.map import database_in, map_database, measure_run
+from sfm_shapefit.pipeline.map import map_database, measure_run
 from sfm_shapefit.pipeline.map_run import start_run
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.points import number_points

@@ -24,7 +24,6 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import assess
-from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.adjust import read_bundle
 from sfm_shapefit.pipeline.evaluate import evaluate
@@ -42,7 +41,7 @@ from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.linear import IterativeSolver
+from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
@@ -116,8 +115,7 @@ def solve_by_splitting(_folder: Path) -> None:
 def solve_iteratively(_folder: Path) -> None:
     """Solve a Laplacian without a factor."""
     graph = _long_graph()
-    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-    solver = IterativeSolver(neighbors, 2)
+    solver = laplacian_factor(graph, Resources(threads=2, memory_bytes=0))
     solver.refactor(graph.weights)
     solver.solve(np.ones((graph.num_nodes, 3)) * np.arange(3.0))
 

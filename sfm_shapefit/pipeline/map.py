@@ -11,13 +11,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
@@ -126,19 +126,6 @@ def measure_run(run: MapRun) -> MeasuredPairs:
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)
     return MeasuredPairs(run.score_pairs(relative), relative, videos, visits)
-
-
-def database_in(path: Path) -> Path:
-    """Return the database of a folder, which is its database.db; any other path is that of a database.
-
-    Raises:
-        InputError: if the folder has none.
-    """
-    if not path.is_dir():
-        return path
-    if not (path / "database.db").is_file():
-        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
-    return path / "database.db"
 
 
 def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:

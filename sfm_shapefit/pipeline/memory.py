@@ -18,16 +18,11 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.inspected import Forecast
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.laplacian.cholesky import analyze
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS, PLENTY, Reading
 from sfm_shapefit.solver.options import NO_FACTOR
-from sfm_shapefit.solver.solve import choose_method
-from sfm_shapefit.solver.splitting.linear import predict_factor
+from sfm_shapefit.solver.solve import choose_method, plan_factor
 
 _MB = 1e6  # bytes; as users count them
 _STARTED_BYTES = 195e6  # bytes; the interpreter with all that `locate` imports
@@ -171,7 +166,7 @@ def describe_work(
     graph, entries = measured.graph, 0
     needs_factor = measured.groups is not None
     if graph.num_edges:
-        plan = _plan_factor(measured)
+        plan = plan_factor(measured)
         needs_factor = needs_factor or choose_method(graph, placement.solver).method == "newton"
         max_bytes = np.inf if needs_factor else placement.solver.factor_bytes
         if plan is not None and plan.num_bytes(graph.dimension, np.float64) <= max_bytes:
@@ -187,18 +182,6 @@ def describe_work(
         factor_entries=entries,
         needs_factor=needs_factor,
     )
-
-
-def _plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
-    """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
-    edges = np.ascontiguousarray(measured.graph.edges)
-    if measured.groups is not None:
-        ends = measured.groups.group_of[edges[measured.groups.joins(edges)]]
-        return analyze(measured.groups.num_groups, np.ascontiguousarray(ends))
-    if predict_factor(measured.graph).tree is None:
-        return None
-    neighbors = adjacency(measured.graph.num_nodes, edges)
-    return plan_factorization(neighbors, edges, best_order(neighbors))
 
 
 def _peaks(work: Workload, economy: Economy) -> dict[str, float]:

@@ -8,9 +8,9 @@ weak cameras   A camera's pairs hold it by the stacked projectors P_v = I - v v^
                camera may slide along them, 1 where they point evenly everywhere.
 corruption     In a triangle without errors each direction lies on the arc between the other two. The
                estimate is the share, of pairs in a triangle, whose iterated mean angle to these arcs
-               (`pairs.triangles`) is above 0.3 rad: within 0.03 of the true share up to 0.2, within 0.09 at
-               0.5, on six synthetic families (`scripts/results/notes.md#corruption-by-triangles`). It does
-               not see wrong pairs that agree with one another; in the plane it is too low.
+               (`graph.triangle_scores`) is above 0.3 rad: within 0.03 of the true share up to 0.2, within
+               0.09 at 0.5, on six synthetic families (`scripts/results/notes.md#corruption-by-triangles`). It
+               does not see wrong pairs that agree with one another; in the plane it is too low.
 
 A camera most of whose matches contradict the given rotations is named as well. Where the scene repeats itself
 right cameras are among these, unless the pairs' own relative rotations (`judgement.turns`) confirm them.
@@ -25,8 +25,8 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, left_out_reasons
+from sfm_shapefit.graph.triangle_scores import triangle_scores
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.placement.conditioning import FEW_PAIRS, NEARLY_PARALLEL, direction_spread
 from sfm_shapefit.placement.place import count_large, order_pieces, refuse_without_triangle
 from sfm_shapefit.refinement.options import PlacementOptions

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
 from sfm_shapefit.refinement.options import PlacementOptions

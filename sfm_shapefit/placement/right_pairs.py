@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.rigidity import rigid_pieces
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.options import SolverOptions, SolverResult
 from sfm_shapefit.solver.solve import solve

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
-from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import file_of, refuse_no_folder
 from sfm_shapefit.report.drawing import Drawing
 
 MAX_BYTES = 4_000_000  # bytes of all pictures of a page as base64; with more it opens slowly
@@ -55,25 +55,6 @@ def read_thumbnails(folder: Path, names: Sequence[str], order: IntArray) -> dict
             break
         found[row] = f"data:image/jpeg;base64,{base64.b64encode(picture).decode('ascii')}"
     return found
-
-
-def refuse_no_folder(folder: Path) -> None:
-    """Refuse what is no folder of images.
-
-    Raises:
-        InputError: a sentence that says so.
-    """
-    if not folder.is_dir():
-        raise InputError(f"{folder} is no folder; give the one that the names of the images start from")
-
-
-def file_of(folder: Path, name: str) -> Path | None:
-    """Return the file of an image, if there is one inside the folder."""
-    try:
-        path, root = (folder / name).resolve(), folder.resolve()
-        return path if path.is_relative_to(root) and path.is_file() else None
-    except (OSError, ValueError):
-        return None
 
 
 def _shrink(path: Path, width: int) -> bytes | None:

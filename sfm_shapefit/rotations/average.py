@@ -24,10 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.quaternions import matrices_of, quaternions_of
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
 from sfm_shapefit.rotations.annealing import (
     AveragingPairs,

@@ -9,6 +9,7 @@ pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
 
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -204,3 +205,14 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
     folds = np.roots([5.0 * k2, 3.0 * k1, 1.0])
     largest = min((float(s.real) for s in folds if s.imag == 0.0 and s.real > 0.0), default=np.inf)
     return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
+
+
+class LensErrors(NamedTuple):
+    """What covariances take errors of the lenses for."""
+
+    score: float
+    """Standard score of smooth errors that all images of a lens share, the largest of all lenses'."""
+    own_px: float
+    """Root of the mean square of the smooth errors of an image of its own; 0 where the lenses fit."""
+    shared_px: float
+    """The same of those that all images of a lens share, the largest of all lenses'."""

@@ -42,12 +42,13 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.jit import array_address, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorize
-from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
+from sfm_shapefit.laplacian.dense import blas_of, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorization

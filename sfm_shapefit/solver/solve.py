@@ -8,11 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.laplacian.cholesky import analyze
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
@@ -189,3 +194,15 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
     c = scale_functional(graph)
     if np.linalg.norm(c) <= _DIRECTIONS_CANCEL * graph.weights.sum():
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
+
+
+def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
+    """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
+    edges = np.ascontiguousarray(measured.graph.edges)
+    if measured.groups is not None:
+        ends = measured.groups.group_of[edges[measured.groups.joins(edges)]]
+        return analyze(measured.groups.num_groups, np.ascontiguousarray(ends))
+    if predict_factor(measured.graph).tree is None:
+        return None
+    neighbors = adjacency(measured.graph.num_nodes, edges)
+    return plan_factorization(neighbors, edges, best_order(neighbors))

@@ -19,10 +19,10 @@ from sfm_shapefit.base.settings import setting_groups
 from sfm_shapefit.cli import app
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.placed import UNITS
+from sfm_shapefit.files.colmap.sqlite_file import database_in
 from sfm_shapefit.files.graph_text import graph_text
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.locate import locate
-from sfm_shapefit.pipeline.map import database_in
 from sfm_shapefit.report.first_screen import tiles
 from sfm_shapefit.report.results import draw_result
 from tests.problems import all_pairs, exact_graph

@@ -21,7 +21,6 @@ from sfm_shapefit.cli.console import show_progress
 from sfm_shapefit.cli.flags import OutputFlags
 from sfm_shapefit.cli.frame import Run
 from sfm_shapefit.files.colmap import model
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict
 from tests.program import run
 from tests.scenes import FACADE, RING, ROOT
 
@@ -157,8 +156,6 @@ class Terminal(io.TextIOWrapper):
 
 
 def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is_wanted(monkeypatch):
-    verdict = ModelVerdict(grade=Grade.LOOK, cameras=("a.jpg",), reasons=())
-
     def shown(**environment):
         with monkeypatch.context() as patch:
             for name, value in ({"TERM": "xterm-256color"} | environment).items():
@@ -166,7 +163,7 @@ def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is
             raw = io.BytesIO()
             patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
             console.print_answer(Telling(["8 of 8"], [Row("warning", ["look out"])]), "3.0 s")
-            console.print_ending(verdict, "written to out/", "colmap")
+            console.print_ending("look", "look at 1 camera (a.jpg)", "written to out/", "colmap")
             sys.stdout.flush()
             return raw.getvalue().decode()
 

@@ -12,12 +12,12 @@ from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_info
 
 from harness.graphs import laplacian_matrix
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.laplacian import ordering
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
 from sfm_shapefit.solver.program import differences

@@ -6,8 +6,8 @@ import pytest
 from paper import baselines
 from paper.baselines import onedsfm_scores
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph.triangle_scores import triangle_scores
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.pairs.triangles import triangle_scores
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import box_graph_problem, random_graph_problem

@@ -35,7 +35,8 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.files.lines import refuse_database, refuse_irregular_file
+from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.lines import refuse_database
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
 

@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from sfm_shapefit.base.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.lines import refuse_irregular_file
+from sfm_shapefit.base.paths import refuse_irregular_file
 
 _SIDECARS = ("-wal", "-journal")
 _WAL_VERSION = 2  # bytes 18 and 19 of the header; they are 2 where the file has a write-ahead log
@@ -48,6 +48,19 @@ _LIMITS = {
 def is_between(value: object, least: int, bound: int) -> bool:
     """Return whether a value of a row is an integer from `least` to below `bound`."""
     return isinstance(value, int) and least <= value < bound
+
+
+def database_in(path: Path) -> Path:
+    """Return the database of a folder, which is its database.db; any other path is that of a database.
+
+    Raises:
+        InputError: if the folder has none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / "database.db").is_file():
+        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
+    return path / "database.db"
 
 
 class DatabaseFile:

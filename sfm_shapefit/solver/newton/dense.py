@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
+from sfm_shapefit.laplacian.dense import Blas, blas_of, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.certificate import Certificate
 from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult

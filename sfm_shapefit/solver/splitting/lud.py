@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
-from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import across, adjoint, along, differences
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data

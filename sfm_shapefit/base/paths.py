@@ -1,0 +1,41 @@
+"""What a path may be before it is opened: an ordinary file, a folder, an image inside one."""
+
+import stat
+from pathlib import Path
+
+from sfm_shapefit.base.errors import InputError
+
+
+def refuse_irregular_file(path: Path) -> None:
+    """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
+
+    Raises:
+        InputError: if `path` is, or links to, a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it says why it cannot be read
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path} cannot be read: Is a directory")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
+
+
+def refuse_no_folder(folder: Path) -> None:
+    """Refuse what is no folder of images.
+
+    Raises:
+        InputError: a sentence that says so.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; give the one that the names of the images start from")
+
+
+def file_of(folder: Path, name: str) -> Path | None:
+    """Return the file of an image, if there is one inside the folder."""
+    try:
+        path, root = (folder / name).resolve(), folder.resolve()
+        return path if path.is_relative_to(root) and path.is_file() else None
+    except (OSError, ValueError):
+        return None
