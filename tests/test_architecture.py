@@ -38,13 +38,13 @@ MOST_LINES = {
     "adjustment": 4690,
     "base": 2290,
     "cli": 1770,
-    "facts": 3400,
+    "facts": 3410,
     "files": 4800,
     "graph": 1340,
-    "judgement": 3310,
+    "judgement": 3320,
     "laplacian": 2070,
     "pairs": 1530,
-    "pipeline": 6470,
+    "pipeline": 6530,
     "placement": 2660,
     "refinement": 2140,
     "report": 1680,
@@ -53,7 +53,7 @@ MOST_LINES = {
     "solver": 4190,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
-    "tracks": 1130,
+    "tracks": 1180,
 }
 MOST_LINES_OF_A_PAGE = 150  # of the pipeline of a command, so that its stages are seen at one glance
 SLACK_LINES = 40  # a budget further above its room than this is to be lowered

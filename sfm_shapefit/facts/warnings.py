@@ -9,6 +9,7 @@ from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
@@ -57,7 +58,9 @@ def quality_warnings(placement: Judged) -> Iterator[str]:
     if placement.certified.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
     refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
-    if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
+    adjusted = placement.adjusted_covariances  # pixels tell lengths, whatever the starts had
+    is_measured = adjusted is not None and not np.isnan(adjusted).any()
+    if refined.collapsed and not (is_measured or (refined.is_refined and rejected <= _FEW_REJECTED)):
         assert refined.disagreement is not None
         yield (
             f"lengths are poorly known: two ways to find them disagree by {refined.disagreement:.0%}, as on "
@@ -137,13 +140,13 @@ def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
 
 
 def ambiguity_warnings(placement: Judged) -> Iterator[str]:
-    """Yield which cameras stand as well turned as they do as placed."""
-    doubts = placement.assessment.doubts
+    """Yield which cameras stand as well turned as they do as placed; pixels confirm none of them."""
+    doubts, is_low = placement.assessment.doubts, placement.assessment.trust < LOW_TRUST
     if doubts is None:
         return
-    ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
+    ambiguous = [k for k, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS and is_low[k]]
     if ambiguous:
-        members = np.flatnonzero(np.isin(doubts.bodies, doubts.bodies[ambiguous]))
+        members = np.flatnonzero(is_low & np.isin(doubts.bodies, doubts.bodies[ambiguous]))
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
         angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))

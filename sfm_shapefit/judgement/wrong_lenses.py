@@ -1,11 +1,12 @@
 """Wrong lenses: whose images ask for another focal length when they are left out, one by one.
 
-A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Where one
-took several, their points have bent to a wrong focal length, so that its value shows less than that the
-images ask for unlike ones: it is wrong if half of them change by more than 0.4 % and three deviations. With
-right lenses, no image of 17 scenes changed so, and half of those of a lens changed by 0.2 % at most, or by
-two deviations; with all lenses wrong by 0.8 to 1.3 and the points adjusted to that, half of them changed by
-0.5 % or more.
+A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Four do if
+they are 2.5 times those of any other image: before a wall, seen from the front, a camera that stands nearer
+hides nearly all of it. Where one took several, their points have bent to a wrong focal length, so that its
+value shows less than that the images ask for unlike ones: it is wrong if half of them change by more than
+0.4 % and three deviations. With right lenses, no image of 17 scenes changed by ten deviations, and half of
+those of a lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the
+points adjusted to that, half of them changed by 0.5 % or more.
 """
 
 from typing import NamedTuple
@@ -21,6 +22,8 @@ from sfm_shapefit.scene.points import Points
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
 # which half of the images of a lens show that it is; see the header.
 _ONE, _HALF = (0.025, 10.0), (0.004, 3.0)
+# Standard deviations, and how many times those of any other image: so clear is a lens of one image too.
+_CLEAR, _FEWEST_OTHERS = (4.0, 2.5), 5  # other images; fewer are no measure
 _FEWEST_IMAGES = 3  # images of a lens of which a half is asked for; each of fewer is asked alone
 _RIVAL = 0.5  # share of the highest score; what is named as clearly is taken out at once, for time's sake
 
@@ -74,11 +77,17 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
     with np.errstate(divide="ignore", invalid="ignore"):
         scores = np.abs(left_out.log_factors) / left_out.sigmas
     for lens in range(len(images.lenses)):
-        rows = np.flatnonzero((images.lens_of == lens) & left_out.observable)
-        changes = left_out.log_factors[rows]
+        own = images.lens_of == lens
+        rows, others = (np.flatnonzero(side & left_out.observable) for side in (own, ~own))
+        (least, deviations), clear = _ONE, max(_CLEAR[0], _CLEAR[1] * scores[others].max(initial=0.0))
+        if len(rows) >= _FEWEST_IMAGES:
+            least, deviations = _HALF
+        elif own.sum() < _FEWEST_IMAGES and len(others) >= _FEWEST_OTHERS:
+            deviations = min(deviations, clear)
+            rows = np.flatnonzero(own & (left_out.observable | (scores > clear)))
         if not len(rows):
             continue
-        least, deviations = _HALF if len(rows) >= _FEWEST_IMAGES else _ONE
+        changes = left_out.log_factors[rows]
         middle = float(np.median(changes))
         sigma = float(left_out.sigmas[rows].max())
         if len(rows) >= _FEWEST_IMAGES:

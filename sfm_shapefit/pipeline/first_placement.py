@@ -19,7 +19,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import Wanted, build_graph, measure, wants_points
-from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, may_be_checked, place_by_checked, place_cameras
 from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.place import Near
 
@@ -59,10 +59,16 @@ def adjust_first_placement(
     """
     images, wanted = source.images, Wanted(tracks=wants_points(source, options.nodes))
     measured = measure(source, options.directions, clock, wanted)
-    graph, directions = given.rigid.apply(build_graph(images, measured, options.nodes)), measured.directions
-    del measured  # arrays of all pairs
-    placement = next(place_cameras(graph, options.placement, options.nodes, clock, certified=False))
-    del graph
+    build = partial(build_graph, images, measured, options.nodes)
+    graph, directions = given.rigid.apply(build()), measured.directions
+    place = partial(
+        place_cameras, options=options.placement, nodes=options.nodes, clock=clock, certified=False
+    )
+    if measured.checked is None or not may_be_checked(graph):
+        placement = next(place(graph))
+    else:
+        _, placement = place_by_checked(graph, partial(build, checked=True), place)
+    del graph, build, measured  # arrays of all pairs
     stand = Stand.of(given, source, directions, placement, options)
     posed = posed_part(stand.place())
     links = partial(stand.read_links, posed, clock.advance)

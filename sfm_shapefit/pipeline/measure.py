@@ -52,6 +52,8 @@ class Measured:
     """Directions of all pairs, usable or not."""
     tracks: Tracks | None = None
     """Points seen by three cameras or more, which may become nodes; None where they were not asked for."""
+    checked: Tracks | None = None
+    """A covering set of those that no single match holds together; None where that is not known."""
     errors: list[FloatArray] | None = None
     """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
     where directions count as independent."""
@@ -110,6 +112,7 @@ def measure(
     return Measured(
         directions=concatenate(parts),
         tracks=beside.tracks(),
+        checked=beside.checked_tracks(),
         errors=beside.errors,
         facts_per_match=beside.facts_per_match(),
     )
@@ -160,6 +163,11 @@ class _Beside:
         """Return the tracks, if they are wanted."""
         return None if self._joiner is None else self._joiner.tracks()
 
+    def checked_tracks(self) -> Tracks | None:
+        """Return a covering set of the checked tracks, if any are wanted."""
+        checked = None if self._joiner is None else self._joiner.checked_tracks()
+        return checked and checked.subset(covering_set(checked, len(self._begins) - 1))
+
 
 def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
     """Return the graph of the usable directions; it has at least one edge."""
@@ -185,12 +193,15 @@ def wants_points(source: MatchSource, options: NodeOptions) -> bool:
     return options.uses_points(source.images.num_images) and source.economy.points
 
 
-def build_graph(images: Images, measured: Measured, nodes: NodeOptions) -> MeasuredGraph:
+def build_graph(
+    images: Images, measured: Measured, nodes: NodeOptions, *, checked: bool = False
+) -> MeasuredGraph:
     """Return the graph of the usable directions, with 3D points as further nodes if there are tracks.
 
-    But many cameras that their pairs hold need none, unless they are wanted always.
+    If `checked`, with those of the checked tracks alone. But many cameras that their pairs hold need none,
+    unless they are wanted always.
     """
-    directions, tracks = measured.directions, measured.tracks
+    directions, tracks = measured.directions, measured.checked if checked else measured.tracks
     graph, covariance = view_graph(images, directions), directions.covariance[directions.usable()]
     if tracks is None or (nodes.points == "auto" and _is_held_by_pairs(graph)):
         return MeasuredGraph(graph, covariance=covariance)

@@ -5,7 +5,7 @@ has them: two or more are one group, whose offsets are their centers; of a singl
 taken.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -30,7 +30,11 @@ from sfm_shapefit.solver.solve import refuse_admm
 from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
+_FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
+_MOST_TRIED = 5_000  # nodes; more take seconds
 _COINCIDENT = 1e-9  # extent of fixed centers over their distance from the origin; less is rounding
+
+Place = Callable[[MeasuredGraph], Iterator[Placement]]
 
 
 class Rigid(NamedTuple):
@@ -145,6 +149,39 @@ def place_cameras(
     found = second if is_better else first
     assert found is not None
     yield found
+
+
+def may_be_checked(measured: MeasuredGraph) -> bool:
+    """Return whether a graph is placed by checked tracks too: rigid groups need few, large ones time."""
+    return measured.groups is None and measured.num_points > 0 and measured.graph.num_nodes <= _MOST_TRIED
+
+
+def place_by_checked(
+    measured: MeasuredGraph, checked: Callable[[], MeasuredGraph], place: Place
+) -> tuple[MeasuredGraph, Placement]:
+    """Return a graph with its points, or that with checked ones where more pairs agree with its placement.
+
+    That is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
+
+    Args:
+        measured: the graph with the points of all tracks.
+        checked: makes the same with the points of checked tracks.
+        place: places a graph; its first piece counts.
+    """
+    usual = next(place(measured))
+    if _count_agreeing(usual) >= _FITTING * usual.num_pairs:
+        return measured, usual
+    graph = checked()
+    with suppress(UnsolvableError):
+        other = next(place(graph))
+        if _count_agreeing(other) > _count_agreeing(usual):
+            return graph, other
+    return measured, usual
+
+
+def _count_agreeing(placement: Placement) -> int:
+    """Return how many pairs agree with a placement."""
+    return int(placement.agreement.agrees[placement.pairs].sum())
 
 
 def _count_held(placement: Placement, options: PlacementOptions) -> int:

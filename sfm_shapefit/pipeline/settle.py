@@ -63,7 +63,7 @@ from sfm_shapefit.pipeline.measure import (
     wants_points,
 )
 from sfm_shapefit.pipeline.memory import describe_work, keep_within_memory
-from sfm_shapefit.pipeline.rigs import place_cameras
+from sfm_shapefit.pipeline.rigs import may_be_checked, place_by_checked, place_cameras
 from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
@@ -100,6 +100,11 @@ def settle(
         describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
         source = opened.at(opened.images, economy)
+        if first is None and measured.checked is not None and may_be_checked(graph):
+            checked = partial(build_graph, opened.images, measured, options.nodes, checked=True)
+            limited = economy.limit(options.placement)
+            place = partial(place_cameras, options=limited, nodes=options.nodes, clock=clock, certified=False)
+            graph, _ = place_by_checked(graph, checked, place)
         graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
         del measured
         near = None if first is None else first.near

@@ -5,9 +5,17 @@ ray, turned round. A point seen by three cameras or more ties their distances to
 between the cameras cannot: on a straight road all baselines are parallel, rays to the roadside are not.
 
 A track is a connected component of observations under matches that agree with their pair's direction; one
-that meets an image twice is wrong and dropped. Where there are too many matches to hold, only those of a
-random share of the keypoints are kept, and with them whole stars of matches around these. A covering set of
-the tracks is chosen: so many that every camera, if it can, sees a given number of them.
+that meets an image twice is wrong and dropped. A checked track holds together without any single one of its
+matches. A false pair agrees with itself: each of its matches joins an observation to a point, or two points,
+and twenty such rays outvote all other pairs of their camera, but no second match says the same. So checked
+tracks are cut at such matches (the bridges of the graph of matches); where pairs are few, as along a chain,
+they are too few to serve alone. Bridges are found as the matches pass by: one that closes a circle draws a
+random number, which both of its ends take up by exclusive or, and a match of the spanning forest is a bridge
+if the numbers of all nodes beyond it cancel out.
+
+Where there are too many matches to hold, only those of a random share of the keypoints are kept, and with
+them whole stars of matches around these; nothing checks these. A covering set of the tracks is chosen: so
+many that every camera, if it can, sees a given number of them.
 """
 
 from dataclasses import dataclass
@@ -16,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
-from sfm_shapefit.base.forests import merge_sets
-from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.forests import merge_sets, root_of
+from sfm_shapefit.base.jit import kernel, mix_bits
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
@@ -86,6 +94,8 @@ class TrackJoiner:
         self._begins = np.append(0, np.cumsum(num_keypoints))
         self._places = np.full(int(self._begins[-1]), -1, dtype=np.int32)
         self._parents, self._rays, self._count = np.empty(0, dtype=np.int64), [np.zeros((0, 3))], 0
+        # By observation: number and exclusive or of its neighbors in the forest; that of its random numbers.
+        self._ties, self._drawn = np.empty((0, 2), dtype=np.int32), np.empty(0, dtype=np.int64)
 
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Join the matches that agree with the directions of their pairs, which are those of the batch."""
@@ -96,11 +106,15 @@ class TrackJoiner:
         new_rays = np.empty((min(2 * len(keypoints), len(self._places) - self._count), 3))
         largest = self._count + len(new_rays)
         if largest > len(self._parents):
-            self._parents = np.concatenate([self._parents, np.arange(len(self._parents), 2 * largest)])
+            more = np.arange(len(self._parents), 2 * largest)
+            self._parents = np.concatenate([self._parents, more])
+            self._ties = np.concatenate([self._ties, np.zeros((len(more), 2), dtype=np.int32)])
+            self._drawn = np.concatenate([self._drawn, np.zeros_like(more)])
         number = _join_batch(
             row, batch.offsets, keypoints, drawn, np.ascontiguousarray(batch.rays_i),
             np.ascontiguousarray(batch.rays_j), directions.directions, batch.pixel_angles,
-            self._threshold_px, self._places, self._parents, self._count, new_rays,
+            self._threshold_px, self._places, self._parents, (self._ties, self._drawn),
+            self._count, new_rays,
         )  # fmt: skip
         self._rays.append(new_rays[: number - self._count].copy())
         self._count = number
@@ -110,18 +124,29 @@ class TrackJoiner:
         rays = np.concatenate(self._rays)
         return _collect(self._places, self._begins, self._parents[: self._count], rays)
 
+    def checked_tracks(self) -> Tracks | None:
+        """Return those that no single match holds together; once, as this uses up what is held for it.
+
+        None where too many matches were added to know.
+        """
+        if self._share < 1.0:
+            return None
+        rays, checked = np.concatenate(self._rays), np.arange(self._count)
+        _cut_bridges(self._ties, self._drawn, checked)
+        return _collect(self._places, self._begins, checked, rays)
+
 
 @kernel
 def _join_batch(
     row: Any, offsets: Any, keypoints: Any, drawn: Any, rays_i: Any, rays_j: Any, directions: Any,
-    pixel_angles: Any, threshold_px: float, places: Any, parents: Any, count: int, rays: Any,
+    pixel_angles: Any, threshold_px: float, places: Any, parents: Any, circles: Any, count: int, rays: Any,
 ) -> int:  # fmt: skip
     """Join the observations of matches that agree with their pair's direction; return how many there are.
 
     `places` has the number of the observation of each keypoint of all images, -1 for none; new ones are
-    numbered from `count` on, and their rays written to `rays`.
+    numbered from `count` on, and their rays written to `rays`. `circles` has what `_cut_bridges` is given.
     """
-    first = count
+    first, (ties, numbers) = count, circles
     for p in range(len(row)):
         if row[p] < 0:
             continue
@@ -136,8 +161,36 @@ def _join_batch(
                     for c in range(3):
                         rays[count - first, c] = rays_i[m, c] if side == 0 else rays_j[m, c]
                     count += 1
-            merge_sets(parents, places[keypoints[m, 0]], places[keypoints[m, 1]])
+            a, b = int(places[keypoints[m, 0]]), int(places[keypoints[m, 1]])
+            if root_of(parents, a) != root_of(parents, b):
+                merge_sets(parents, a, b)
+                for own, other in ((a, b), (b, a)):
+                    ties[own, 0] += 1
+                    ties[own, 1] ^= other
+            else:
+                number = np.int64(mix_bits(mix_bits(np.uint64(a)) + np.uint64(b)))
+                numbers[a] ^= number
+                numbers[b] ^= number
     return count
+
+
+@kernel
+def _cut_bridges(ties: Any, numbers: Any, parents: Any) -> None:
+    """Join observations that no single match holds together, each its own parent at first, leaf after leaf.
+
+    `ties` and `numbers` are used up: the only match of a leaf is a bridge if the numbers in it cancel out.
+    """
+    for first in range(len(parents)):
+        leaf = first
+        while ties[leaf, 0] == 1:
+            other = int(ties[leaf, 1])
+            if numbers[leaf] != 0:
+                merge_sets(parents, leaf, other)
+            ties[leaf, 0] = 0
+            ties[other, 0] -= 1
+            ties[other, 1] ^= leaf
+            numbers[other] ^= numbers[leaf]
+            leaf = other
 
 
 def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:

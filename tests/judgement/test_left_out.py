@@ -160,6 +160,17 @@ def test_what_a_pose_can_make_up_for_or_noise_hides_is_not_observable():
     assert left_out.observable.tolist() == [True, False, False, False]
 
 
+@pytest.mark.parametrize(
+    ("others", "num_others", "is_named"), [(1.9, 11, True), (2.1, 11, False), (0.1, 4, False)]
+)
+def test_five_deviations_do_where_no_other_image_is_near_them(others, num_others, is_named):
+    changes, sigmas, free = np.full((3, NUM_IMAGES), [[0.005 * others], [0.005], [1e-3]])
+    changes[0], sigmas[0], free[0] = 0.2, 0.04, 1e-6  # a camera that stands nearer hides nearly all
+    free[1 + num_others :] = 1e-6
+    left_out = LeftOut(np.full(NUM_IMAGES, 100), changes, sigmas, free, np.ones(NUM_IMAGES))
+    assert [one.lens for one in wrong_lenses(left_out, Scene().images)] == [0] * is_named
+
+
 def test_a_lens_of_all_images_is_wrong_if_they_ask_for_unlike_ones():
     right = Scene(shared=True)
     assert wrong_lenses(right.left_out(), right.images) == ()

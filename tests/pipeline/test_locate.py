@@ -16,7 +16,7 @@ from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.synthetic import make_scene
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, write_workspace
 from tests.models import centers_of, posed
 from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint
 
@@ -122,6 +122,18 @@ def test_points_place_cameras_that_pairs_do_not_determine(tmp_path, kept):
     errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0").position
     assert found.reconstruction.num_reg_images() == 8
     assert errors.max < 0.02  # of a ring of radius 5; a pair alone leaves the distance free
+
+
+def test_the_points_of_false_pairs_put_no_cameras_elsewhere(tmp_path):
+    options = SceneOptions(
+        shape="courtyard", num_images=16, num_points=1200, corrupted_pair_fraction=0.2, seed=1
+    )
+    write_workspace(make_scene(options), tmp_path / "thin", WorkspaceOptions(model="rotations"))
+    found = sfm_shapefit.locate(tmp_path / "thin" / "sparse" / "0")
+    assert found.verdict.grade == "good"
+    errors = sfm_shapefit.evaluate(found.reconstruction, tmp_path / "thin" / "truth")
+    assert len(errors.names) == 16
+    assert errors.position.max < 0.001 * errors.extent
 
 
 def test_a_camera_that_hangs_by_one_pair_is_left_out_by_name(tmp_path):

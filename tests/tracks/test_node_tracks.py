@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
@@ -45,6 +46,12 @@ def build_tracks(batches, **options):
     for batch in batches:
         joiner.add(batch, estimate_directions(batch))
     return joiner.tracks()
+
+
+def checked_tracks_of(batch):
+    joiner = TrackJoiner(2.0, KEYPOINTS)
+    joiner.add(batch, estimate_directions(batch))
+    return joiner.checked_tracks()
 
 
 def tracks_of(batch, **options):
@@ -93,6 +100,38 @@ def test_a_track_that_meets_an_image_twice_is_dropped():
     keypoints = batch.keypoints.copy()
     keypoints[7, 1] = 8  # of image 0 it now matches keypoint 8 of image 1, at the ray that fits its direction
     assert tracks_of(dataclasses.replace(batch, keypoints=keypoints)).num_tracks == NUM_POINTS - 2
+
+
+def test_a_single_match_joins_no_checked_tracks():
+    _, _, batch = scene()
+    keypoints = batch.keypoints.copy()
+    keypoints[7, 1] = 8
+    batch = dataclasses.replace(batch, keypoints=keypoints)
+    assert tracks_of(batch).num_tracks == NUM_POINTS - 2
+    assert checked_tracks_of(batch).lengths().tolist() == [6] * NUM_POINTS
+
+
+def test_checked_tracks_are_what_no_single_match_holds_together():
+    rng = np.random.default_rng(3)
+    num_cut = 0
+    for seed in range(20):
+        _, _, batch = scene(cameras=6, seed=seed)
+        kept = np.sort(rng.permutation(len(batch.pairs))[:7])
+        tracks = checked_tracks_of(reordered(batch, kept))
+        pairs = batch.pairs[kept]
+        bridges = [
+            connected_components(6, np.delete(pairs, k, axis=0)).max() > connected_components(6, pairs).max()
+            for k in range(len(pairs))
+        ]
+        parts = connected_components(6, pairs[~np.array(bridges)])
+        wanted = sorted(np.flatnonzero(parts == k).tolist() for k in range(6) if np.sum(parts == k) > 2)
+        found = [
+            tracks.cameras[tracks.offsets[p] : tracks.offsets[p + 1]].tolist()
+            for p in range(tracks.num_tracks)
+        ]
+        assert sorted(found) == sorted(NUM_POINTS * wanted)
+        num_cut += any(bridges)
+    assert 5 < num_cut < 20
 
 
 def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept():
