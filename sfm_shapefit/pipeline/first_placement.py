@@ -64,10 +64,10 @@ def adjust_first_placement(
     place = partial(
         place_cameras, options=options.placement, nodes=options.nodes, clock=clock, certified=False
     )
-    if measured.checked is None or not may_be_checked(graph):
-        placement = next(place(graph))
-    else:
-        _, placement = place_by_checked(graph, partial(build, checked=True), place)
+    placement = next(place(graph))
+    if measured.checked is not None and may_be_checked(graph):
+        better = place_by_checked(placement, partial(build, checked=True), place)
+        placement = placement if better is None else better[1]
     del graph, build, measured  # arrays of all pairs
     stand = Stand.of(given, source, directions, placement, options)
     posed = posed_part(stand.place())

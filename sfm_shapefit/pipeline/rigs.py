@@ -157,26 +157,25 @@ def may_be_checked(measured: MeasuredGraph) -> bool:
 
 
 def place_by_checked(
-    measured: MeasuredGraph, checked: Callable[[], MeasuredGraph], place: Place
-) -> tuple[MeasuredGraph, Placement]:
-    """Return a graph with its points, or that with checked ones where more pairs agree with its placement.
+    usual: Placement, checked: Callable[[], MeasuredGraph], place: Place
+) -> tuple[MeasuredGraph, Placement] | None:
+    """Return the graph with the points of checked tracks, and its placement, if more pairs agree with that.
 
-    That is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
+    It is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
 
     Args:
-        measured: the graph with the points of all tracks.
-        checked: makes the same with the points of checked tracks.
+        usual: the placement with the points of all tracks.
+        checked: makes the same graph with the points of checked tracks.
         place: places a graph; its first piece counts.
     """
-    usual = next(place(measured))
     if _count_agreeing(usual) >= _FITTING * usual.num_pairs:
-        return measured, usual
+        return None
     graph = checked()
     with suppress(UnsolvableError):
         other = next(place(graph))
         if _count_agreeing(other) > _count_agreeing(usual):
             return graph, other
-    return measured, usual
+    return None
 
 
 def _count_agreeing(placement: Placement) -> int:

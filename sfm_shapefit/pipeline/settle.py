@@ -12,7 +12,7 @@ Each rigid piece goes through all that follows `place`. A further piece has a un
 told of positions says how large it is, and where.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -37,6 +37,7 @@ from sfm_shapefit.facts.warnings import (
 )
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.trust import LOW_TRUST
@@ -55,6 +56,7 @@ from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.known import bring_to_known
 from sfm_shapefit.pipeline.measure import (
+    Measured,
     Wanted,
     add_evidence,
     build_graph,
@@ -67,8 +69,10 @@ from sfm_shapefit.pipeline.rigs import may_be_checked, place_by_checked, place_c
 from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.tracks.options import NodeOptions
 
 _SMALLEST_ADJUSTED = 8
 """Cameras of a further piece that is adjusted; smaller ones are placed and seeded only, for their seconds."""
@@ -100,15 +104,20 @@ def settle(
         describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
         source = opened.at(opened.images, economy)
-        if first is None and measured.checked is not None and may_be_checked(graph):
-            checked = partial(build_graph, opened.images, measured, options.nodes, checked=True)
-            limited = economy.limit(options.placement)
-            place = partial(place_cameras, options=limited, nodes=options.nodes, clock=clock, certified=False)
-            graph, _ = place_by_checked(graph, checked, place)
-        graph = add_evidence(graph, measured if economy.samples else replace(measured, errors=None))
-        del measured
-        near = None if first is None else first.near
-        pieces = list(place_cameras(graph, economy.limit(options.placement), options.nodes, clock, near))
+        measured = measured if economy.samples else replace(measured, errors=None)
+        place = partial(
+            place_cameras,
+            options=economy.limit(options.placement),
+            nodes=options.nodes,
+            clock=clock,
+            near=None if first is None else first.near,
+        )
+        if first is not None or measured.checked is None or not may_be_checked(graph):
+            graph = add_evidence(graph, measured)
+            del measured
+            pieces = list(place(graph))
+        else:
+            pieces = _place_with_checked(opened.images, graph, measured, options.nodes, place)
         del graph
     models = []
     while pieces:  # a piece is given up when it is finished: its samples of errors are large
@@ -116,6 +125,21 @@ def settle(
         own, start = (given, first) if piece.piece == 0 else (given.of_further_piece(), None)
         models.append(finish_piece(Stand.of(own, source, directions, piece, options), options, clock, start))
     return replace(models[0], further=tuple(models[1:]))
+
+
+def _place_with_checked(
+    images: Images,
+    graph: MeasuredGraph,
+    measured: Measured,
+    nodes: NodeOptions,
+    place: Callable[..., Iterator[Placement]],
+) -> list[Placement]:
+    """Return the pieces of a graph, or of that with checked points where more pairs agree with these."""
+    copied = measured if measured.errors is None else replace(measured, errors=list(measured.errors))
+    pieces = list(place(add_evidence(graph, copied)))
+    checked = partial(build_graph, images, measured, nodes, checked=True)
+    better = place_by_checked(pieces[0], checked, partial(place, certified=False))
+    return pieces if better is None else list(place(add_evidence(better[0], measured)))
 
 
 def finish_piece(
