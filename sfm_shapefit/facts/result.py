@@ -268,12 +268,13 @@ class LocateResult(_Placed):
     @cached_property
     def verdict(self) -> ModelVerdict:
         """Whether the model can be used, and why."""
-        elsewhere = self.elsewhere
+        is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
             self.agreeing_observations,
             self.contradicting_observations,
             float(np.mean(self.kept)),
-            float(np.mean(self.placed.is_posed if elsewhere is None else self.placed.is_posed[~elsewhere])),
+            placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
+            here=float(np.mean(is_posed)),
         )
         outside = [*self.placement.cameras[~self.kept].tolist(), *self.cameras_without_support]
         repeats = tuple(match_warnings(self.directions))[:1]

@@ -21,7 +21,7 @@ can be named, if
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
     images, left out one by one, or the matches of pairs contradict the focal length of a lens
-    fewer than 95 % of the images are placed
+    fewer than 95 % of the images are placed, or stand in this one of several models
     fewer than three quarters of the observations see a 3D point
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
@@ -101,6 +101,8 @@ class Shares(NamedTuple):
     contradicting: float
     kept: float
     placed: float = np.nan
+    here: float = np.nan
+    """The same of all images; of several models, the others' are missing here, though they are placed."""
 
 
 class Against(NamedTuple):
@@ -189,6 +191,8 @@ def judge_model(
         unnamed.append(f"only {shares.observations:.0%} of the observations see a 3D point")
     if shares.placed < _FEW_PLACED:
         unnamed.append(f"only {shares.placed:.0%} of the images are placed")
+    elif shares.here < _FEW_PLACED:
+        unnamed.append(f"{1.0 - shares.here:.0%} of the images stand in another model")
     reasons = bad or tuple(unnamed)
     grade = Grade.DO_NOT_USE if bad else Grade.LOOK if named or unnamed else Grade.GOOD
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)

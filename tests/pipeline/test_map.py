@@ -477,8 +477,10 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     placed = {row.name for model in found.models for row in model.located.cameras if row.placed}
     assert len(placed) == found.num_placed == 8
     assert not found.left_out
-    # The images of the other are not missing in either.
-    assert not any("are placed" in why for one in found.models for why in one.located.verdict.reasons)
+    # The images of the other are not missing in either, but not there: neither is all of the scene.
+    verdicts = [model.located.verdict for model in found.models]
+    assert [verdict.grade for verdict in verdicts] == ["look", "look"]
+    assert all("of the images stand in another model" in verdict.reasons[-1] for verdict in verdicts)
     (told,) = found.joins
     assert "1 pair of images cannot tell how large it is and where" in told.reason
     sfm_shapefit.write_result(found, tmp_path / "out")
