@@ -231,7 +231,9 @@ class FactsOfModel(Facts):
         error_px = self.mean_reprojection_error_px
         points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
         source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
-        contradict = f"{against[0]:,} of {counted(against[1], 'pair')} contradict the result"
+        contradict = (
+            f"{against[0]:,} of {counted(against[1], 'pair')} contradict{'s' * (against[1] == 1)} the result"
+        )
         contradict = contradict if against[1] else "no pair says where cameras stand"
         return [
             f"{self.num_placed:,} of {counted(self.num_images, 'image')} {verb}, "
