@@ -22,7 +22,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 ModelArgument = Annotated[
     Path | None,
     typer.Argument(
-        metavar="MODEL", help="COLMAP model folder; for `locate` and `inspect` also a list of poses."
+        metavar="MODEL", help="COLMAP model folder; for `locate` and `inspect` also transforms.json or TUM."
     ),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]

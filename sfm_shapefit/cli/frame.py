@@ -91,9 +91,9 @@ class Run(Generic[S]):
             return ""
         return f"{folder} has none of the images, so the report has no pictures"
 
-    @staticmethod
-    def _with_folder(command: str, out: Path) -> str:
-        """Return a command with the folder of the result filled in."""
+    def _with_folder(self, command: str, out: Path) -> str:
+        """Return a command with the folders of the result, and of the images if told, filled in."""
+        command = command.replace(" IMAGES ", f" {shlex.quote(str(self.flags.images or 'IMAGES'))} ")
         return re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
 
     def _describe_time(self) -> str:

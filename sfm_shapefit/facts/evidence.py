@@ -111,12 +111,12 @@ class ToldOpinion(Record):
         if self.undecided:
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
         if self.ambiguous:
-            where = f"{_cameras(self.ambiguous)} where they do {by}"
+            where = f"{_cameras(self.ambiguous)} in the same place {by}"
             parts.append(f"{where}, but as many matches speak for another rotation")
-        usual = f"{100.0 * self.usual:.2g} % of their spread apart in the median"
+        usual = f"positions differ by {100.0 * self.usual:.2g} % of their spread, median"
         if not parts and self.usual > _ALIKE:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
-        told = "; ".join(parts) or f"{self.num_common} cameras stand where they do {by}"
+        told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"
         return f"{told} ({usual})"
 
 

@@ -83,7 +83,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
     told = run("check", COURTYARD / "truth", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: good" in told
     assert "weak: " not in told  # one has many false pairs, but the second opinion has it at the same place
-    assert "second opinion: 25 cameras stand where they do in the model that map made" in told
+    assert "second opinion: 25 cameras stand in the same place in the model that map made" in told
     moved = pycolmap.Reconstruction(COURTYARD / "truth")
     image = moved.image(sorted(moved.reg_image_ids())[7])
     pose = image.frame.rig_from_world
