@@ -73,7 +73,8 @@ def check_command(
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
-            _ = report.exists() and read_model(source)  # what is wrong with that is said first
+            if report.exists():
+                read_model(source)  # what is wrong with that is said first
             refuse_page(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)

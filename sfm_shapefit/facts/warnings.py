@@ -10,7 +10,6 @@ from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, larges
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.trust import LOW_TRUST
-from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
@@ -141,12 +140,10 @@ def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
 
 def ambiguity_warnings(placement: Judged) -> Iterator[str]:
     """Yield which cameras stand as well turned as they do as placed; pixels confirm none of them."""
-    doubts, is_low = placement.assessment.doubts, placement.assessment.trust < LOW_TRUST
-    if doubts is None:
-        return
-    ambiguous = [k for k, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS and is_low[k]]
-    if ambiguous:
-        members = np.flatnonzero(is_low & np.isin(doubts.bodies, doubts.bodies[ambiguous]))
+    doubts, ambiguous = placement.assessment.doubts, placement.assessment.ambiguous
+    if doubts is not None and ambiguous.any():
+        alike = np.isin(doubts.bodies, doubts.bodies[ambiguous])
+        members = np.flatnonzero(alike & (placement.assessment.trust < LOW_TRUST))
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
         angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))

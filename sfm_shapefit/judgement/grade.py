@@ -42,6 +42,7 @@ from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
@@ -56,7 +57,6 @@ _LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, 
 LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
 _MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
 _MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
-_LOW_TRUST = 0.75  # trust; a camera with less is to be looked at
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
 
@@ -176,7 +176,7 @@ def judge_model(
     """
     bad = (*_reasons_against(shares), *against.reasons)
     trust, cameras = placement.assessment.trust, placement.cameras
-    doubtful = trust < _LOW_TRUST
+    doubtful = trust < LOW_TRUST
     doubtful[uncertain_cameras(placement)] = True
     adjusted = placement.adjusted_covariances
     for group in placement.assessment.loose_groups:  # by the pairs; where the pixels were asked, they say

@@ -333,7 +333,7 @@ def conjugate_gradients(
         coupled: the k columns are one vector of an (nk x nk) system, not k separate systems; a number: so
             many rows, the first, are those of nodes, which constants move.
     """
-    count = coupled if coupled > 1 else len(rhs)
+    count = len(rhs) if isinstance(coupled, bool) else coupled
     r = _centered(rhs, count)
     x, p = np.zeros_like(r), np.zeros_like(r)
     scale = _norms(r, coupled)

@@ -57,7 +57,8 @@ def adjust_first_placement(
         WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    images, wanted = source.images, Wanted(tracks=wants_points(source, options.nodes))
+    images, is_free = source.images, given.rigid.groups is None  # rigid groups need few points
+    wanted = Wanted(tracks=wants_points(source, options.nodes), checked=is_free)
     measured = measure(source, options.directions, clock, wanted)
     build = partial(build_graph, images, measured, options.nodes)
     graph, directions = given.rigid.apply(build()), measured.directions

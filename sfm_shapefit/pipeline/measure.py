@@ -53,7 +53,7 @@ class Measured:
     tracks: Tracks | None = None
     """Points seen by three cameras or more, which may become nodes; None where they were not asked for."""
     checked: Tracks | None = None
-    """A covering set of those that no single match holds together; None where that is not known."""
+    """A covering set of those that no single match holds together; None where not asked for, or unknown."""
     errors: list[FloatArray] | None = None
     """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
     where directions count as independent."""
@@ -65,6 +65,7 @@ class Wanted(NamedTuple):
     """What a pass over the matches is to tell beside the directions."""
 
     tracks: bool = False
+    checked: bool = False
     errors: bool = False
 
 
@@ -128,7 +129,7 @@ class _Beside:
         self._begins = np.append(0, np.cumsum(view.num_keypoints))
         # Pairs of most keypoints are far below the limit of the type, 65,535.
         self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
-        self._joiner = None
+        self._joiner, self._checks = None, wanted.checked
         if wanted.tracks:
             self._joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
 
@@ -164,8 +165,8 @@ class _Beside:
         return None if self._joiner is None else self._joiner.tracks()
 
     def checked_tracks(self) -> Tracks | None:
-        """Return a covering set of the checked tracks, if any are wanted."""
-        checked = None if self._joiner is None else self._joiner.checked_tracks()
+        """Return a covering set of the checked tracks, if they are wanted."""
+        checked = self._joiner.checked_tracks() if self._joiner is not None and self._checks else None
         return checked and checked.subset(covering_set(checked, len(self._begins) - 1))
 
 

@@ -152,8 +152,8 @@ def place_cameras(
 
 
 def may_be_checked(measured: MeasuredGraph) -> bool:
-    """Return whether a graph is placed by checked tracks too: rigid groups need few, large ones time."""
-    return measured.groups is None and measured.num_points > 0 and measured.graph.num_nodes <= _MOST_TRIED
+    """Return whether a graph with points may be placed by checked tracks too; large ones take time."""
+    return measured.num_points > 0 and measured.graph.num_nodes <= _MOST_TRIED
 
 
 def place_by_checked(

@@ -95,7 +95,8 @@ def settle(
         first: where an adjustment has the images already; None if there was none.
     """
     with clock("directions"):
-        wanted = Wanted(tracks=wants_points(opened, options.nodes), errors=opened.economy.samples)
+        checked = first is None and given.rigid.groups is None  # rigid groups need few points
+        wanted = Wanted(wants_points(opened, options.nodes), checked, errors=opened.economy.samples)
         measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions
     with clock("solve"):
@@ -105,14 +106,9 @@ def settle(
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
         source = opened.at(opened.images, economy)
         measured = measured if economy.samples else replace(measured, errors=None)
-        place = partial(
-            place_cameras,
-            options=economy.limit(options.placement),
-            nodes=options.nodes,
-            clock=clock,
-            near=None if first is None else first.near,
-        )
-        if first is not None or measured.checked is None or not may_be_checked(graph):
+        limited, near = economy.limit(options.placement), None if first is None else first.near
+        place = partial(place_cameras, options=limited, nodes=options.nodes, clock=clock, near=near)
+        if measured.checked is None or not may_be_checked(graph):
             graph = add_evidence(graph, measured)
             del measured
             pieces = list(place(graph))

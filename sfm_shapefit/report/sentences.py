@@ -14,11 +14,11 @@ import numpy as np
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160  # characters of a name or sentence that are shown; strangers may write longer ones
 _FAR_DEG = 1.0  # degrees, residual of a pair; repeated structure and wrong rotations are off by more
-_LOW_TRUST = 0.75  # trust; a camera below is named, with the reason
 _SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4  # contradicting pairs; that most are of one camera says nothing where there are fewer
 _HAVE_TABLES = {"intrinsics", "control points", "video"}
@@ -140,7 +140,7 @@ def _left_out(drawing: Drawing) -> Iterator[Hint]:
 
 def _least_trusted(drawing: Drawing) -> Iterator[Hint]:
     trust = np.where(drawing.cameras.placed, drawing.cameras.trust, np.nan)
-    low = np.flatnonzero(trust < _LOW_TRUST)
+    low = np.flatnonzero(trust < LOW_TRUST)
     for row in low[np.argsort(trust[low], kind="stable")][:_SHOWN].tolist():
         reason = shorten(drawing.cameras.reasons[row] or "its pairs speak against it")
         yield Hint(
