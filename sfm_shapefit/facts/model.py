@@ -266,6 +266,9 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     known_distances: Annotated[
         tuple[DistanceFacts, ...], "Distances that the user gave, and those in the model."
     ]
+    wrong_priors: Annotated[
+        dict[str, float], "Images whose position priors are wrong, most likely, and how far these are off."
+    ]
     control_points: Annotated[tuple[ControlPoint, ...], "Ground control points, with their residuals."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[GroupFacts | None, "Null where every camera moves by itself."]

@@ -55,7 +55,7 @@ from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.options import KnownDistance
-from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.placement.right_pairs import RightPairs, examine_right_pairs
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
@@ -176,9 +176,8 @@ class LocateResult(_Placed):
     """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
     loops: tuple[Loop, ...] = ()
     """Loops of the videos among the images, where `map` looked for some."""
-    prior_angles: PriorAngles | None = None
-    """Angles of the `directions` to the baselines of position priors; None without priors that set the
-    axes."""
+    prior_fit: PriorFit | None = None
+    """How well position priors fit the images and the `directions`; None where they do not set the scale."""
     num_seen: IntArray
     """(n,) number of points that an image saw, where it was left out because they are too few, or hardly any
     of those that its matches could make; -1 for all others."""
@@ -239,6 +238,7 @@ class LocateResult(_Placed):
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,
             known_distances=told_distances(self.distances, model),
+            wrong_priors=self._wrong_priors(),
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
             intrinsics=tuple(self.intrinsics.rows(self.placed)),
@@ -317,7 +317,8 @@ class LocateResult(_Placed):
             rows[camera] = replace(rows[camera], reason=reason)
         for camera in self.cameras_without_support:
             rows[camera] = replace(rows[camera], reason=NO_SUPPORT)
-        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved)):
+        off = self.prior_fit and self.prior_fit.off
+        for name, values in (("turned_deg", self.turned_deg), ("moved", self.moved), ("prior_off", off)):
             if values is not None:
                 both = zip(rows, values.tolist(), strict=True)
                 rows = [replace(row, **{name: value}) for row, value in both]
@@ -365,6 +366,11 @@ class LocateResult(_Placed):
             if camera not in few
         }
 
+    def _wrong_priors(self) -> dict[str, float]:
+        """Return the images whose position priors are wrong, and how far they are off."""
+        fit = self.prior_fit
+        return {} if fit is None else {self.images.names[k]: float(fit.off[k]) for k in fit.wrong.tolist()}
+
     def _carried(self) -> dict[int, tuple[float, ...]]:
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
         carried = self.placed.is_posed
@@ -399,8 +405,8 @@ class LocateResult(_Placed):
         if self.triplet_scores is not None and self.matched_shares is not None:
             columns |= {"triplet_score": self.triplet_scores, "matched_share": self.matched_shares}
             columns["pair_score"] = score_pairs(self.triplet_scores, self.matched_shares)
-        if self.prior_angles is not None:
-            columns["prior_angle_deg"] = self.prior_angles.angles_deg
+        if self.prior_fit is not None:
+            columns["prior_angle_deg"] = self.prior_fit.angles_deg
         for name, values in columns.items():
             rows = [replace(row, **{name: value}) for row, value in zip(rows, values.tolist(), strict=True)]
         return rows

@@ -54,6 +54,8 @@ class CameraRow:
     moved: float = math.nan
     """Distance of its center from the given one, in the output's units, after the similarity that brings most
     given centers near; only with rough rotations."""
+    prior_off: float = math.nan
+    """Distance of its center from its position prior, in the output's units; only where priors set these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

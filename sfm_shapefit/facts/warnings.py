@@ -11,7 +11,7 @@ from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
-from sfm_shapefit.placement.prior_pairs import PriorAngles
+from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # share of pairs against the solution, or the given rotations; above, warn
@@ -174,16 +174,12 @@ def _least_trusted(placement: Judged, rows: IntArray) -> str:
     return f"{placement.graph.name_of(int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"
 
 
-def prior_warnings(found: PriorAngles | None, pairs: IntArray, names: Sequence[str]) -> Iterator[str]:
-    """Warn of pairs whose directions contradict the baselines of position priors."""
-    if found is None or not found.contradicting.any():
-        return
-    rows = np.flatnonzero(found.contradicting)
-    worst = int(rows[np.argmax(found.angles_deg[rows])])
-    first, second = (names[k] for k in pairs[worst].tolist())
-    compared = int(np.isfinite(found.angles_deg).sum())
-    yield (
-        f"the directions of {len(rows)} of {counted(compared, 'pair')} contradict the baselines of their "
-        f"position priors, that of {first} and {second} most, by {found.angles_deg[worst]:.0f} deg; see "
-        "prior_angle_deg in pairs.csv"
-    )
+def prior_warnings(fit: PriorFit | None, names: Sequence[str]) -> Iterator[str]:
+    """Yield which position priors of the images `names` (n,) are wrong, if any are."""
+    if fit is not None and len(fit.wrong):
+        wrong = [f"{names[k]} ({fit.off[k]:.3g} off)" for k in fit.wrong.tolist()]
+        are = "is" if len(wrong) == 1 else "are"
+        yield (
+            f"{counted(len(wrong), 'position prior')} {are} wrong, most likely: {first_of(wrong)}, in the "
+            f"priors' units; half of all are within {np.nanmedian(fit.off):.2g}; see prior_off in cameras.csv"
+        )

@@ -41,12 +41,8 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.trust import LOW_TRUST
-from sfm_shapefit.pipeline.adjustment import (
-    adjust_placed,
-    pull_cameras,
-    turned_deg,
-    with_uncertainty,
-)
+from sfm_shapefit.judgement.uncertainty import standard_deviations
+from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
@@ -70,7 +66,7 @@ from sfm_shapefit.pipeline.seed import Seeded, seed_points, select_trusted
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.gauge import Gauge, tell_scale
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
+from sfm_shapefit.placement.prior_fit import PriorFit, compare_with_priors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -203,7 +199,7 @@ def finish_piece(
         warnings=(),
         fixed=given.rigid.fixed,
         distances=given.distances,
-        prior_angles=_compare_with_priors(stand, images, gauge),
+        prior_fit=_compare_with_priors(stand, judged, images, gauge),
         evidence=evidence,
         intrinsics=intrinsics,
         rigs=refined_rigs(given.images, images, sensors),
@@ -318,12 +314,15 @@ def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estim
     return sigmas
 
 
-def _compare_with_priors(stand: Stand, images: Images, gauge: Gauge) -> PriorAngles | None:
-    """Return what the pairs say of position priors where these set the axes; else None."""
-    priors, directions = stand.given.known.priors, stand.directions
-    if priors is None or gauge.scale != "prior" or gauge.axes is None:
+def _compare_with_priors(stand: Stand, judged: Judged, images: Images, gauge: Gauge) -> PriorFit | None:
+    """Return how well position priors fit the delivered images where they set the scale; else None."""
+    priors, pairs = stand.given.known.priors, stand.directions
+    if priors is None or gauge.scale != "prior":
         return None
-    return compare_with_priors(directions.pairs, directions.directions, priors, gauge, images.centers)
+    directions = pairs.directions if gauge.axes is None else pairs.directions @ gauge.axes.T
+    sigmas, own = np.full(images.num_images, np.nan), standard_deviations(judged.covariances)
+    sigmas[judged.cameras] = gauge.similarity.scale * own.max(axis=1)
+    return compare_with_priors(images.centers, sigmas, priors, pairs.pairs, directions)
 
 
 def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
@@ -344,7 +343,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"
-    yield from prior_warnings(found.prior_angles, stand.directions.pairs, images.names)
+    yield from prior_warnings(found.prior_fit, images.names)
     there = np.flatnonzero(images.is_posed)
     yield from rule.check(gauge, there, images.centers[there])
     if found.options.gauge.scale == "unit" and gauge.scale != "unit":

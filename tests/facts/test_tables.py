@@ -16,7 +16,7 @@ from tests.scenes import RING
 
 SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]
 RHOS = ["rho_xy", "rho_xz", "rho_yz"]
-TURNED = ["turned_deg", "moved"]
+TURNED = ["turned_deg", "moved", "prior_off"]
 NOT_UTF8 = os.fsdecode(b"mod\xe8le")
 
 
@@ -58,8 +58,9 @@ def test_a_row_has_one_cell_per_axis_and_empty_cells_for_what_is_not_known(tmp_p
             "0.0",
             "1.5",
             "",
+            "",
         ],
-        ["c", "false", "why", "", "", "", "", "0", *[""] * 9],
+        ["c", "false", "why", "", "", "", "", "0", *[""] * 10],
     ]
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sqlite3
 import struct
 
@@ -29,13 +30,13 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
-from sfm_shapefit.placement.prior_pairs import compare_with_priors
+from sfm_shapefit.placement.prior_fit import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
-from tests.scenes import BUNDLED, RING, read_from
+from tests.scenes import BUNDLED, COURTYARD, RING, read_from
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -482,26 +483,47 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
         assert np.sum(np.square(pulled)) < np.sum(np.square(off[0]))  # nearer to the priors than before
 
 
-def test_pairs_that_contradict_the_baselines_of_priors_are_named():
+def test_a_wrong_prior_is_named_and_no_pair_is_blamed_for_it():
+    """Cameras 10 and 11 have no prior, that of 4 is wrong, 6 is off by its own uncertainty."""
     rng = np.random.default_rng(4)
     t = cameras(4)
     truth = 5.0 * t @ TURN.T
-    priors = priors_of(truth + 0.02 * rng.standard_normal(truth.shape), 0.02, rows=np.arange(10))
+    given = truth + 0.02 * rng.standard_normal(truth.shape)
+    given[4] += [0.0, 0.6, 0.0]
+    given[6] += [0.0, 0.6, 0.0]
+    priors = priors_of(given, 0.02, rows=np.arange(10))
     gauge = prior_gauge(t, priors)
     pairs = np.array([(i, j) for i in range(12) for j in range(i)])
-    directions = normalized(t[pairs[:, 0]] - t[pairs[:, 1]])
-    directions[7] = normalized(np.cross(directions[7], directions[8]))
+    directions = normalized(truth[pairs[:, 0]] - truth[pairs[:, 1]])
     directions[9] = np.nan
-    found = compare_with_priors(pairs, directions, priors, gauge, gauge.apply(t))
+    sigmas = np.full(12, np.nan)
+    sigmas[6] = 0.3
+    found = compare_with_priors(gauge.apply(t), sigmas, priors, pairs, directions)
     without = (pairs >= 10).any(axis=1)
     without[9] = True
     np.testing.assert_array_equal(np.isnan(found.angles_deg), without)
-    assert np.flatnonzero(found.contradicting).tolist() == [7]
-    assert found.angles_deg[7] == pytest.approx(90.0, abs=2.0)
-    (sentence,) = prior_warnings(found, pairs, [f"{k}.jpg" for k in range(12)])
-    i, j = pairs[7]
-    assert f"1 of {int((~without).sum())} pairs contradict" in sentence
-    assert f"that of {i}.jpg and {j}.jpg most, by 90 deg" in sentence
+    assert found.wrong.tolist() == [4]
+    assert found.off[4] == pytest.approx(0.6, abs=0.06)
+    (sentence,) = prior_warnings(found, [f"{k}.jpg" for k in range(12)])
+    assert sentence.startswith("1 position prior is wrong, most likely: 4.jpg (0.")
+    assert not list(prior_warnings(found._replace(wrong=found.wrong[:0]), []))
+    everywhere = compare_with_priors(gauge.apply(t), np.full(12, np.inf), priors, pairs, directions)
+    assert len(everywhere.wrong) == 0
+
+
+def test_the_wrong_position_of_the_bundled_table_is_named_everywhere(tmp_path):
+    out = tmp_path / "out"
+    arguments = ("locate", COURTYARD / "sparse" / "0", out, "--priors", BUNDLED / "gps.csv", "--json")
+    facts = json.loads(run(*arguments).stdout)
+    assert list(facts["wrong_priors"]) == ["0004.jpg"]
+    (warning,) = (line for line in facts["warnings"] if "prior" in line)
+    assert "0004.jpg (29" in warning
+    assert not re.search(r"00(15|16)\.jpg", warning)  # a false pair, and contradicted as one
+    with (out / "cameras.csv").open() as lines:
+        off = {row["name"]: float(row["prior_off"]) for row in csv.DictReader(lines)}
+    assert max(off, key=off.get) == "0004.jpg"
+    assert np.median(list(off.values())) < 0.1
+    assert "0004.jpg (29" in (out / "report.html").read_text()
 
 
 def exif_segment(latitude, longitude, altitude):

@@ -1,0 +1,51 @@
+"""How well position priors fit the cameras, and which of them are wrong."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between_deg, median_spread, normalized
+from sfm_shapefit.scene.given import PositionPriors
+
+_FAR = 5.0  # standard deviations; of 100,000 cameras with normal errors two are farther off by chance
+_ROUNDING = 1e-9  # share of the priors' spread; the least error of a prior, where all fit exactly
+
+
+class PriorFit(NamedTuple):
+    """How far cameras are off their priors, and directions of pairs off the priors' baselines."""
+
+    off: FloatArray
+    """(n,) distances in the output's units; NaN where a camera is not placed or has no prior."""
+    wrong: IntArray
+    """(k,) cameras that are farther off than the errors of both explain, the farthest first."""
+    angles_deg: FloatArray
+    """(m,) NaN where one of the cameras has no prior."""
+
+
+def compare_with_priors(
+    centers: FloatArray, sigmas: FloatArray, priors: PositionPriors, pairs: IntArray, directions: FloatArray
+) -> PriorFit:
+    """Return how well priors fit cameras that stand in the priors' axes.
+
+    A prior is off by its own standard deviation, or by the level of all, whichever is larger.
+
+    Args:
+        centers: (n, 3) of all cameras in the output; NaN for those that are not in it.
+        sigmas: (n,) standard deviations of the centers, per axis; NaN where unknown, infinite where nothing
+            holds a camera.
+        priors: priors of the cameras.
+        pairs: (m, 2) cameras (i, j).
+        directions: (m, 3) unit vectors of t_i - t_j in the priors' axes; NaN where there is none.
+    """
+    rows, n = priors.known.indices, len(centers)
+    positions, off, errors = np.full((n, 3), np.nan), np.full(n, np.nan), np.full(n, np.nan)
+    positions[rows] = priors.known.positions
+    off[rows] = np.linalg.norm(priors.known.off(centers), axis=1)
+    there = np.isfinite(off)
+    level = float(np.median(off[there])) / MEDIAN_NORMAL_LENGTH if there.any() else 0.0
+    least = max(level, _ROUNDING * median_spread(priors.known.positions))
+    errors[rows] = np.fmax(priors.known.sigmas(), least)
+    wrong = np.flatnonzero(off > _FAR * np.hypot(errors, np.nan_to_num(sigmas, posinf=np.inf)))
+    angles_deg = angle_between_deg(normalized(positions[pairs[:, 0]] - positions[pairs[:, 1]]), directions)
+    return PriorFit(off, wrong[np.argsort(-off[wrong], kind="stable")], angles_deg)
