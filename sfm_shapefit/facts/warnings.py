@@ -9,7 +9,6 @@ from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.options import TrustOptions
-from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
 from sfm_shapefit.solver.options import Status
@@ -142,8 +141,7 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
     """Yield which cameras stand as well turned as they do as placed; pixels confirm none of them."""
     doubts, ambiguous = placement.assessment.doubts, placement.assessment.ambiguous
     if doubts is not None and ambiguous.any():
-        alike = np.isin(doubts.bodies, doubts.bodies[ambiguous])
-        members = np.flatnonzero(alike & (placement.assessment.trust < LOW_TRUST))
+        members = np.flatnonzero(ambiguous)
         names = [placement.graph.name_of(int(placement.cameras[k])) for k in members.tolist()]
         angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))

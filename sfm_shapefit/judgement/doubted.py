@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE
 from sfm_shapefit.judgement.turns import RIGHT_SHARE, TURNED_SHARE, Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment
@@ -40,25 +40,31 @@ def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
     factors = _factors(doubts)
     finite = np.isfinite(factors)
     trust = np.where(finite, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
-    reasons = list(assessment.reasons)
-    for camera in np.flatnonzero(finite).tolist():
-        found = [_reason(doubts, camera), assessment.loose_reasons[camera]]
-        if trust[camera] < LOW_TRUST:
-            reasons[camera] = "; ".join(filter(None, found)) or SOMEWHAT_LOOSE
-        else:
-            reasons[camera] = ""
-    return replace(assessment, trust=trust, reasons=tuple(reasons), doubts=doubts)
+    return _with_reasons(replace(assessment, trust=trust, doubts=doubts), finite)
+
+
+def confirm_cameras(assessment: Assessment, sure: BoolArray) -> Assessment:
+    """Return the same with trust in cameras (k,) that are `sure`, whatever their pairs say."""
+    trust = np.where(sure, np.maximum(assessment.trust, LOW_TRUST), assessment.trust)
+    doubts = assessment.doubts and assessment.doubts.without(sure)
+    among = sure if doubts is None else np.isfinite(_factors(doubts))
+    return _with_reasons(replace(assessment, trust=trust, doubts=doubts), among)
+
+
+def _with_reasons(assessment: Assessment, among: BoolArray) -> Assessment:
+    """Return the same with reasons `among` the cameras (k,) where trust is low, and none where it is not."""
+    reasons, doubts = list(assessment.reasons), assessment.doubts
+    for camera in np.flatnonzero(among).tolist():
+        found = ["" if doubts is None else _reason(doubts, camera), assessment.loose_reasons[camera]]
+        is_low = assessment.trust[camera] < LOW_TRUST
+        reasons[camera] = ("; ".join(filter(None, found)) or SOMEWHAT_LOOSE) if is_low else ""
+    return replace(assessment, reasons=tuple(reasons))
 
 
 def believe_rotations(assessment: Assessment) -> Assessment:
     """Return an assessment whose trust depends only on how well the pairs hold each camera."""
     hold = _lenient_hold(assessment)
-    low = hold < LOW_TRUST
-    reasons = [
-        (loose or SOMEWHAT_LOOSE) if is_low else ""
-        for loose, is_low in zip(assessment.loose_reasons, low.tolist(), strict=True)
-    ]
-    return replace(assessment, trust=hold, reasons=tuple(reasons))
+    return _with_reasons(replace(assessment, trust=hold), np.ones(len(hold), dtype=np.bool_))
 
 
 def _lenient_hold(assessment: Assessment) -> FloatArray:

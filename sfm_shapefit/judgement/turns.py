@@ -38,7 +38,7 @@ It is 1 or more for all but 5 % of the right pairs.
 """
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -128,6 +128,12 @@ class Doubts:
     def members(self, camera: int) -> IntArray:
         """Return the cameras of a camera's body, ascending."""
         return np.flatnonzero(self.bodies == self.bodies[camera])
+
+    def without(self, sure: BoolArray) -> "Doubts":
+        """Return the doubts of the other cameras: those that are `sure` (n,) are right and in no body."""
+        kinds = (Doubt.RIGHT if is_sure else k for is_sure, k in zip(sure.tolist(), self.kinds, strict=True))
+        bodies = np.where(sure, -1 - np.arange(len(sure)), self.bodies)
+        return replace(self, kinds=tuple(kinds), bodies=bodies)
 
 
 def fit_as_placed(directions: PairDirections) -> FloatArray:

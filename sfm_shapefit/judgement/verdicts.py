@@ -6,7 +6,7 @@ pair decides for itself, is `uncertainty`; what all pairs of a camera say togeth
 
 import enum
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.trust import LOW_TRUST, PairFit, judge_cameras
+from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (
     GroupGauge,
@@ -83,18 +83,12 @@ class Assessment:
     def ambiguous(self) -> BoolArray:
         """(k,) cameras whose matches speak as much for another rotation, and which no pixels confirm."""
         kinds = [None] * len(self.trust) if self.doubts is None else self.doubts.kinds
-        return np.array([kind is Doubt.AMBIGUOUS for kind in kinds]) & np.less(self.trust, LOW_TRUST)
+        return np.array([kind is Doubt.AMBIGUOUS for kind in kinds], dtype=np.bool_)
 
     @property
     def sigmas(self) -> FloatArray:
         """(n, d) standard deviation of each location along the axes."""
         return standard_deviations(self.covariances)
-
-    def confirmed(self, sure: BoolArray) -> "Assessment":
-        """Return the same with trust in some of the cameras (k,), whatever their pairs say."""
-        reasons = ("" if is_sure else why for is_sure, why in zip(sure.tolist(), self.reasons, strict=True))
-        trust = np.where(sure, np.maximum(self.trust, LOW_TRUST), self.trust)
-        return replace(self, trust=trust, reasons=tuple(reasons))
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""

@@ -38,6 +38,7 @@ from sfm_shapefit.facts.warnings import (
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.trust import LOW_TRUST
@@ -156,7 +157,7 @@ def finish_piece(
     with clock("trust"):
         sure = _ask_pixels(stand, judged, kept, seeded)
         if sure.any():
-            judged = replace(judged, assessment=judged.assessment.confirmed(sure[judged.cameras]))
+            judged = replace(judged, assessment=confirm_cameras(judged.assessment, sure[judged.cameras]))
             kept, stand = _choose(stand, judged, options.trust.min_trust)
     if (sure & ~seeded.images.is_posed).any():
         seeded = seed_points(stand, kept, options, clock, sure)

@@ -12,6 +12,8 @@ import sfm_shapefit
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.judgement.doubted import confirm_cameras
+from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs import essential as relative_rotations
 from sfm_shapefit.pairs.essential import estimate_relative_rotations
@@ -46,11 +48,26 @@ def turned(scene, chosen, angle_deg):
 def test_right_cameras_of_a_symmetric_scene_are_kept_and_the_group_is_named():
     found = located(PHOTOGRAPHED)
     assert found.kept.all()
-    doubts = found.placement.assessment.doubts
-    ambiguous = [k for k, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
-    assert [found.images.names[k] for k in ambiguous] == ["0003.jpg", "0004.jpg", "0005.jpg"]
+    ambiguous = np.flatnonzero(found.placement.assessment.ambiguous)
+    assert [found.images.names[k] for k in ambiguous] == ["0004.jpg", "0005.jpg"]  # pixels confirm 0003.jpg
     assert any("turning 0004.jpg, 0005.jpg by 90 degrees" in w for w in found.warnings)
-    assert found.verdict.cameras[:1] != ()
+    assert set(found.verdict.cameras) == {"0004.jpg", "0005.jpg"}
+    reasons = {row.name: row.reason for row in found.cameras if row.reason}
+    assert set(reasons) == {"0004.jpg", "0005.jpg"}
+    assert all("a turn by 90 degrees, with 1 other camera" in reason for reason in reasons.values())
+
+
+def test_confirmed_cameras_are_trusted_and_no_reason_counts_them():
+    assessment = located(PHOTOGRAPHED).placement.assessment
+    sure = assessment.ambiguous & (np.cumsum(assessment.ambiguous) == 1)
+    found = confirm_cameras(assessment, sure)
+    first, second = np.flatnonzero(assessment.ambiguous).tolist()
+    assert found.trust[first] == LOW_TRUST
+    assert found.reasons[first] == ""
+    assert "other camera" not in found.reasons[second]
+    assert np.flatnonzero(found.ambiguous).tolist() == [second]
+    believed = confirm_cameras(replace(assessment, doubts=None), sure)
+    assert believed.reasons == tuple("" if k == first else r for k, r in enumerate(assessment.reasons))
 
 
 def test_every_camera_of_a_clean_scene_is_trusted():
