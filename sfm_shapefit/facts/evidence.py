@@ -13,6 +13,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 
 _UNLIKE = 2.0  # scatters of what images ask for; a mean that is nearer names no other focal length
+_LEAST_TOLD = 1e-5  # share of the spread; a smaller difference is not told as a number
 _ALIKE = 0.1  # share of the spread of cameras; models farther apart in the median are of different shape
 
 
@@ -113,7 +114,8 @@ class ToldOpinion(Record):
         if self.ambiguous:
             where = f"{_cameras(self.ambiguous)} in the same place {by}"
             parts.append(f"{where}, but as many matches speak for another rotation")
-        usual = f"positions differ by {100.0 * self.usual:.2g} % of their spread, median"
+        percent = f"{100.0 * self.usual:.2g}" if self.usual > _LEAST_TOLD else "less than 0.001"
+        usual = f"positions differ by {percent} % of their spread, median"
         if not parts and self.usual > _ALIKE:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"

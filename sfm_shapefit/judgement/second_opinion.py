@@ -24,6 +24,7 @@ from sfm_shapefit.scene.images import Images
 _FEWEST_COMMON = 4  # cameras of both; of three, one that is off takes the similarity along
 _CAP = 0.03  # spreads; farther off, a camera is lost, and half of them may be
 _OF_USUAL = 6.0  # usual differences; more is elsewhere, if it is more than the next as well
+_ROUNDING, _ROUNDING_DEG = 1e-7, 1e-5  # spreads and degrees; usual differences of the same model are smaller
 _FAR, _TURNED_DEG = 0.01, 0.5  # spreads and degrees; what is nearer needs no judge
 _LEVELS, _RATIO = 4.0, 2.0  # levels, and residuals of the better one; a pair that misses by both speaks
 _LEAST_LEVEL_DEG = 0.05  # degrees; good rotations leave as much in any direction
@@ -57,7 +58,8 @@ def compare_models(
     turns = np.swapaxes(others.rotations[theirs], 1, 2) @ images.rotations[mine]
     angles = rotation_angles_deg(np.swapaxes(turns, 1, 2) @ mean_rotation_l1(turns))
     usual = float(np.median(distances))
-    unlike = distances > _OF_USUAL * usual, angles > _OF_USUAL * np.median(angles)
+    turned = max(float(np.median(angles)), _ROUNDING_DEG)
+    unlike = distances > _OF_USUAL * max(usual, _ROUNDING), angles > _OF_USUAL * turned
     elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > _TURNED_DEG))
     residuals = _residuals(fits, mine), _residuals(other_fits, theirs)
     votes = _count_votes(*residuals, elsewhere)

@@ -61,8 +61,10 @@ def test_what_is_wrong_in_the_other_model_says_nothing_against_this_one(images):
     assert len(found.confirmed) == N - len(GROUP)
 
 
-def test_models_that_agree_have_all_cameras_confirmed(images):
-    found = compare(images, images, images)
+@pytest.mark.parametrize("how", [{}, {"shift": 1e-10}, {"turn_deg": 1e-8}])
+def test_models_that_agree_have_all_cameras_confirmed(images, how):
+    """Rounding, which is all that differs, is larger for some cameras than for most."""
+    found = compare(moved(images, [5], **how), images, images)
     assert (found.num_common, len(found.confirmed)) == (N, N)
     assert (len(found.wrong), len(found.undecided)) == (0, 0)
 
