@@ -296,7 +296,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        return next_of_model(self.verdict.grade, self.inputs, is_adjusted=True)
+        return next_of_model(self.verdict.grade, self.inputs)
 
     def scene_rows(self) -> list[Row]:
         """Return what is told of lenses, rigs, control points and the scene, where there is something."""
@@ -353,20 +353,13 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return [f"{usable} usable ({contradicting} contradict the solution)", *others]
 
 
-def next_of_model(grade: Grade, inputs: ModelInputs, *, is_adjusted: bool) -> NextStep:
+def next_of_model(grade: Grade, inputs: ModelInputs) -> NextStep:
     """Return what to do with a model of ours, by what it was made of."""
     if grade is Grade.DO_NOT_USE:
         model = "{out}" if inputs.model == IN_MEMORY else shlex.quote(inputs.model)  # `map` has no other
         step = f"sfm-shapefit inspect {model}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
-    if not is_adjusted:
-        held = "--BundleAdjustment.refine_focal_length 0 --BundleAdjustment.refine_extra_params 0"
-        return NextStep(
-            f"Next: adjust it as a whole{looked}, with the intrinsics as they are.",
-            "mkdir -p {out_adjusted} && colmap bundle_adjuster --input_path {out} "
-            f"--output_path {{out_adjusted}} {held}",
-        )
     return NextStep(
         f"Next: undistort the images for splatting or dense reconstruction{looked}.",
         "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
@@ -392,7 +385,7 @@ class CheckedFacts(FactsOfModel):
         path, second = shlex.quote(self.inputs.path), self.evidence.second
         is_as_map_has_it = second is not None and not (second.wrong or second.undecided)
         if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
-            step = next_of_model(self.verdict.grade, self.inputs, is_adjusted=True)
+            step = next_of_model(self.verdict.grade, self.inputs)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
@@ -431,8 +424,7 @@ class JoinedFacts(CheckedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        is_adjusted = self.options.get("adjust") == "full" and "join" not in self.options
-        return next_of_model(self.verdict.grade, self.inputs, is_adjusted=is_adjusted)
+        return next_of_model(self.verdict.grade, self.inputs)
 
 
 class DatabaseInputs(Record):
