@@ -73,7 +73,7 @@ def check_command(
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
-            if report.exists():
+            if report.exists() and not overwrite:
                 read_model(source)  # what is wrong with that is said first
             refuse_page(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):

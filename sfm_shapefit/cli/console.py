@@ -44,6 +44,8 @@ _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code
 
 flag_names: set[str] = set()
 """Names of the options that are flags of the command at work."""
+key_names: set[str] = set()
+"""Names of those, and of the options of the command that stand in the file of --config only."""
 
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
@@ -167,12 +169,12 @@ def _say(message: str) -> None:
 
 
 def in_flags(text: str) -> str:
-    """Return a message with its options as they are typed: min_trust=0 as --min-trust 0."""
+    """Return a message with its options as they are typed: min_trust=0 as --min-trust 0, or as a key."""
 
     def typed(option: re.Match[str]) -> str:
         name, value = option.groups()
         if name not in flag_names:
-            return option[0]
+            return f"{name} = {value} in the file of --config" if name in key_names else option[0]
         flag = f"--{name.replace('_', '-')}"
         return flag if value == "True" else f"{flag} {value}"
 

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from sfm_shapefit.base.settings import S, Settings, hint, homes_of, option, setting_groups
-from sfm_shapefit.cli.console import flag_names
+from sfm_shapefit.cli.console import flag_names, key_names
 from sfm_shapefit.cli.root import convert_plainly
 
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -198,13 +198,11 @@ class GroupedCommand(TyperCommand):
         """Refuse flags that are keys of --config; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
         groups = () if settings is None else setting_groups(settings)
-        keys = {item.name for one in groups for item in one.options}
+        key_names.update(item.name for one in groups for item in one.options)
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]
             name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
-            if not flag.startswith("--") or flag in known:
-                continue
-            if name in keys:
+            if flag.startswith("--") and flag not in known and name in key_names:
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
 
 

@@ -37,8 +37,8 @@ _MANY_PAIRS = 15  # pairs of a camera; two hold it, and some are wrong
 # The `direction_spread` of the pairs of a camera; 0.5 in a plane, and 0.1 on a line with 15 % of pairs wrong.
 _WIDELY_SPREAD = 0.2
 _ADVICE = {
-    DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
-    DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
+    DirectionStatus.TOO_FEW_MATCHES: "match more, or be content with fewer by min_inliers=10",
+    DirectionStatus.FEW_INLIERS: "match more, or be content with fewer by min_inliers=10",
     DirectionStatus.NO_PARALLAX: "cameras that only turn cannot be placed; use images from different places",
 }
 """What to do where no pair has a direction, by the most frequent reason."""

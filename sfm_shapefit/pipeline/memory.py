@@ -130,7 +130,7 @@ def choose_economy(
         if needed <= limit_mb:
             return economy
     raise InputError(
-        f"this takes about {needed:.0f} MB even with every economy, and max_memory_mb allows {limit_mb:.0f}; "
+        f"this takes about {needed:.0f} MB even with every economy, more than max_memory_mb={limit_mb:.0f}; "
         f"raise it to {np.ceil(needed / 10.0) * 10.0:.0f} or more, or split the model"
     )
 

@@ -339,7 +339,8 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     if stand.gauge.warning:
         yield stand.gauge.warning
     if stand.source.economy.statement:
-        yield f"to stay below max_memory_mb, {stand.source.economy.statement}"
+        limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
+        yield f"to stay below {limit}, {stand.source.economy.statement}"
     if found.reconstruction.num_points3D() == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:

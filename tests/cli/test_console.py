@@ -180,8 +180,10 @@ def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is
 
 def test_options_are_spelled_as_the_command_takes_them(monkeypatch, tmp_path):
     monkeypatch.setattr(console, "flag_names", {"min_trust", "overwrite", "rigs"})
+    monkeypatch.setattr(console, "key_names", {"min_trust", "min_inliers"})
     assert console.in_flags("rigs=free, or min_trust=0.5; tol=1") == "--rigs free, or --min-trust 0.5; tol=1"
     assert console.in_flags("replace it (overwrite=True)") == "replace it (--overwrite)"
+    assert console.in_flags("by min_inliers=10") == "by min_inliers = 10 in the file of --config"
     typed = run("locate", RING / "sparse/0", tmp_path / "out", "--min-trust", "7", code=2)
     assert "--min-trust must lie in [0, 1]" in typed.output
     (tmp_path / "few.toml").write_text("min_trust = 7\n[directions]\nmin_inlers = 3\n")

@@ -159,7 +159,7 @@ def workspaces(rig_drive):
 def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_changes_nothing(
     workspaces, kind
 ):
-    with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
+    with pytest.raises(InputError, match="more than max_memory_mb=100; raise it") as refused:
         sfm_shapefit.locate(workspaces[kind], max_memory_mb=100)
     needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
     # The counts of the database alone do not know the graph, whose part is a few megabytes here.
@@ -187,7 +187,9 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind, monkeypatch
             found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit)
         except InputError:
             break
-        statement = next(text for text in found.warnings if text.startswith("to stay below max_memory_mb"))
+        statement = next(
+            text for text in found.warnings if text.startswith(f"to stay below max_memory_mb={limit}, ")
+        )
         assert ("count as independent" in statement) == (sampled[-1] is None)
         assert found.placement.measured.evidence.errors is None  # the largest arrays are not kept
         assert ("not adjusted" in statement) == (found.adjustment is None)
