@@ -46,7 +46,7 @@ MOST_LINES = {
     "pairs": 1530,
     "pipeline": 6550,
     "placement": 2660,
-    "refinement": 2140,
+    "refinement": 2_160,
     "report": 1680,
     "rotations": 2290,
     "scene": 2080,

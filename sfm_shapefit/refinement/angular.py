@@ -67,6 +67,7 @@ _STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the n
 _STILL_PER_LEVEL = 1e-3
 _ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
 _HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
+_FARTHEST = 1e6  # median spreads; of nodes farther out the others are one point, whose shape is rounded away
 _MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
 _MAX_FLOPS = 1e10  # operations of one factorization in blocks; they take a third of a second per step
 
@@ -134,6 +135,7 @@ def refine_angles(
     other = None if other is None else _unit(other)
     t, damping, steps = first, DAMPING.first, 0
     still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
+    moves_singly = isinstance(plan, SymbolicFactor | IterativeNormal)
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
@@ -145,7 +147,7 @@ def refine_angles(
         is_still = (
             _motion(t, moved) <= max(_STILL, still * levels.min()) or before - after <= _CONVERGED * before
         )
-        t, steps = moved, steps + 1
+        t, steps = _within_reach(moved) if moves_singly else moved, steps + 1
         if settled and is_still:
             break
         if settled and other is not None and _is_decided(before, after, terms.cost(other)):
@@ -288,6 +290,16 @@ def _unit(t: FloatArray) -> FloatArray:
     """Return the locations centered and of unit norm."""
     centered = t - t.mean(axis=0)
     return np.asarray(centered / np.sqrt(np.sum(centered * centered)))
+
+
+def _within_reach(t: FloatArray) -> FloatArray:
+    """Return the locations (n, d) with nodes that nothing holds pulled in to where all look the same."""
+    about = t - np.median(t, axis=0)
+    distances = np.linalg.norm(about, axis=1, keepdims=True)
+    farthest = _FARTHEST * float(np.median(distances))
+    if farthest == 0.0 or distances.max() <= farthest:
+        return t
+    return _unit(about * np.minimum(1.0, farthest / np.maximum(distances, farthest)))
 
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:

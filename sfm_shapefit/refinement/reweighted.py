@@ -54,7 +54,7 @@ _PRIORS = (0.03, 0.97)  # least and largest share of right pairs; at 0 and 1 not
 _HEARD = (-4.0, 6.0)  # nats that a residual may say; locations are uncertain as yet
 _STILL = 0.01  # mean change of weights; a smaller one is none
 
-Refine = Callable[[ViewGraph, FloatArray], AngularResult]
+Refine = Callable[[ViewGraph, FloatArray, FloatArray], AngularResult]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,7 +92,8 @@ def solve_reweighted(
     search = _Search(measured, options, refine)
     mixture = fit_mixture(measured, usual)
     found = search.climb(usual, mixture)
-    if (mixture if found is None else found.mixture).shares[0] < _FEW:
+    few = (mixture if found is None else found.mixture).shares[0] < _FEW
+    if few or (found is not None and measured.graph.num_edges <= PAIRS_AT_SCALE):
         from_triangles = search.follow(weigh_by_triangles(measured.graph))
         if found is None or from_triangles.mixture.evidence > found.mixture.evidence:
             found = from_triangles
@@ -128,7 +129,7 @@ class _Search:
             there, least = fit_mixture(self._measured, moved), _more(mixture.evidence)
             if best is not None and there.evidence <= least:
                 break
-            placed = self._place(there.posterior)
+            placed = self._place(there.posterior, moved)
             if best is None or placed.mixture.evidence > best.mixture.evidence:
                 best = placed
             locations, mixture = moved, there
@@ -145,7 +146,8 @@ class _Search:
         for _ in range(_TRIANGLE_ROUNDS):
             weighted = self._weighted(weights)
             # Unrefined, noise draws the optimum together, and what it says of the pairs is too weak.
-            placed = self._refine(weighted, self._solve(weighted).locations).locations
+            solved = self._solve(weighted).locations
+            placed = self._refine(weighted, solved, solved).locations
             residual = _weighted_median(residual_angles(graph, placed), weights)
             level, factor = float(np.clip(factor * residual, _LEAST_LEVEL_RAD, level)), _LEVEL
             odds, variances = np.full(graph.num_edges, logit(prior)), np.full(graph.num_edges, level**2)
@@ -158,7 +160,7 @@ class _Search:
             if change < _STILL:
                 break
         best, mixture = max(candidates, key=lambda candidate: candidate[1].evidence)
-        return self.climb(best, mixture) or self._place(mixture.posterior)
+        return self.climb(best, mixture) or self._place(mixture.posterior, best)
 
     def _put(self, t: FloatArray, odds: FloatArray, variances: FloatArray, **how: int) -> FloatArray:
         """Return the locations by consensus; those of groups, where these lie nearest to them."""
@@ -175,11 +177,15 @@ class _Search:
         graph = self._measured.graph
         return graph.with_weights(graph.weights * np.maximum(posterior, _LEAST_WEIGHT))
 
-    def _place(self, posterior: FloatArray) -> Reweighted:
-        """Return the certified optimum at the weights of a posterior (m,), refined."""
+    def _place(self, posterior: FloatArray, near: FloatArray) -> Reweighted:
+        """Return the certified optimum at the weights of a posterior (m,), refined.
+
+        A camera all but one of whose pairs have no weight may be anywhere along that one: it stays where it
+        is in `near` (n, d).
+        """
         graph = self._weighted(posterior)
         solved = self._solve(graph)
-        refined = self._refine(graph, solved.locations)
+        refined = self._refine(graph, solved.locations, near)
         mixture = fit_mixture(self._measured, refined.locations)
         unrefined = fit_mixture(self._measured, solved.locations)
         if unrefined.evidence >= mixture.evidence:

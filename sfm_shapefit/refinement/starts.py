@@ -224,8 +224,9 @@ def _reweight(
     if mixture.shares[0] >= POOR_SHARE or not can_be_reweighted(measured):
         return None
 
-    def refine(graph: ViewGraph, locations: FloatArray) -> AngularResult:
-        return refine_angles(graph, locations, problem.metric, solver)
+    def refine(graph: ViewGraph, locations: FloatArray, fallback: FloatArray) -> AngularResult:
+        refined = refine_angles(graph, locations, problem.metric, solver)
+        return _reset_strays(problem._replace(measured=replace(measured, graph=graph)), fallback, refined)[0]
 
     return solve_reweighted(measured, usual, options.solver.at_scale(measured.graph.num_edges), refine)
 

@@ -41,6 +41,19 @@ def shaken(problem: synthetic.GraphProblem, share: float, seed: int = 0):
     return problem.locations + share * median_spread(problem.locations) * noise
 
 
+def test_a_node_that_nothing_holds_goes_no_farther_than_leaves_the_others_their_shape():
+    problem = synthetic.random_graph_problem(60, sigma=0.01, seed=1)
+    graph, directions, start = problem.view_graph, problem.directions.copy(), problem.locations.copy()
+    from_first = graph.edges[:, 0] == 0
+    assert not (graph.edges[:, 1] == 0).any()
+    directions[from_first] = (1.0, 0.0, 0.0)  # as if infinitely far away
+    start[0] = start[0] + (1e13, 0.0, 0.0)
+    graph = ViewGraph(graph.num_nodes, graph.edges, directions)
+    found = refined(graph, start).locations
+    assert np.linalg.norm(found[0] - found[1]) < 2e6 * median_spread(found)
+    assert shape_error(found[1:], problem.locations[1:]) < 0.01
+
+
 def isotropic(sigma: float, graph: ViewGraph):
     return np.tile(sigma**2 * np.eye(graph.dimension - 1), (graph.num_edges, 1, 1))
 

@@ -109,6 +109,32 @@ def test_an_answer_whose_rays_all_meet_stays_without_a_further_solve(monkeypatch
     assert place(problem.view_graph).refined.reweighted is None
 
 
+def test_a_camera_of_a_single_right_pair_stays_in_the_scene():
+    problem = corrupted(0.7)
+    graph, is_own = problem.view_graph, (problem.edges == 7).any(axis=1)
+    right, wrong = (np.flatnonzero(is_own & (problem.corrupted == bad)) for bad in (False, True))
+    kept = np.sort(np.concatenate([np.flatnonzero(~is_own), right[:1], wrong[:2]]))
+    found = place(graph.subset(kept))
+    assert found.refined.start == "reweighted ShapeFit"
+    others = np.arange(graph.num_nodes) != 7
+    assert shape_error(found.locations[others], problem.locations[others]) < 1e-6
+    distances = np.linalg.norm(found.locations, axis=1)
+    assert distances[7] < 10.0 * np.median(distances)
+
+
+def test_triangles_are_asked_too_where_a_consensus_has_moved_cameras_unless_pairs_are_many(monkeypatch):
+    problem = synthetic.random_graph_problem(100, 0.5, q=0.6, seed=6)
+    asked, weigh = [], reweighted.weigh_by_triangles
+    monkeypatch.setattr(reweighted, "weigh_by_triangles", lambda graph: asked.append(graph) or weigh(graph))
+    found = place(problem.view_graph).refined
+    assert found.reweighted is not None
+    assert found.reweighted.mixture.shares[0] > reweighted._FEW
+    assert len(asked) == 1
+    monkeypatch.setattr(reweighted, "PAIRS_AT_SCALE", problem.view_graph.num_edges - 1)
+    assert place(problem.view_graph).refined.reweighted is not None
+    assert len(asked) == 1
+
+
 def test_an_answer_that_most_directions_point_against_has_no_scale_and_is_not_taken(hopeless, monkeypatch):
     monkeypatch.setattr(reweighted, "projected_length", lambda *_: -1.0)
     assert place(hopeless.view_graph).refined.reweighted is None
