@@ -1,6 +1,6 @@
 """The door between reconstructions and `Points`, and pixels and rays of the points2D that observe them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 
 import numpy as np
@@ -14,6 +14,9 @@ from sfm_shapefit.scene.points import Points
 
 Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
+
+Observed = Mapping[int, tuple[IntArray, UInt64Array]]
+"""By the id of an image: its points2D that observe a 3D point, ascending, and the ids of those points."""
 
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalized coordinates are the same numbers.

@@ -38,7 +38,7 @@ class TrackMatches(Matches):
         self._model, self._images = model.reconstruction, dict(zip(self.names, images, strict=True))
         self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
         self.total_keypoints = int(self.num_keypoints.sum())
-        seen = [observed_points(image) for image in images]
+        seen = [model.observed.get(image.image_id) or observed_points(image) for image in images]
         points = np.concatenate([ids for _, ids in seen])
         image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
         order = np.argsort(points, kind="stable")
