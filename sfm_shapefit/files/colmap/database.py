@@ -151,14 +151,11 @@ class DatabaseMatches(Matches):
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
         """Return the matches of pairs as the file lists them, one pair after the other."""
-        parts, counts = [], self.num_matches[chosen].tolist()
-        for pair, count, (cols, data) in zip(
-            chosen.tolist(), counts, self.look_up(chosen, "cols, data"), strict=True
-        ):
-            if cols != 2 or not is_blob(data, count, 2, itemsize=4):
+        found = self.look_up(chosen, "cols, data")
+        for pair, (cols, data) in zip(chosen.tolist(), found, strict=True):
+            if cols != 2 or not is_blob(data, int(self.num_matches[pair]), 2, itemsize=4):
                 raise self.damaged_pair(pair, "matches of wrong length")
-            parts.append(data)
-        return b"".join(parts)
+        return b"".join(data for _, data in found)
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""

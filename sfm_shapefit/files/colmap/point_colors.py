@@ -35,10 +35,7 @@ class PointColors:
 
 
 def read_colors(source: pycolmap.Reconstruction, observed: Observed) -> PointColors:
-    """Return the colors of a model's points, eight bytes an observation; black says that there is none.
-
-    What images observe is asked of `source` where `observed` does not have it.
-    """
+    """Return the colors of a model's points; black is none. `observed` has what some of its images see."""
     points = source.points3D
     ids = np.array(sorted(source.point3D_ids()), dtype=np.uint64)
     colors = np.array([points[k].color for k in ids.tolist()], dtype=np.uint8).reshape(-1, 3)
