@@ -48,7 +48,7 @@ def copy_without_points(model):
 def colored(model, original):
     """A copy whose points have the colors of another model's."""
     copy = pycolmap.Reconstruction(model)
-    color_points(copy, read_colors(original))
+    color_points(copy, read_colors(original, {}))
     return copy
 
 

@@ -407,9 +407,9 @@ class LocateResult(_Placed):
             columns["pair_score"] = score_pairs(self.triplet_scores, self.matched_shares)
         if self.prior_fit is not None:
             columns["prior_angle_deg"] = self.prior_fit.angles_deg
-        for name, values in columns.items():
-            rows = [replace(row, **{name: value}) for row, value in zip(rows, values.tolist(), strict=True)]
-        return rows
+        added = zip(*(column.tolist() for column in columns.values()), strict=True)
+        given = (dict(zip(columns, values, strict=True)) for values in added)
+        return [replace(row, **values) for row, values in zip(rows, given, strict=True)] if columns else rows
 
     @cached_property
     def line_sigma(self) -> float | None:

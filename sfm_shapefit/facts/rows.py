@@ -1,8 +1,10 @@
 """One row per camera and one per pair of a placed graph."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from sfm_shapefit.placement.place import count_large
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _ELSEWHERE = "in a larger piece, to which this one is not rigidly tied"
 _OUTSIDE = "outside the pieces that are solved"
+_NOT_JUDGED = (Verdict.UNDETERMINED, *4 * (math.nan,))
 _INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 
 
@@ -139,38 +142,36 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
         support: (m,) the pairs' number of inlier matches.
         further: the other pieces that are solved; their pairs are judged by them.
     """
-    graph = placement.graph
-    judged: dict[int, tuple[Judged, int, float]] = {}
+    graph, groups = placement.graph, placement.groups
+    judged: dict[int, tuple[Any, ...]] = {}
     for piece in (placement, *further):
-        dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
-        judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
+        told, dual_norms = piece.assessment, np.linalg.norm(piece.certified.dual, axis=1)
+        figures = (told.residuals_deg, dual_norms / graph.weights[piece.edges], told.leverages)
+        columns = (column.tolist() for column in (*figures, piece.refined.posterior))
+        verdicts = map(told.verdict, range(len(piece.edges)))
+        judged |= zip(piece.edges.tolist(), zip(verdicts, *columns, strict=True), strict=True)
     rows = []
-    for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
-        row = PairRow(
-            name1=graph.name_of(i),
-            name2=graph.name_of(j),
-            direction=tuple(graph.directions[edge].tolist()),
-            support=int(support[edge]),
-            weight=float(graph.weights[edge]),
-        )
+    known = (graph.edges, graph.directions, support, graph.weights)
+    given = zip(*(column[: placement.num_pairs].tolist() for column in known), strict=True)
+    for edge, ((i, j), direction, number, weight) in enumerate(given):
+        verdict, residual_deg, dual_norm, leverage, posterior = judged.get(edge, _NOT_JUDGED)
+        reason = _UNCHECKED if verdict is Verdict.UNDETERMINED else ""
         if edge not in judged:
-            inner = placement.groups is not None and bool(
-                placement.groups.group_of[i] == placement.groups.group_of[j]
-            )
-            rows.append(replace(row, reason=_INNER if inner else _OUTSIDE))
-            continue
-        piece, e, dual_norm = judged[edge]
-        assessment = piece.assessment
-        verdict = assessment.verdict(e)
+            inner = groups is not None and bool(groups.group_of[i] == groups.group_of[j])
+            reason = _INNER if inner else _OUTSIDE
         rows.append(
-            replace(
-                row,
-                residual_deg=float(assessment.residuals_deg[e]),
-                dual_norm=float(dual_norm),
-                leverage=float(assessment.leverages[e]),
+            PairRow(
+                name1=graph.name_of(i),
+                name2=graph.name_of(j),
+                direction=tuple(direction),
+                support=number,
+                weight=weight,
+                residual_deg=residual_deg,
+                dual_norm=dual_norm,
+                leverage=leverage,
                 verdict=verdict.value,
-                reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
-                posterior=float(piece.refined.posterior[e]),
+                reason=reason,
+                posterior=posterior,
             )
         )
     return rows

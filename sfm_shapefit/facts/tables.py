@@ -6,9 +6,8 @@
 import csv
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -104,17 +103,15 @@ def write_rows(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
-    names = [field.name for field in fields(row_type)]
-    values_of = attrgetter(*names)
-    empty = [("",) * len(columns_of_field(name, dimension)) for name in names]
-
-    def cells(row: CameraRow | PairRow) -> list[object]:
-        values = zip(values_of(row), empty, strict=True)
-        spread = (((value or none) if isinstance(value, tuple) else (value,)) for value, none in values)
-        return [_cell(value) for some in spread for value in some]
-
-    columns = [column for name in names for column in columns_of_field(name, dimension)]
-    _write_csv(columns, map(cells, rows), path)
+    columns: dict[str, Sequence[object]] = {}
+    for item in fields(row_type):
+        values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
+        if names == [item.name]:
+            columns[item.name] = values
+        else:
+            whole = [value or ("",) * len(names) for value in values]
+            columns |= {name: [value[k] for value in whole] for k, name in enumerate(names)}
+    _write_csv(columns, path)
 
 
 def read_trust(path: Path) -> dict[str, float]:
@@ -152,30 +149,38 @@ def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
-    columns = list(records[0])
-    _write_csv(columns, ([_cell(record[name]) for name in columns] for record in records), path)
+    _write_csv({name: [record[name] for record in records] for name in records[0]}, path)
 
 
-def _write_csv(columns: Sequence[str], rows: Iterable[list[object]], path: Path) -> None:
-    """Write a header and rows of cells; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
+def _write_csv(columns: Mapping[str, Sequence[object]], path: Path) -> None:
+    """Write columns under their names; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
+    rows = zip(*map(_cells, columns.values()), strict=True)
     try:
         with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
             bare = csv.writer(stream, lineterminator="\n")
             quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
             bare.writerow(columns)
+            if not any(map(_has_return, columns.values())):
+                bare.writerows(rows)
             for row in rows:  # a carriage return ends a line for others, which `csv` forgets
-                has_return = any("\r" in cell for cell in row if isinstance(cell, str))
-                (quoted if has_return else bare).writerow(row)
+                (quoted if _has_return(row) else bare).writerow(row)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
 
 
-def _cell(value: object) -> object:
-    if isinstance(value, float):
-        return repr(float(value)) if math.isfinite(value) else ""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "" if value is None else value
+def _has_return(cells: Sequence[object]) -> bool:
+    """Return whether one of some texts, beside which there may be other things, has a carriage return."""
+    return str in set(map(type, cells)) and any("\r" in str(cell) for cell in cells)
+
+
+def _cells(values: Sequence[object]) -> Sequence[object]:
+    """Return values as `csv` is to write them; itself it writes numbers that round-trip, None as nothing."""
+    kinds = set(map(type, values))
+    if bool in kinds:
+        return [str(value).lower() for value in values]
+    if float not in kinds:
+        return values
+    return ["" if isinstance(value, float) and not math.isfinite(value) else value for value in values]
 
 
 class Tabled:

@@ -79,11 +79,12 @@ def _add_scores(
     """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
     a, b, normal = np.empty(3), np.empty(3), np.empty(3)
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
-    terms = np.empty((16, 3))
+    axes, sums = np.empty((2, 3)), np.empty((3, NUM_SAMPLES))
     for p in range(len(pairs)):
         if not has_direction[p]:
             continue
         v = directions[p]
+        sums[:] = 0.0
         for k in range(offsets[p], offsets[p + 1]):
             for c in range(3):
                 a[c], b[c] = rays_i[k, c], rays_j[k, c]
@@ -98,9 +99,12 @@ def _add_scores(
                 continue
             for c in range(3):
                 normal[c] /= square
-            _tangential(a, across_b, factors[:2])
-            _tangential(b, across_a, factors[2:])
-            _add_samples(pairs[p], keypoints[k], factors, normal, terms, scores[p])
+            _tangential(a, across_b, axes, factors[:2])
+            _tangential(b, across_a, axes, factors[2:])
+            _add_samples(pairs[p], keypoints[k], factors, normal, sums)
+        for sample in range(NUM_SAMPLES):
+            for c in range(3):
+                scores[p, sample, c] = sums[c, sample]
 
 
 @inner_kernel
@@ -110,16 +114,15 @@ def _dot(a: Any, b: Any) -> float:
 
 
 @inner_kernel
-def _tangential(ray: Any, vector: Any, out: Any) -> None:
+def _tangential(ray: Any, vector: Any, axes: Any, out: Any) -> None:
     """Write the components of a vector along two axes across a ray that depend on the ray alone."""
-    axis, first, second = np.empty(3), np.empty(3), np.empty(3)
-    smallest = 0
+    first, second, smallest = axes[0], axes[1], 0
     for c in range(3):
-        axis[c] = 0.0
+        second[c] = 0.0
         if abs(ray[c]) < abs(ray[smallest]):
             smallest = c
-    axis[smallest] = 1.0
-    cross(ray, axis, first)
+    second[smallest] = 1.0
+    cross(ray, second, first)
     length = np.sqrt(_dot(first, first))
     for c in range(3):
         first[c] /= length
@@ -128,26 +131,21 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
 
 
 @inner_kernel
-def _add_samples(pair: Any, match: Any, factors: Any, score: Any, terms: Any, scores: Any) -> None:
-    """Add a match's score times its residual in each sample; `terms` (16, 3), for the signs of both ends."""
-    one, two, four = np.uint64(1), np.uint64(2), np.uint64(4)
-    for signs in range(16):
-        residual = factors[0] if signs & 1 else -factors[0]
-        residual += factors[1] if signs & 2 else -factors[1]
-        residual += factors[2] if signs & 4 else -factors[2]
-        residual += factors[3] if signs & 8 else -factors[3]
-        for c in range(3):
-            terms[signs, c] = residual * score[c]
-    both = one + two
-    for first in range(0, len(scores), _SIGNS_PER_HASH):
-        bits_i = _hash(pair[0], match[0], first)
-        bits_j = _hash(pair[1], match[1], first)
-        for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
-            row = np.int64((bits_i & both) + four * (bits_j & both))
-            bits_i >>= two
-            bits_j >>= two
-            for c in range(3):
-                scores[k, c] += terms[row, c]
+def _add_samples(pair: Any, match: Any, factors: Any, score: Any, sums: Any) -> None:
+    """Add a match's score times its residual in each sample to `sums` (3, NUM_SAMPLES), several at once."""
+    one, two = np.uint64(1), np.uint64(2)
+    f0, f1, f2, f3 = factors[0], factors[1], factors[2], factors[3]
+    x, y, z = score[0], score[1], score[2]
+    for first in range(0, NUM_SAMPLES, _SIGNS_PER_HASH):
+        bits_i, bits_j = _hash(pair[0], match[0], first), _hash(pair[1], match[1], first)
+        for k in range(_SIGNS_PER_HASH):
+            shift = np.uint64(2 * k)
+            i, j = bits_i >> shift, bits_j >> shift
+            residual = (f0 if i & one else -f0) + (f1 if i & two else -f1)
+            residual = residual + (f2 if j & one else -f2) + (f3 if j & two else -f3)
+            sums[0, first + k] += residual * x
+            sums[1, first + k] += residual * y
+            sums[2, first + k] += residual * z
 
 
 @inner_kernel

@@ -66,7 +66,7 @@ def adjust_first_placement(
         place_cameras, options=options.placement, nodes=options.nodes, clock=clock, certified=False
     )
     placement = next(place(graph))
-    if measured.checked is not None and may_be_checked(graph):
+    if measured.checks and may_be_checked(graph):
         better = place_by_checked(placement, partial(build, checked=True), place)
         placement = placement if better is None else better[1]
     del graph, build, measured  # arrays of all pairs

@@ -23,13 +23,14 @@ from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among
-from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
+from sfm_shapefit.tracks.node_tracks import TrackJoiner, covering_set, join_points
 from sfm_shapefit.tracks.options import NodeOptions
 
 _CHECK_ROTATIONS = (
     "check that rotations and intrinsics belong to these matches; rough rotations need rotations=2"
 )
 _MAX_SAMPLED_PAIRS = 100_000  # pairs; beyond, standard deviations take them as independent, for memory
+_MOST_PAIRS = 200_000  # pairs, usable or not; of more, none is sampled to begin with
 # Cameras from which points are left out of the graph where pairs hold it: they treble the time of its solve.
 _MANY_CAMERAS = 1_000
 _FEW_CAMERAS = 0.01  # share of the cameras that may be held worse: the refinement judges each by itself
@@ -50,10 +51,10 @@ class Measured:
 
     directions: PairDirections
     """Directions of all pairs, usable or not."""
-    tracks: Tracks | None = None
-    """Points seen by three cameras or more, which may become nodes; None where they were not asked for."""
-    checked: Tracks | None = None
-    """A covering set of those that no single match holds together; None where not asked for, or unknown."""
+    tracks: TrackJoiner | None = None
+    """Joins points seen by three cameras or more, which may become nodes; None where not asked for."""
+    checks: bool = False
+    """Whether those are known, and were asked for, that no single match holds together."""
     errors: list[FloatArray] | None = None
     """Samples of the usable directions' errors, which share keypoints, (m, NUM_SAMPLES, 2) in parts. None
     where directions count as independent."""
@@ -112,8 +113,8 @@ def measure(
         )
     return Measured(
         directions=concatenate(parts),
-        tracks=beside.tracks(),
-        checked=beside.checked_tracks(),
+        tracks=beside.joiner,
+        checks=wanted.checked and beside.joiner is not None and beside.joiner.holds_all,
         errors=beside.errors,
         facts_per_match=beside.facts_per_match(),
     )
@@ -125,18 +126,19 @@ class _Beside:
     def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
         view = source.view
         self._threshold_px, self._num_usable = threshold_px, 0
-        self.errors: list[FloatArray] | None = [] if wanted.errors else None
+        is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
+        self.errors: list[FloatArray] | None = [] if is_sampled else None
         self._begins = np.append(0, np.cumsum(view.num_keypoints))
         # Pairs of most keypoints are far below the limit of the type, 65,535.
         self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
-        self._joiner, self._checks = None, wanted.checked
+        self.joiner = None
         if wanted.tracks:
-            self._joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
+            self.joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
 
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Take a batch and its directions."""
-        if self._joiner is not None:
-            self._joiner.add(batch, directions)
+        if self.joiner is not None:
+            self.joiner.add(batch, directions)
         usable = directions.usable()
         self._num_usable += len(usable)
         for row in usable.tolist():
@@ -159,15 +161,6 @@ class _Beside:
         counts = self._num_pairs_of[self._num_pairs_of > 0].astype(np.float64)
         facts = np.sum((2.0 * counts - 1.0) / (counts + 1.0))
         return min(1.0, float(facts / max(0.5 * np.sum(counts), 1.0)))
-
-    def tracks(self) -> Tracks | None:
-        """Return the tracks, if they are wanted."""
-        return None if self._joiner is None else self._joiner.tracks()
-
-    def checked_tracks(self) -> Tracks | None:
-        """Return a covering set of the checked tracks, if they are wanted."""
-        checked = self._joiner.checked_tracks() if self._joiner is not None and self._checks else None
-        return checked and checked.subset(covering_set(checked, len(self._begins) - 1))
 
 
 def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
@@ -202,10 +195,11 @@ def build_graph(
     If `checked`, with those of the checked tracks alone. But many cameras that their pairs hold need none,
     unless they are wanted always.
     """
-    directions, tracks = measured.directions, measured.checked if checked else measured.tracks
+    directions, joiner = measured.directions, measured.tracks
     graph, covariance = view_graph(images, directions), directions.covariance[directions.usable()]
-    if tracks is None or (nodes.points == "auto" and _is_held_by_pairs(graph)):
+    if joiner is None or (nodes.points == "auto" and _is_held_by_pairs(graph)):
         return MeasuredGraph(graph, covariance=covariance)
+    tracks = joiner.checked_tracks() if checked else joiner.tracks()
     chosen = tracks.subset(covering_set(tracks, images.num_images))
     return join_points(graph, covariance, chosen, 1.0 / images.focal_lengths_px)
 
@@ -222,12 +216,12 @@ def _is_held_by_pairs(graph: ViewGraph) -> bool:
 def count_work(source: MatchSource, directions: PairDirections) -> Workload:
     """Return the work to do, as far as it is known once the directions are measured."""
     usable = directions.usable()
-    is_sampled = source.economy.samples and len(usable) <= _MAX_SAMPLED_PAIRS
+    is_few = len(usable) <= _MAX_SAMPLED_PAIRS and len(directions.pairs) <= _MOST_PAIRS
     return replace(
         source.workload(),
         num_pairs=len(directions.pairs),
         num_matches=int(directions.num_matches.sum()),
-        num_sampled=len(usable) if is_sampled else 0,
+        num_sampled=len(usable) if source.economy.samples and is_few else 0,
     )
 
 

@@ -105,7 +105,7 @@ def settle(
         measured = measured if economy.samples else replace(measured, errors=None)
         limited, near = economy.limit(options.placement), None if first is None else first.near
         place = partial(place_cameras, options=limited, nodes=options.nodes, clock=clock, near=near)
-        if measured.checked is None or not may_be_checked(graph):
+        if not (measured.checks and may_be_checked(graph)):
             graph = add_evidence(graph, measured)
             del measured
             pieces = list(place(graph))

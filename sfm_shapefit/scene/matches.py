@@ -9,7 +9,6 @@ matters of a keypoint is the unit ray of its pixel in world axes. So there are t
 
 import itertools
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -33,8 +32,6 @@ from sfm_shapefit.scene.lens import Lens
 
 PairNames = frozenset[tuple[str, str]]
 """Pairs of images by their names, the smaller name first."""
-
-KeypointNumbers = IntArray | UInt32Array
 
 KEPT_MATCHES = 1_000_000  # matches that are kept with their rays; they take 80 MB
 # Matches of a database; of more, none is kept while points are made of them. To read 30 million again takes a
@@ -188,14 +185,6 @@ class Matches(ABC):
     def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
         """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
 
-    def matched(self, name: str) -> FloatArray:
-        """Return the pixels (m, 2) of those keypoints of an image to which matches may refer."""
-        return self.keypoints(name)
-
-    def places(self, name: str, keypoints: KeypointNumbers) -> KeypointNumbers:  # noqa: ARG002
-        """Return the places (k,) of keypoints (k,) of an image among those to which matches may refer."""
-        return keypoints
-
     @abstractmethod
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:
         """Return the matches of pairs (k,), ascending: how many each has, and the keypoints (M, 2) of all.
@@ -234,6 +223,10 @@ class View:
     A pass yields the pairs (i, j), i < j, in their order, and of each those matches whose pixels have rays.
     """
 
+    _rays: FloatArray
+    _num_rays: int
+    _begins: IntArray
+
     def __init__(self, matches: Matches, images: Images, left_out: PairNames, reading: Reading) -> None:
         self.matches, self.images, self.reading = matches, images, reading
         index = {name: k for k, name in enumerate(images.names)}
@@ -249,8 +242,7 @@ class View:
         self.num_keypoints = np.array([count_of.get(name, 0) for name in images.names], dtype=np.int64)
         """(n,) keypoints of each image."""
         self._rotations, self._focal_lengths_px = images.rotations, images.focal_lengths_px
-        self._rays: OrderedDict[int, FloatArray] = OrderedDict()
-        self._rays_bytes = 0
+        self._forget_rays()
         self._kept: dict[int, list[MatchBatch]] = {}
         self._blind: dict[int, BoolArray | None] = {}
 
@@ -348,18 +340,14 @@ class View:
     def _batches(self, chosen: IntArray, min_matches: int) -> Iterator[MatchBatch]:
         """Yield the matches of chosen pairs with their rays."""
         for found in self._links(chosen, min_matches):
-            rays = np.empty((2, len(found.keypoints), 3))
-            bounds = itertools.pairwise(found.offsets.tolist())
-            for pair, (first, last) in zip(found.pairs.tolist(), bounds, strict=True):
-                for side, image in enumerate(pair):
-                    own = self.matches.places(self.images.names[image], found.keypoints[first:last, side])
-                    self._rays_of(image).take(own, axis=0, out=rays[side, first:last])
+            self._keep_rays(np.unique(found.pairs))
+            rows = np.repeat(self._begins[found.pairs], np.diff(found.offsets), axis=0) + found.keypoints
             yield MatchBatch(
                 pairs=found.pairs,
                 offsets=found.offsets,
                 keypoints=found.keypoints,
-                rays_i=rays[0],
-                rays_j=rays[1],
+                rays_i=self._rays.take(rows[:, 0], axis=0),
+                rays_j=self._rays.take(rows[:, 1], axis=0),
                 pixel_angles=1.0 / self._focal_lengths_px[found.pairs].min(axis=1),
             )
 
@@ -373,7 +361,6 @@ class View:
     def _keypoint_batch(self, chosen: IntArray, min_matches: int) -> KeypointMatches:
         """Return the matches of some of the chosen pairs."""
         pairs = self.pairs[chosen]
-        names = self.images.names
         all_see = all(self._blind_of(image) is None for image in np.unique(pairs).tolist())
         counts, keypoints = self.matches.read(self.rows[chosen], keep=self.reading.keeps)
         if not all_see:
@@ -383,8 +370,7 @@ class View:
                 for side, image in enumerate(images):
                     blind = self._blind_of(image)
                     if blind is not None:
-                        own = self.matches.places(names[image], keypoints[first:last, side])
-                        has_ray[first:last] &= ~blind[own]
+                        has_ray[first:last] &= ~blind[keypoints[first:last, side]]
             keypoints = keypoints[has_ray]
             counts = np.bincount(np.repeat(np.arange(len(pairs)), counts)[has_ray], minlength=len(pairs))
         kept = counts >= min_matches
@@ -396,22 +382,19 @@ class View:
             keypoints=keypoints.astype(np.int64),
         )
 
-    def _rays_of(self, image: int) -> FloatArray:
-        """Return the rays (m, 3) of an image's keypoints that may be matched, from memory if there lately.
-
-        NaN where a pixel has none.
-        """
-        if image in self._rays:
-            self._rays.move_to_end(image)
-            return self._rays[image]
-        images, pixels = self.images, self.matches.matched(self.images.names[image])
-        rays = self.matches.rays(images.lenses[int(images.lens_of[image])], pixels)
-        rays = normalized(rays @ self._rotations[image])
-        self._rays[image] = rays
-        self._rays_bytes += rays.nbytes
-        while self._rays_bytes > self.reading.rays_bytes:
-            self._rays_bytes -= self._rays.popitem(last=False)[1].nbytes
-        return rays
+    def _keep_rays(self, images: IntArray) -> None:
+        """Make the rays of images' keypoints; those of others are given up where there is no room."""
+        new = images[self._begins[images] < 0]
+        if self._num_rays + self.num_keypoints[new].sum() > len(self._rays):
+            self._forget_rays()
+            new, needed = images, int(self.num_keypoints[images].sum())
+            most = min(int(self.num_keypoints.sum()), self.reading.rays_bytes // 24)
+            self._rays = np.empty((max(needed, most), 3))  # memory is taken as they come
+        for image in new.tolist():
+            begin, pixels = self._num_rays, self.matches.keypoints(self.images.names[image])
+            rays = self.matches.rays(self.images.lenses[int(self.images.lens_of[image])], pixels)
+            self._rays[begin : begin + len(rays)] = normalized(rays @ self._rotations[image])
+            self._begins[image], self._num_rays = begin, begin + len(rays)
 
     def forget(self) -> None:
         """Give back the memory of all that is kept with rays; it is made again where it is needed."""
@@ -426,13 +409,15 @@ class View:
 
     def _forget_rays(self) -> None:
         """Give back the memory of the rays of keypoints."""
-        self._rays.clear()
-        self._rays_bytes = 0
+        self._rays, self._num_rays = np.empty((0, 3)), 0
+        self._begins = np.full(self.images.num_images, -1)
 
     def _blind_of(self, image: int) -> BoolArray | None:
-        """Return which of the same keypoints have no ray, (m,); None if all have one."""
+        """Return which keypoints of an image have no ray, (k,); None if all have one."""
         if image not in self._blind:
-            blind = np.isnan(self._rays_of(image)[:, 0])
+            self._keep_rays(np.array([image]))
+            begin = self._begins[image]
+            blind = np.isnan(self._rays[begin : begin + self.num_keypoints[image], 0])
             self._blind[image] = blind if blind.any() else None
         return self._blind[image]
 

@@ -124,13 +124,13 @@ class TrackJoiner:
         rays = np.concatenate(self._rays)
         return _collect(self._places, self._begins, self._parents[: self._count], rays)
 
-    def checked_tracks(self) -> Tracks | None:
-        """Return those that no single match holds together; once, as this uses up what is held for it.
+    @property
+    def holds_all(self) -> bool:
+        """Whether all matches are held, so that it is known which tracks are checked."""
+        return self._share >= 1.0
 
-        None where too many matches were added to know.
-        """
-        if self._share < 1.0:
-            return None
+    def checked_tracks(self) -> Tracks:
+        """Return those that no single match holds together; once, as this uses up what is held for it."""
         rays, checked = np.concatenate(self._rays), np.arange(self._count)
         _cut_bridges(self._ties, self._drawn, checked)
         return _collect(self._places, self._begins, checked, rays)

@@ -36,6 +36,7 @@ from sfm_shapefit.base.arrays import IntArray, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.colmap.points import Observed
 from sfm_shapefit.files.lines import refuse_database
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
@@ -60,8 +61,8 @@ _POINT3D_BYTES = 51  # bytes of a point; id 8, xyz 24, rgb 3, error 8, track len
 _TRACK_ELEMENT_BYTES = 8  # bytes of an observation; image 4, keypoint 4
 
 
-def check_model_files(folder: Path) -> None:
-    """Refuse a model folder that pycolmap must not be given.
+def check_model_files(folder: Path) -> Observed:
+    """Refuse a model folder that pycolmap must not be given; return what the images of a binary one observe.
 
     Where a folder holds both formats, the binary one is checked, since pycolmap reads that. It
     must have cameras, images and points3D, and either both or none of rigs and frames.
@@ -81,11 +82,11 @@ def check_model_files(folder: Path) -> None:
             f"{folder} has {there}{suffix} but no {missing}{suffix}; add it, or remove {there}{suffix}"
         )
     if suffix == ".bin":
-        _check_binary_model(folder, with_rigs=has_rigs)
-    else:
-        _check_camera_lines(folder / "cameras.txt")
-        _check_image_lines(folder / "images.txt")
-        _check_point_lines(folder / "points3D.txt")
+        return _check_binary_model(folder, with_rigs=has_rigs)
+    _check_camera_lines(folder / "cameras.txt")
+    _check_image_lines(folder / "images.txt")
+    _check_point_lines(folder / "points3D.txt")
+    return {}
 
 
 def model_suffix(folder: Path) -> str:
@@ -206,21 +207,22 @@ class _BinaryFile:
 
 
 class _Images(NamedTuple):
-    """What other files refer to in images.bin: of each image (n,), by id, and of each observation (O,)."""
+    """What other files refer to in images.bin: of each image (n,), by id, and what it observes."""
 
     ids: IntArray
     camera_ids: IntArray
     num_points2d: IntArray
-    observed_points: UInt64Array
+    observed: Observed
 
 
-def _check_binary_model(folder: Path, *, with_rigs: bool) -> None:
+def _check_binary_model(folder: Path, *, with_rigs: bool) -> Observed:
     """Walk the binary files in the order in which they refer to each other."""
     camera_ids = _check_cameras(_BinaryFile(folder / "cameras.bin"))
     image_file = _BinaryFile(folder / "images.bin")
     images = _check_images(image_file, camera_ids)
     point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
-    unknown = images.observed_points[~np.isin(images.observed_points, point_ids)]
+    observed = np.concatenate([point_ids[:0], *(points for _, points in images.observed.values())])
+    unknown = observed[~np.isin(observed, point_ids)]
     if len(unknown):
         raise image_file.fault(f"an image observes 3D point {unknown[0]}, which points3D.bin does not have")
     if with_rigs:
@@ -229,6 +231,7 @@ def _check_binary_model(folder: Path, *, with_rigs: bool) -> None:
         camera_of_image = _check_frames(frame_file, rigs)
         if rigs or camera_of_image:  # two empty files are read like a model without rigs and frames
             _check_frames_match_images(frame_file, camera_of_image, images)
+    return images.observed
 
 
 def _check_cameras(file: _BinaryFile) -> set[int]:
@@ -253,7 +256,7 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
     """Walk images.bin; one step per image, its points at once."""
     header_of: dict[int, tuple[int, int]] = {}  # camera id, number of points
     names: set[bytes] = set()
-    observed = [np.empty(0, dtype=np.uint64)]
+    observed: dict[int, tuple[IntArray, UInt64Array]] = {}
     for _ in range(file.take_count(_IMAGE.size + 1 + _U64.size, "images")):
         image_id, *pose, camera_id = file.take(_IMAGE, "an image")
         label = f"image {image_id}"
@@ -272,10 +275,11 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
             raise file.fault(f"{label} has a point whose coordinates are not finite")
         header_of[int(image_id)] = (int(camera_id), count)
         names.add(name)
-        observed.append(points["point3d_id"][points["point3d_id"] != _NO_POINT])
+        keypoints = np.flatnonzero(points["point3d_id"] != _NO_POINT)
+        observed[int(image_id)] = keypoints, points["point3d_id"][keypoints]
     file.finish()
     table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
-    return _Images(table[:, 0], table[:, 1], table[:, 2], np.concatenate(observed))
+    return _Images(table[:, 0], table[:, 1], table[:, 2], observed)
 
 
 def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:

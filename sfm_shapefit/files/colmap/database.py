@@ -24,8 +24,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, RelativePoses, View
 
-_KEYPOINT_BITS = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
-_KEYPOINT_MASK = np.uint64(2**32 - 1)  # bits of the second keypoint; the first stands above them
+_HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
 
 _CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
 """COLMAP's configurations without a direction: not verified (0, 1, 7), pure turn (5), several motions (8)."""
@@ -132,21 +131,19 @@ class DatabaseMatches(Matches):
         read together, since a pair has few matches, and a call of numpy takes as long as a hundred of them.
         """
         counts = self.num_matches[chosen]
-        stored = np.frombuffer(self._stored_matches(chosen), dtype="<u4").reshape(-1, 2).astype(np.uint64)
-        swapped = np.repeat(self.rows.swapped[chosen], counts)
-        first, second = np.where(swapped, stored.T[::-1], stored.T)
-        # A match is made one number, for numbers are sorted several times faster than rows.
-        both = first << _KEYPOINT_BITS | second
-        ends = np.cumsum(counts)
-        for begin, end in zip((ends - counts).tolist(), ends.tolist(), strict=True):
-            both[begin:end].sort()
-        new = np.append(True, both[1:] != both[:-1])[: len(both)]
-        new[(ends - counts)[counts > 0]] = True
-        of_pair = np.repeat(np.arange(len(chosen)), counts)[new]
-        both = both[new]
-        matches = np.stack([both >> _KEYPOINT_BITS, both & _KEYPOINT_MASK], axis=1).astype(np.uint32)
-        limits = self.num_keypoints[self.pairs[chosen]]
-        missing = np.flatnonzero((matches >= limits[of_pair]).any(axis=1))
+        # A match is made one number, its first keypoint above, for numbers are sorted faster than rows.
+        both = np.frombuffer(self._stored_matches(chosen), dtype="<u8")
+        both = np.where(np.repeat(self.rows.swapped[chosen], counts), both, both >> _HALF | both << _HALF)
+        of_pair = np.repeat(np.arange(len(chosen)), counts)
+        is_same = of_pair[1:] == of_pair[:-1]
+        ends = np.cumsum(counts).tolist()
+        for pair in np.unique(of_pair[1:][(both[1:] < both[:-1]) & is_same]).tolist():
+            both[ends[pair] - counts[pair] : ends[pair]].sort()
+        new = np.append(True, (both[1:] != both[:-1]) | ~is_same)[: len(both)]
+        if not new.all():
+            of_pair, both = of_pair[new], both[new]
+        matches = both.astype("<u8", copy=False).view("<u4").reshape(-1, 2)[:, ::-1]
+        missing = np.flatnonzero((matches >= self.num_keypoints[self.pairs[chosen]][of_pair]).any(axis=1))
         if len(missing):
             pair = int(chosen[of_pair[missing[0]]])
             raise self.damaged_pair(pair, "matches of keypoints that do not exist")
@@ -154,14 +151,11 @@ class DatabaseMatches(Matches):
 
     def _stored_matches(self, chosen: IntArray) -> bytes:
         """Return the matches of pairs as the file lists them, one pair after the other."""
-        parts, counts = [], self.num_matches[chosen].tolist()
-        for pair, count, (cols, data) in zip(
-            chosen.tolist(), counts, self.look_up(chosen, "cols, data"), strict=True
-        ):
-            if cols != 2 or not is_blob(data, count, 2, itemsize=4):
+        found = self.look_up(chosen, "cols, data")
+        for pair, (cols, data) in zip(chosen.tolist(), found, strict=True):
+            if cols != 2 or not is_blob(data, int(self.num_matches[pair]), 2, itemsize=4):
                 raise self.damaged_pair(pair, "matches of wrong length")
-            parts.append(data)
-        return b"".join(parts)
+        return b"".join(data for _, data in found)
 
     def parts(self, view: View, ranges: Sequence[slice]) -> "list[DatabasePart]":
         """Return ranges of a view's pairs for other processes."""
@@ -177,8 +171,7 @@ class DatabaseMatches(Matches):
 
     def look_up(self, pairs: IntArray, columns: str) -> list[tuple[Any, ...]]:
         """Return columns of the two-view geometries of pairs."""
-        query = f"SELECT {columns} FROM two_view_geometries WHERE rowid = ?"
-        return self.file.look_up(query, self.rows.rowids[pairs].tolist())
+        return self.file.look_up("two_view_geometries", columns, self.rows.rowids[pairs].tolist())
 
     def damaged_pair(self, pair: int, what: str) -> InputError:
         """Return the error that names a pair of images."""

@@ -22,7 +22,7 @@ import pycolmap
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
 from sfm_shapefit.files.colmap.images import images_of
-from sfm_shapefit.files.colmap.points import points2d_xy
+from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.images import Images
 
@@ -62,6 +62,9 @@ class ColmapModel:
     The answer's sums depend on the order of images, so it is that of the user's names, not of ids.
     """
 
+    observed: Observed
+    """What images observe, as far as the files told it already."""
+
     @property
     def image_names(self) -> tuple[str, ...]:
         """Names of all images, posed or not."""
@@ -81,6 +84,7 @@ def read_model(source: ModelSource) -> ColmapModel:
             pose.
     """
     is_checked, source = False, model_of(source)
+    observed: Observed = {}
     if not isinstance(source, pycolmap.Reconstruction | Path | str):
         raise InputError(
             f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
@@ -88,22 +92,22 @@ def read_model(source: ModelSource) -> ColmapModel:
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
     else:
-        label, reconstruction = str(Path(source)), _load(Path(source))
+        label, (reconstruction, observed) = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"
     try:
         with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
-            return _posed_model(label, reconstruction)
+            return _posed_model(label, reconstruction, observed)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def _load(folder: Path) -> pycolmap.Reconstruction:
+def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed]:
     """Check the files of a model and only then let pycolmap read them."""
-    check_model_files(folder)
+    observed = check_model_files(folder)
     try:
         with quiet_log():
-            return pycolmap.Reconstruction(folder)
+            return pycolmap.Reconstruction(folder), observed
     except PYCOLMAP_ERRORS as error:
         raise InputError(
             f"{folder} cannot be read as a COLMAP model ({_first_line(error)}); write it again with COLMAP"
@@ -145,7 +149,7 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
         raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
 
 
-def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> ColmapModel:
+def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: Observed) -> ColmapModel:
     """Collect the posed images of a reconstruction."""
     every = images_of(reconstruction)
     has_pose = [reconstruction.image(image_id).has_pose for image_id in every.ids.tolist()]
@@ -174,7 +178,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> ColmapM
             raise InputError(
                 f"{label}: camera {lens.id} has focal length {lens.focal_px:g} px; it must be > 0"
             )
-    return ColmapModel(reconstruction=reconstruction, images=images)
+    return ColmapModel(reconstruction=reconstruction, images=images, observed=observed)
 
 
 def _refuse_unplaced_sensors(label: str, reconstruction: pycolmap.Reconstruction, images: Images) -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
-from sfm_shapefit.files.colmap.points import observed_points, points2d_xy
+from sfm_shapefit.files.colmap.points import Observed, observed_points, points2d_xy
 
 
 class SeenColors(NamedTuple):
@@ -34,8 +34,8 @@ class PointColors:
     """By the ids of the images; of a model without any color, none."""
 
 
-def read_colors(source: pycolmap.Reconstruction) -> PointColors:
-    """Return the colors of a model's points, eight bytes an observation; black says that there is none."""
+def read_colors(source: pycolmap.Reconstruction, observed: Observed) -> PointColors:
+    """Return the colors of a model's points; black is none. `observed` has what some of its images see."""
     points = source.points3D
     ids = np.array(sorted(source.point3D_ids()), dtype=np.uint64)
     colors = np.array([points[k].color for k in ids.tolist()], dtype=np.uint8).reshape(-1, 3)
@@ -44,7 +44,7 @@ def read_colors(source: pycolmap.Reconstruction) -> PointColors:
     images = {}
     for image_id in sorted(source.images.keys()):
         image = source.image(image_id)
-        keypoints, seen = observed_points(image)
+        keypoints, seen = observed.get(image_id) or observed_points(image)
         if len(keypoints):
             rows = np.searchsorted(ids, seen).astype(np.int32)
             images[image_id] = SeenColors(_digest(image), keypoints.astype(np.int32), rows)

@@ -1,7 +1,6 @@
 """The door between reconstructions and `Points`, and pixels and rays of the points2D that observe them."""
 
-from collections.abc import Callable
-from operator import attrgetter
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pycolmap
@@ -15,7 +14,9 @@ from sfm_shapefit.scene.points import Points
 Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
 
-_POINT3D_ID = attrgetter("point3D_id")
+Observed = Mapping[int, tuple[IntArray, UInt64Array]]
+"""By the id of an image: its points2D that observe a 3D point, ascending, and the ids of those points."""
+
 # For this camera, pixel coordinates and normalized coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
 
@@ -34,8 +35,8 @@ def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
     most points of an image usually observe nothing.
     """
     keypoints = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-    points = image.get_observation_points2D()
-    return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
+    points = (point.point3D_id for point in image.get_observation_points2D())
+    return keypoints, np.fromiter(points, dtype=np.uint64, count=len(keypoints))
 
 
 class ModelPictures:

@@ -43,11 +43,15 @@ class SortedMatches:
         new = pairs[self._lengths[pairs] < 0]
         if len(new):
             lengths, matches = read(new)
-            shifts = self._starts[new] - (np.cumsum(lengths) - lengths)
-            self._keypoints[np.repeat(shifts, lengths) + np.arange(len(matches))] = matches
+            self._keypoints[self._rows(new, lengths)] = matches
             self._lengths[new] = lengths
-        lengths, starts = self._lengths[pairs], self._starts[pairs]
+        lengths = self._lengths[pairs]
+        return lengths, self._keypoints[self._rows(pairs, lengths)]
+
+    def _rows(self, pairs: IntArray, lengths: IntArray) -> slice | IntArray:
+        """Return where the matches of pairs (m,) stand, (M,), or from where to where if in one piece."""
+        starts = self._starts[pairs]
         if len(pairs) and (starts[1:] == starts[:-1] + lengths[:-1]).all():
-            return lengths, self._keypoints[starts[0] : starts[-1] + lengths[-1]]
+            return slice(starts[0], starts[-1] + lengths[-1])
         shifts = starts - (np.cumsum(lengths) - lengths)
-        return lengths, self._keypoints[np.repeat(shifts, lengths) + np.arange(lengths.sum())]
+        return np.asarray(np.repeat(shifts, lengths) + np.arange(lengths.sum()))

@@ -86,7 +86,7 @@ def template_of(model: ColmapModel, replaced: BoolArray | None = None) -> Templa
             bare_image(image, keeps_keypoints=image.image_id not in is_replaced)
             for image in read.images.values()
         ),
-        colors=read_colors(read),
+        colors=read_colors(read, model.observed),
     )
 
 

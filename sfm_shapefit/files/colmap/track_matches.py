@@ -15,7 +15,6 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import (
     PLENTY,
-    KeypointNumbers,
     Matches,
     PairNames,
     Reading,
@@ -39,8 +38,7 @@ class TrackMatches(Matches):
         self._model, self._images = model.reconstruction, dict(zip(self.names, images, strict=True))
         self.num_keypoints = np.array([image.num_points2D() for image in images], dtype=np.int64)
         self.total_keypoints = int(self.num_keypoints.sum())
-        seen = [observed_points(image) for image in images]
-        self._matched = {name: keypoints for name, (keypoints, _) in zip(self.names, seen, strict=True)}
+        seen = [model.observed.get(image.image_id) or observed_points(image) for image in images]
         points = np.concatenate([ids for _, ids in seen])
         image_of = np.repeat(np.arange(len(seen)), [len(ids) for _, ids in seen])
         order = np.argsort(points, kind="stable")
@@ -76,14 +74,6 @@ class TrackMatches(Matches):
     def rays(self, lens: Lens, pixels: FloatArray) -> FloatArray:
         """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those without."""
         return rays_of(lens, pixels)
-
-    def matched(self, name: str) -> FloatArray:
-        """Return the pixels (m, 2) of those points of an image that observe a 3D point."""
-        return self.keypoints(name)[self._matched[name]]
-
-    def places(self, name: str, keypoints: KeypointNumbers) -> IntArray:
-        """Return the places (k,) of some of these points (k,) among them."""
-        return np.searchsorted(self._matched[name], keypoints)
 
     def read(self, pairs: IntArray, *, keep: bool) -> tuple[IntArray, UInt32Array]:  # noqa: ARG002
         """Return the matches of pairs; they are made anew each time."""
