@@ -167,6 +167,7 @@ def _facts(names):
         scale="input: scale and origin of the input's centers",
         scale_sigma=None,
         known_distances=(),
+        wrong_priors={},
         control_points=(),
         datum=None,
         rigid_groups=None,

@@ -42,10 +42,8 @@ _GRADE_STYLES = {"good": "bold green", "look": "bold yellow", "do not use": "bol
 _SAID_EVERY_S = 2.0  # seconds between lines of progress where there is no terminal; logs stay short
 _AGAIN_S = 0.02  # seconds after which a lost interrupt comes again; native code has returned by then
 
-flag_names: set[str] = set()
-"""Names of the options that are flags of the command at work."""
-key_names: set[str] = set()
-"""Names of those, and of the options of the command that stand in the file of --config only."""
+flag_names, key_names = set[str](), set[str]()
+"""Names of the options of the command at work that are flags, and of those that may stand in --config."""
 
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
@@ -287,7 +285,8 @@ def print_answer(told: Telling, time_taken: str = "") -> None:
         time_taken: put at the end of the first line.
     """
     first, *others = told.lines
-    print_lines([first + (f"        {time_taken}" if time_taken else ""), *others])
+    gap = " " * min(8, max(2, 80 - len(first) - len(time_taken)))  # in a terminal of 80 columns on one line
+    print_lines([f"{first}{gap}{time_taken}" if time_taken else first, *others])
     for label, lines in told.rows:
         more = len(lines) - NAMES_SHOWN
         shown = [*lines[:NAMES_SHOWN], f"and {more} more, {told.elsewhere}"] if more > 0 else lines
@@ -301,13 +300,14 @@ def print_ending(grade: str, verdict: str, written: str, step: str) -> None:
 
 
 def print_lines(lines: Iterable[str], style: str = "") -> None:
-    """Print lines on stdout, of any length and with control characters replaced."""
+    """Print lines on stdout; a terminal breaks sentences between words, but no command and no path."""
     from rich.console import Console
     from rich.text import Text
 
     console = Console()
     for line in lines:
-        console.print(Text(_encodable(in_flags(line)), style), soft_wrap=True)
+        breaks = console.is_terminal and not line.startswith(("next: ", "written to "))
+        console.print(Text(_encodable(in_flags(line)), style), soft_wrap=not breaks)
 
 
 def print_json(summary: dict[str, Any]) -> None:

@@ -107,7 +107,7 @@ class ToldOpinion(Record):
         if self.wrong:
             parts.append(
                 f"{_cameras(self.wrong)} elsewhere {by}: "
-                f"{counted(self.num_against, 'pair')} support that, {self.num_for} where they are"
+                f"{counted(self.num_against, 'pair')} support that, {self.num_for} this model"
             )
         if self.undecided:
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")

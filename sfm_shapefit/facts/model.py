@@ -387,6 +387,9 @@ class CheckedFacts(FactsOfModel):
         if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
             step = next_of_model(self.verdict.grade, self.inputs)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))
+        if second is not None and second.wrong:
+            command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
+            return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 

@@ -31,7 +31,7 @@ class Loop(Record):
         """Its two stretches, pairs, matches, angle and fate, as the report has them in a row."""
         refused, total = self.num_refused, self.num_pairs
         fate = "taken" if refused == 0 else "refused" if refused == total else f"taken but for {refused}"
-        angle = f"{self.angle_deg:.2g} deg (up to {self.tolerance_deg:.2g} agree)"
+        angle = f"{self.angle_deg:.2g} (up to {self.tolerance_deg:.2g} agree)"
         stretches = [_stretch(self.first), _stretch(self.second)]
         return [*stretches, str(total), str(self.num_matches), angle, fate]
 

@@ -6,7 +6,7 @@ from pathlib import PurePath
 import numpy as np
 
 from sfm_shapefit.base.wording import counted, rounded
-from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, ModelFacts
+from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, JoinedFacts, ModelFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.report.drawing import Drawing, PairClass
@@ -20,10 +20,10 @@ _NAMED = 3  # cameras that the banner names; the table has all
 def scene_name(facts: Facts) -> str:
     """Return the name of the scene: that of the folder which holds the model or database, or of the graph."""
     path = facts.inputs.path
-    if isinstance(facts, GraphFacts):
+    if isinstance(facts, GraphFacts) or path == IN_MEMORY:
         return shorten(PurePath(path).name)
-    if path == IN_MEMORY:
-        return path
+    if isinstance(facts, JoinedFacts):
+        return shorten(" + ".join(PurePath(model).name for model in facts.models))
     parts = PurePath(path).parts
     named = [part for part in parts if part.lower() not in _NAMELESS and not part.isdigit()]
     folders = [part for part in named if PurePath(part).suffix.lower() != ".db"]

@@ -25,7 +25,7 @@ from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.evidence import ToldEvidence
-from sfm_shapefit.facts.model import FactsOfModel, ModelFacts
+from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts, ModelFacts
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
 from sfm_shapefit.report.charts import (
@@ -320,7 +320,8 @@ def _control_points(facts: Facts) -> list[list[str]]:
 
 def _subtitle(facts: Facts) -> str:
     dimensions = f", in {facts.dimension} dimensions" if isinstance(facts, GraphFacts) else ""
-    return shorten(facts.inputs.path + dimensions, 400)
+    path = ", ".join(facts.models) if isinstance(facts, JoinedFacts) else facts.inputs.path
+    return shorten(path + dimensions, 400)
 
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
@@ -387,13 +388,10 @@ def _trust_note(drawing: Drawing) -> str:
 def _histogram_note(medians_deg: dict[str, float]) -> str:
     if not medians_deg:
         return "No pair has a residual."
-    where = {
-        "input": "at the input's positions",
-        "optimum": "at the solver's optimum",
-        "output": "as delivered",
-    }
-    medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
-    return f"Angle between what the matches of a pair say and where its cameras stand; medians: {medians}."
+    where = {"input": " at the input's positions", "optimum": " at the solver's optimum"}
+    last = " as delivered" if len(medians_deg) > 1 else ""
+    medians = ", ".join(f"{value:.3g}°{where.get(state, last)}" for state, value in medians_deg.items())
+    return f"Angle between what the matches of a pair say and where its cameras stand; median: {medians}."
 
 
 def _tracks_note(points: DrawnPoints) -> str:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.facts.map_result import JoinedModel
+from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
@@ -19,6 +20,8 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
     placement, poses, points = found.placement, None, None
     if isinstance(found, LocateResult):
         poses, points = poses_of(found.images, [row.name for row in found.cameras]), found.reconstruction
+        if isinstance(found.options, MapOptions):  # a database has no positions, or those of sensors in rigs
+            poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
         if found.gauge.axes is not None:
             poses = replace(poses, rotations=poses.rotations @ found.gauge.axes.T)
     # NaN stands for the cameras that the certified optimum does not place.

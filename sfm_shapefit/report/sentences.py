@@ -67,7 +67,7 @@ def first_looks(drawing: Drawing, facts: Facts) -> list[Hint]:
     return [
         *_warnings(drawing, facts, {hint.camera for hint in cameras}),
         *cameras,
-        *_contradictions(drawing),
+        *_contradictions(drawing, is_told=any("of the pairs contradict" in text for text in facts.warnings)),
         *_loose(facts),
         *_unchecked(drawing),
     ]
@@ -107,10 +107,8 @@ def _certainty(drawing: Drawing, facts: Facts) -> Iterator[str]:
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     covers, _, relative = facts.sigma_of.removeprefix("adjusted: ").partition("; ")
     meaning = f" Uncertainties cover {covers}, {relative}." if covers else ""
-    yield (
-        f"The least certain position is that of {shorten(drawing.cameras.names[worst])}: "
-        f"± {drawing.cameras.sigmas[worst]:.2g} of {drawing.extent:.4g} units.{shorten(meaning)}"
-    )
+    who, sigma = shorten(drawing.cameras.names[worst]), drawing.cameras.sigmas[worst]
+    yield f"The least certain position is that of {who}: ± {sigma:.2g} units.{shorten(meaning)}"
 
 
 def _warnings(drawing: Drawing, facts: Facts, told: set[int | None]) -> Iterator[Hint]:
@@ -162,15 +160,15 @@ def _weak(drawing: Drawing, facts: Facts) -> Iterator[Hint]:
         yield Hint(text=f"{len(rows) - _MOST_WEAK:,} more are weak; the table of cameras says why")
 
 
-def _contradictions(drawing: Drawing) -> Iterator[Hint]:
+def _contradictions(drawing: Drawing, *, is_told: bool) -> Iterator[Hint]:
     """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
 
-    Pairs that are off by little, if by more than the others, come together in a sentence.
+    How many there are comes first, if that `is_told` by no warning; those that are off by little only count.
     """
     pairs = drawing.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
     far = pairs.residuals_deg[against] >= _FAR_DEG
-    if len(against):
+    if len(against) and not is_told:
         yield _set_aside(drawing, against)
     against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
@@ -187,7 +185,8 @@ def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
     """Say how many pairs contradict the placed cameras, by how much if it is little, and whose they are."""
     pairs, count = drawing.pairs, len(against)
     verb = "contradicts" if count == 1 else "contradict"
-    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed {drawing.noun}s"
+    judged = int(np.sum(pairs.classes != PairClass.NO_DIRECTION))
+    text = f"{count:,} of {judged:,} pairs {verb} the placed {drawing.noun}s"
     if np.isfinite(drawing.cameras.trust).any():
         text += f" and {_are(count)} set aside"
     largest = float(pairs.residuals_deg[against].max())

@@ -176,6 +176,26 @@ def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is
     assert "\x1b[1;33mverdict: look at 1 camera (a.jpg)" in colored
     assert colored.endswith("written to out/\nnext: colmap\n")
     assert "33m" not in shown(NO_COLOR="1")
+    narrow = re.sub("\x1b\\[[0-9]*m", "", shown(COLUMNS="20", NO_COLOR="1"))
+    assert narrow.endswith("look at 1 \ncamera (a.jpg)\nwritten to out/\nnext: colmap\n")
+
+
+def test_a_terminal_of_eighty_columns_has_a_usual_first_line_whole_and_never_breaks_a_command(monkeypatch):
+    first, step = (
+        "30 of 30 images placed, 20,937 points, mean reprojection error 0.40 px",
+        f"colmap {'x ' * 60}",
+    )
+    raw = io.BytesIO()
+    with monkeypatch.context() as patch:
+        patch.setenv("COLUMNS", "80")
+        patch.setenv("TERM", "xterm")
+        patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
+        console.print_answer(Telling([first]), "29.9 s")
+        console.print_ending("good", "good", "written to out/", step)
+        sys.stdout.flush()
+        lines = raw.getvalue().decode().splitlines()
+    assert lines[0] == f"{first}    29.9 s"
+    assert lines[-1].strip() == f"next: {step}".strip()
 
 
 def test_options_are_spelled_as_the_command_takes_them(monkeypatch, tmp_path):

@@ -57,7 +57,9 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path):
     wrong = drawing.pairs.cameras[drawing.pairs.classes == PairClass.CONTRADICTS]
     assert len(wrong) > 0
     assert (wrong == row).any(axis=1).all()
-    assert "locate" in banner(drawing, facts)["command"]
+    assert banner(drawing, facts)["command"].startswith(
+        "sfm-shapefit map "
+    )  # its model has that camera right
 
 
 def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):

@@ -97,7 +97,8 @@ def test_models_are_joined_in_the_world_of_the_first(tmp_path, adjust):
     # Points that both see are one, so that there are no more than in the whole scene.
     assert joined.num_points3D() <= 1.02 * WHOLE.num_points3D()
     assert joined.compute_mean_reprojection_error() < 0.1
-    assert (out / "report.html").is_file()
+    title = " + ".join(model.name for model in models)
+    assert f"<title>{title} " in (out / "report.html").read_text()
 
 
 def test_models_that_share_images_are_joined_without_a_database_and_whatever_their_ids():

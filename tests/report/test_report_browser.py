@@ -241,6 +241,13 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     facts.options["note"] = HOSTILE[1]
     write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
+    parts = driver.execute_script(
+        "return [...document.querySelectorAll('#cameras td.name span')].map((span) => span.textContent)"
+    )
+    assert len(parts) > len(HOSTILE)
+    assert all(
+        len(part.removesuffix("/").removesuffix(" ").split("/")) == 1 for part in parts
+    )  # lines break there
     for row in range(len(HOSTILE)):
         driver.execute_script(f"document.querySelector(\"#cameras tr[data-row='{row}']\").click()")
     driver.execute_script("document.querySelector('#pairs tbody tr').click()")

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.pipeline.locate import locate
+from sfm_shapefit.pipeline.map import map_database
+from sfm_shapefit.report.charts import residual_histogram
 from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.results import draw_result
 from tests.drawings import make_drawing
 from tests.program import run
-from tests.scenes import BUNDLED, FACADE
+from tests.scenes import BUNDLED, FACADE, RING
 
 
 def test_locate_writes_a_report_unless_told_otherwise(tmp_path):
@@ -25,6 +27,16 @@ def test_what_is_drawn_of_a_result_is_what_its_facts_count():
     assert int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS)) == facts.pairs["outlier"]
     assert np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).all()
     assert len(drawing.points.positions) > 0
+
+
+def test_map_is_not_compared_with_positions_that_no_database_has():
+    """Sensors of rigs stand apart in a database, by their offsets."""
+    found = map_database(RING / "database.db", points="never").models[0].located
+    given = np.random.default_rng(1).standard_normal(found.images.frames.centers.shape)
+    apart = replace(found.images, frames=replace(found.images.frames, centers=given))
+    drawing = draw_result(replace(found, images=apart))
+    assert input_centers(drawing) is None
+    assert "input" not in residual_histogram(drawing.pairs).counts
 
 
 def test_a_bare_graph_has_its_report_too(tmp_path):

@@ -22,9 +22,12 @@ const { cameras, pairs, points } = data;
 const numCameras = cameras.names.length;
 const numPairs = pairs.first.length;
 
+// Text breaks at blanks, a name after its folders, and elsewhere only where a part is very long.
+const breakable = (text) => text.split(/(?<=[/ ])/).flatMap((part) => [element("span", part, part.length < 25 ? "whole" : ""), element("wbr")]);
 const element = (tag, text = "", className = "") => {
   const made = document.createElement(tag);
-  if (text !== "") made.textContent = text;
+  if (tag === "td") made.append(...breakable(String(text)));
+  else if (text !== "") made.textContent = text;
   if (className) made.className = className;
   return made;
 };
@@ -49,7 +52,7 @@ const number = (value, digits = 3) => {
   if (size < 1e-3 || size >= 1e6) return value.toExponential(Math.max(digits - 1, 0));
   return Number(value.toPrecision(digits)).toString();
 };
-const count = (value) => value.toLocaleString("en");
+const count = (value) => value.toLocaleString("en", { maximumFractionDigits: 9 });
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const counted = (value, noun) => `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
 const reason = (code) => data.reasons[code];
@@ -66,7 +69,16 @@ const quantile = (values, share) => {
   return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : NaN;
 };
 const isKnown = (values) => values.some(Number.isFinite);
-const middleOfName = (name, most) => {
+// What all names begin with tells none from another.
+const [firstName, ...otherNames] = cameras.names;
+const numCommon = otherNames.reduce((most, name) => {
+  let k = 0;
+  while (k < most && name[k] === firstName[k]) k++;
+  return k;
+}, otherNames.length ? firstName.length : 0);
+const middleOfName = (whole, most) => {
+  if (whole.length <= most) return whole;
+  const name = numCommon > 1 ? `…${whole.slice(numCommon)}` : whole;
   if (name.length <= most) return name;
   const tail = Math.ceil(most * 0.6);
   return `${name.slice(0, most - tail - 1)}…${name.slice(-tail)}`;
