@@ -28,7 +28,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pairs.two_view_poses import TwoViewPoses, refine_two_view_poses
+from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
 from sfm_shapefit.scene.matches import RayMatches, View
 
 RelativeSource = Literal["matches", "stored"]
@@ -94,23 +94,30 @@ def estimate_relative_rotations(
 
 
 def refine_rough_rotations(
-    batch: RayMatches, rotations: FloatArray, sigma_rad: float, threads: int = 1
+    batch: RayMatches,
+    threads: int,
+    advance: Callable[[int], None],
+    *,
+    rotations: FloatArray,
+    sigma_rad: float,
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that fits its matches best, near a rough one.
 
     Args:
-        batch: rays in camera axes.
-        rotations: (k, 3, 3) cam_j_from_cam_i of its pairs.
+        batch, threads, advance: as of `estimate_relative_rotations`.
+        rotations: (n, 3, 3) of all images, cam_from_world.
         sigma_rad: standard deviation per axis of the rotation of each image.
-        threads: number of threads to share the pairs among.
     """
+    i, j = batch.pairs.T
+    rotations = rotations[j] @ rotations[i].transpose(0, 2, 1)
     turns = np.repeat(rotations, np.diff(batch.offsets), axis=0)
     normals = np.cross(np.einsum("mab,mb->ma", turns, batch.rays_i), batch.rays_j)
     products = np.append(normals[:, :, None] * normals[:, None, :], np.zeros((1, 3, 3)), axis=0)
     sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
     translations = np.linalg.eigh(sums)[1][:, :, 0]  # rays meet in planes with it
-    off_rad = _ROUGH_WIDTH * sigma_rad
-    return _relative(batch, refine_two_view_poses(batch, rotations, translations, threads, off_rad))
+    refined = _refine(batch, rotations, translations, threads, _ROUGH_WIDTH * sigma_rad)
+    advance(len(batch.pairs))
+    return refined
 
 
 def stored_relative_rotations(view: View, min_matches: int = 1) -> RelativeRotations:
@@ -175,13 +182,11 @@ def _estimate_slice(
     return concatenate_rotations(estimates).subset(np.argsort(np.concatenate(places)))
 
 
-def _refine(matches: RayMatches, rotations: FloatArray, translations: FloatArray) -> RelativeRotations:
-    """Return the relative rotations of pairs that fit all their matches best, near those given."""
-    return _relative(matches, refine_two_view_poses(matches, rotations, translations))
-
-
-def _relative(matches: RayMatches, poses: TwoViewPoses) -> RelativeRotations:
-    """Return what the poses of pairs say of their rotations."""
+def _refine(
+    matches: RayMatches, turns: FloatArray, shifts: FloatArray, threads: int = 1, off_rad: float = 0.0
+) -> RelativeRotations:
+    """Return the relative rotations of pairs that fit all their matches best, near those of a start."""
+    poses = refine_two_view_poses(matches, turns, shifts, threads, off_rad)
     return RelativeRotations(
         pairs=matches.pairs,
         rotations=poses.rotations,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import METRIC_SIGMA
+from sfm_shapefit.base.geometry import METRIC_SIGMA, normalized
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, observed_points, points2d_of
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
@@ -41,15 +41,16 @@ class TiedPieces(NamedTuple):
     names: tuple[str, ...]
     """Image of each camera, (v,)."""
     keypoints: IntArray
-    """(M, 2) points of the two pieces that the keypoints of a match observe, by their ids; -1 for none."""
+    """(M, 2) points of the two pieces that the keypoints of a match observe, by their ids; -1 for none, and
+    less for a camera of the piece, `_camera_id`."""
 
 
 class _Tie(NamedTuple):
     """The matches of one pair of cameras."""
 
-    cameras: tuple[int, int]
-    rays: tuple[FloatArray, FloatArray]
-    """(m, 3) each, in axes of the cameras."""
+    cameras: tuple[int, ...]
+    rays: tuple[FloatArray, ...]
+    """Two (m, 3), in axes of the cameras."""
     ids: IntArray
     """(m, 2)"""
     pixel_angle: float
@@ -86,6 +87,11 @@ def tie_pieces(pieces: Sequence[ModelPiece], matches: Matches | None, left_out: 
     return TiedPieces(seen.cameras, ties, seen.names, ids)
 
 
+def _camera_id(cameras: IntArray) -> IntArray:
+    """Return the ids of cameras where ids of points are expected, or the cameras with such ids."""
+    return -2 - cameras
+
+
 class _Seen:
     """The cameras of all pieces, by piece and then by name, and what their keypoints observe."""
 
@@ -94,6 +100,7 @@ class _Seen:
         own = [piece.model.images for piece in pieces]
         self.names = tuple(name for images in own for name in images.names)
         self.row = np.concatenate([np.arange(images.num_images) for images in own])
+        self.focal = np.concatenate([images.focal_lengths_px for images in own])
         self.cameras = PieceCameras(
             piece_of=np.repeat(np.arange(len(own)), [images.num_images for images in own]),
             rotations=np.concatenate([images.rotations for images in own]),
@@ -117,13 +124,15 @@ class _Seen:
     def points(self, cameras: IntArray, ids: IntArray) -> FloatArray:
         """Return the points (m, 3) of cameras' pieces by their ids; NaN for none."""
         found = np.full((len(ids), 3), np.nan)
+        is_camera = ids < -1
+        found[is_camera] = self.cameras.centers[_camera_id(ids[is_camera])]
         numbers = self.cameras.piece_of[cameras]
         for m in np.flatnonzero(ids >= 0).tolist():
             found[m] = self.pieces[numbers[m]].model.reconstruction.point3D(int(ids[m])).xyz
         return found
 
     def shared(self) -> Iterator[_Tie]:
-        """Yield a tie for each two cameras that are one image; its rays are those of observed keypoints."""
+        """Yield a tie for each two cameras that are one image, with what each of them sees of its piece."""
         for own in self.of_name.values():
             for second in range(1, len(own)):
                 for first in range(second):
@@ -132,26 +141,29 @@ class _Seen:
     def _shared(self, first: int, second: int) -> _Tie:
         rays, ids = [], []
         for place, v in enumerate((first, second)):
-            keypoints, points = self.observed[v]
-            pictures, row = self.pictures[self.cameras.piece_of[v]], int(self.row[v])
-            seen = pictures.rays(row, pictures.pixels(row, keypoints)) if len(keypoints) else np.zeros((0, 3))
-            rays.append(seen / np.linalg.norm(seen, axis=1, keepdims=True))
+            seen, points = self._sees(v)
+            rays.append(normalized(seen))
             column = np.full((len(points), 2), -1)
             column[:, place] = points
             ids.append(column)
         both, known = np.concatenate(rays), np.concatenate(ids)
         finite = np.isfinite(both).all(axis=1)
-        return _Tie(
-            (first, second), (both[finite], both[finite]), known[finite], self._angle(first, second), True
-        )
+        angle = 1.0 / float(min(self.focal[first], self.focal[second]))
+        return _Tie((first, second), (both[finite], both[finite]), known[finite], angle, True)
 
-    def _angle(self, first: int, second: int) -> float:
-        """Return the angle of a pixel of the wider of two lenses."""
-        focal = [
-            self.pieces[self.cameras.piece_of[v]].model.images.focal_lengths_px[self.row[v]]
-            for v in (first, second)
-        ]
-        return float(1.0 / min(focal))
+    def _sees(self, v: int) -> tuple[FloatArray, IntArray]:
+        """Return what a camera sees, in its axes, and ids: points or, with few, the other cameras.
+
+        Models without points have poses all the same, and one image is one camera in both.
+        """
+        keypoints, points = self.observed[v]
+        if len(keypoints) < _LEAST_MATCHES:
+            others = np.flatnonzero(self.cameras.piece_of == self.cameras.piece_of[v])
+            others = others[others != v]
+            away = self.cameras.centers[others] - self.cameras.centers[v]
+            return away @ self.cameras.rotations[v].T, _camera_id(others)
+        pictures, row = self.pictures[self.cameras.piece_of[v]], int(self.row[v])
+        return pictures.rays(row, pictures.pixels(row, keypoints)), points
 
     def matched(self, matches: Matches, left_out: PairNames) -> Iterator[_Tie]:
         """Yield the pairs of a database whose images no piece has both of."""
@@ -172,16 +184,11 @@ class _Seen:
                         for one in (v, w):
                             if one not in ids:
                                 ids[one] = self._by_keypoint(one, view.keypoints(i if one == v else j))
-                        found = np.stack(
-                            [ids[v][batch.keypoints[rows, 0]], ids[w][batch.keypoints[rows, 1]]], axis=1
-                        )
+                        seen = batch.keypoints[rows].T
+                        found, angle = np.stack([ids[v][seen[0]], ids[w][seen[1]]]), batch.pixel_angles[k]
                         rays = batch.rays_i[rows], batch.rays_j[rows]
-                        if piece_of[v] > piece_of[w]:
-                            yield _Tie(
-                                (w, v), rays[::-1], found[:, ::-1], float(batch.pixel_angles[k]), False
-                            )
-                        else:
-                            yield _Tie((v, w), rays, found, float(batch.pixel_angles[k]), False)
+                        way = -1 if piece_of[v] > piece_of[w] else 1
+                        yield _Tie((v, w)[::way], rays[::way], found[::way].T, float(angle), False)
 
     def _union(self) -> tuple[Images, IntArray]:
         """Return every image once, apart from all others, and labels that differ unless one piece has both.
@@ -190,16 +197,13 @@ class _Seen:
         """
         names = sorted(self.of_name)
         first = [self.of_name[name][0] for name in names]
-        lens_of = []
-        begins = np.cumsum([0, *(len(piece.model.images.lenses) for piece in self.pieces)])
-        lenses = [lens for piece in self.pieces for lens in piece.model.images.lenses]
-        for v in first:
-            number = int(self.cameras.piece_of[v])
-            lens_of.append(begins[number] + self.pieces[number].model.images.lens_of[self.row[v]])
-        used, lens_of_image = np.unique(lens_of, return_inverse=True)
-        example = self.pieces[0].model.images
+        own = [piece.model.images for piece in self.pieces]
+        begins = np.cumsum([0, *(len(images.lenses) for images in own)])
+        lenses = [lens for images in own for lens in images.lenses]
+        lens_of = np.concatenate([n + images.lens_of for n, images in zip(begins, own, strict=False)])
+        used, lens_of_image = np.unique(lens_of[first], return_inverse=True)
         images = replace(
-            example,
+            own[0],
             names=tuple(names),
             ids=np.arange(len(names)),
             frame_of=np.arange(len(names)),

@@ -126,18 +126,14 @@ def measure_rotations(
     sharing = sharing or Sharing()
     estimate = partial(estimate_relative_rotations, num_pairs=view.num_pairs)
     if view.num_pairs > MANY_PAIRS:
-        some = _estimate_here(view, min_matches, sharing, estimate, _all_but_some(view))
-        averaged = average_relative_rotations(
-            view.images.num_images, concatenate_rotations(some), sharing.threads
-        )
+        some = estimate_here(view, estimate, sharing, min_matches, without=_all_but_some(view))
+        averaged = average_relative_rotations(view.images.num_images, some, sharing.threads)
         known = np.where(averaged.registered[:, None, None], averaged.rotations, np.nan)
         estimate = partial(estimate_near, num_pairs=view.num_pairs, rotations=known)
     if sharing.executor is None:
-        parts = _estimate_here(view, min_matches, sharing, estimate)
-    else:
-        work = PairWork(estimate=estimate, min_matches=min_matches, matches_per_task=_MATCHES_PER_TASK)
-        parts = measure_with_workers(view, work, sharing.executor, sharing.advance)
-    return concatenate_rotations(parts)
+        return estimate_here(view, estimate, sharing, min_matches)
+    work = PairWork(estimate=estimate, min_matches=min_matches, matches_per_task=_MATCHES_PER_TASK)
+    return concatenate_rotations(measure_with_workers(view, work, sharing.executor, sharing.advance))
 
 
 def estimate_near(
@@ -182,14 +178,18 @@ def _all_but_some(view: View) -> IntArray:
     return np.delete(view.pairs, order[rank < _FIRST_PAIRS] // 2, axis=0)
 
 
-def _estimate_here(
+def estimate_here(
     view: View,
-    min_matches: int,
-    sharing: Sharing,
     estimate: Callable[..., RelativeRotations],
+    sharing: Sharing,
+    min_matches: int = LEAST_MATCHES,
+    *,
     without: IntArray | None = None,
-) -> list[RelativeRotations]:
-    """Return the relative rotations of each batch."""
+) -> RelativeRotations:
+    """Return the relative rotations of a view's pairs, but for some of them, by threads of this process.
+
+    `estimate` is called with a batch, the number of threads, and whom to tell of pairs that are done.
+    """
     parts, before, total = [], 0, view.num_pairs
     for batch in view.batches(min_matches, without):
 
@@ -200,4 +200,4 @@ def _estimate_here(
         before += len(batch.pairs)
     if without is None:
         sharing.advance(total, total)
-    return parts
+    return concatenate_rotations(parts)

@@ -7,13 +7,14 @@ tries all of them. Averaged, the rotations are as good as those of `map`, and go
 first placement finds lenses through which pairs turn otherwise, all of them are tried through these.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.warnings import rotation_warnings
@@ -23,13 +24,13 @@ from sfm_shapefit.pairs.essential import (
     estimate_relative_rotations,
     refine_rough_rotations,
 )
-from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.adjustment import turned_deg
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.first_placement import start_from_first
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.relative_rotations import Sharing, estimate_here
 from sfm_shapefit.pipeline.settle import settle
 from sfm_shapefit.placement.gauge import coincide
 from sfm_shapefit.rotations.average import average_relative_rotations
@@ -53,7 +54,7 @@ def settle_rough(
     if differ_in_rays(corrected.images, rough):
         source = source.at(rough.with_lenses(corrected.images.lenses))
         with clock("relative rotations"):
-            relative = _try_pairs(source, clock)
+            relative = _measure(source, clock)
         corrected = _averaged(source, relative, np.ones(len(relative.pairs), dtype=np.bool_), clock)
         given, corrected, first = start_from_first(given, corrected, options, clock, lenses="known")
     source = corrected
@@ -97,34 +98,31 @@ def measure_near(source: MatchSource, sigma_rad: float, clock: Clock) -> tuple[R
     Pairs of turned images are those of trials.
     """
     rotations = source.images.rotations
-    view = source.matches.at(source.images.apart(), source.inputs.left_out)
-    parts, share_out = [], partial(refine_rough_rotations, sigma_rad=sigma_rad, threads=clock.threads)
-    for batch in view.batches(LEAST_MATCHES):
-        i, j = batch.pairs.T
-        near = rotations[j] @ rotations[i].transpose(0, 2, 1)
-        parts.append((share_out(batch, near), near))
-    refined = concatenate_rotations([part for part, _ in parts])
+    refined = _measure(
+        source, clock, partial(refine_rough_rotations, rotations=rotations, sigma_rad=sigma_rad)
+    )
     if not len(refined.pairs):
         return refined, np.zeros(0, dtype=np.bool_)
-    off_deg = rotation_angles_deg(
-        refined.rotations.transpose(0, 2, 1) @ np.concatenate([near for _, near in parts])
-    )
-    fits = refined.are_sound() & (off_deg <= np.degrees(_NEAR * sigma_rad))
+    fits = refined.are_sound() & (refined.residuals_deg(rotations) <= np.degrees(_NEAR * sigma_rad))
     turned = _turned(refined, fits, source.images.num_images)[refined.pairs].any(axis=1)
     kept = np.flatnonzero(~turned)
-    both = concatenate_rotations([refined.subset(kept), _try_pairs(source, clock, refined.pairs[kept])])
-    believed = np.append(fits[kept], np.ones(len(both.pairs) - len(kept), dtype=np.bool_))
+    tried = _measure(source, clock, without=refined.pairs[kept])
+    both = concatenate_rotations([refined.subset(kept), tried])
+    believed = np.append(fits[kept], np.ones(len(tried.pairs), dtype=np.bool_))
     order = np.lexsort(both.pairs.T[::-1])
     return both.subset(order), believed[order]
 
 
-def _try_pairs(source: MatchSource, clock: Clock, without: IntArray | None = None) -> RelativeRotations:
-    """Return the relative rotations of pairs by trials, as `map` measures them, but for some of them."""
+def _measure(
+    source: MatchSource,
+    clock: Clock,
+    estimate: Callable[..., RelativeRotations] | None = None,
+    without: IntArray | None = None,
+) -> RelativeRotations:
+    """Return the relative rotations of pairs, but for some of them; by trials, as `map` does, if None."""
     view = source.matches.at(source.images.apart(), source.inputs.left_out)
-    batches = view.batches(LEAST_MATCHES, without=without)
-    return concatenate_rotations(
-        [estimate_relative_rotations(batch, clock.threads, num_pairs=view.num_pairs) for batch in batches]
-    )
+    estimate = estimate or partial(estimate_relative_rotations, num_pairs=view.num_pairs)
+    return estimate_here(view, estimate, Sharing(clock.threads, advance=clock.advance), without=without)
 
 
 def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Images:

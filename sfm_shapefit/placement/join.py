@@ -46,6 +46,7 @@ FEWEST_PAIRS = 3
 """Agreeing pairs that a join needs; a wrong one has two by chance, and two leave nothing to check it by."""
 _SHARED = 2  # pairs; an image that both pieces have knows its turn and its place
 _MOST_TURNS = 4  # turns between two pieces that are tried; bounds the time where single votes scatter
+_MOST_ALONE = 10  # pairs by each of which alone two pieces are placed; bounds the time where few are right
 _RIVAL_SHARE = 0.25  # share of the agreeing pairs; from as many rivals on nothing says which join is right
 _FEWEST_RIVALS = 2  # pairs that agree on another join, and are named; one always agrees with itself
 AGREEING_PX = 4.0
@@ -215,10 +216,33 @@ def _search(evidence: _Evidence, enough: int) -> _Joint:
             latest = _place(rest)
         except UnsolvableError:
             break
-        agrees = _agreeing(best.evidence, latest.standing)
-        if best.evidence.weigh(agrees) > best.evidence.weigh(best.agrees):
-            best = latest._replace(evidence=best.evidence, agrees=agrees)
+        best = _better(best, latest)
     return best
+
+
+def _search_alone(best: _Joint) -> _Joint:
+    """Place two pieces, of which too few pairs agree, by each pair alone, the soundest first."""
+    evidence = best.evidence
+    if evidence.cameras.num_pieces > 2:
+        return best
+    for pair in np.argsort(-evidence.votes.soundness, kind="stable")[:_MOST_ALONE].tolist():
+        if best.evidence.weigh(best.agrees) >= FEWEST_PAIRS:
+            break
+        try:
+            best = _better(
+                best, _place(evidence.part(evidence.numbers, np.arange(len(evidence.rows)) == pair))
+            )
+        except UnsolvableError:
+            continue
+    return best
+
+
+def _better(best: _Joint, other: _Joint) -> _Joint:
+    """Return of two joints of the same pieces the one with which more pairs of the first agree."""
+    agrees = _agreeing(best.evidence, other.standing)
+    if best.evidence.weigh(agrees) <= best.evidence.weigh(best.agrees):
+        return best
+    return other._replace(evidence=best.evidence, agrees=agrees)
 
 
 def _place(evidence: _Evidence) -> _Joint:
@@ -259,7 +283,7 @@ def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
     """Yield what comes of joining pieces to the first, by their numbers among all."""
     while True:
         try:
-            joint = _search(evidence, FEWEST_PAIRS)
+            joint = _search_alone(_search(evidence, FEWEST_PAIRS))
         except UnsolvableError as error:
             yield from ((k, str(error)) for k in evidence.numbers[1:].tolist() if evidence.touches(k))
             return
@@ -313,7 +337,8 @@ def _find_rivals(joint: _Joint) -> BoolArray:
             rival = _search(part, _FEWEST_RIVALS)
         except UnsolvableError:
             continue
-        if rival.evidence.weigh(rival.agrees) >= _FEWEST_RIVALS:
+        enough = rival.evidence.weigh(rival.agrees) >= _FEWEST_RIVALS
+        if enough and not _join_of(rival, 1, ~rival.agrees).reason:
             found[np.isin(evidence.rows, rival.evidence.rows[rival.agrees])] = True
     return found
 

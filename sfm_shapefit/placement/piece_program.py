@@ -199,7 +199,7 @@ class Residuals(NamedTuple):
         looks = np.einsum("rkl,rl->rk", first.turns, self.looks)
         across = normalized(targets - eyes)
         off = across - looks
-        rows = np.flatnonzero(np.isfinite(self.other_looks).all(axis=1))
+        rows = np.flatnonzero(np.isfinite(self.other_looks[:, 0]))
         others = np.einsum("rkl,rl->rk", second.turns[rows], self.other_looks[rows])
         planes = [np.linalg.norm(np.cross(across[rows], one), axis=1) for one in (looks[rows], others)]
         volume = np.vecdot(np.cross(looks[rows], others), across[rows])

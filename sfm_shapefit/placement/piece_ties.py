@@ -1,7 +1,8 @@
 """What ties pieces together: pairs of cameras of two pieces, the turns that they suggest, their directions.
 
 A piece is a model with a world of its own, of unknown scale, turn and place: y = s R x + t. An image that two
-pieces have is a camera of each, and the two are a pair, too: they stand at one place and look the same way.
+pieces have is a camera of each, and the two are a pair, too: they stand at one place and look the same way,
+so that each sees the points of the other's piece, or its cameras where it has no points.
 """
 
 from collections.abc import Iterator

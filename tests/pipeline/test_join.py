@@ -111,6 +111,19 @@ def test_models_that_share_images_are_joined_without_a_database_and_whatever_the
     assert found.reconstruction.num_points3D() <= 1.02 * WHOLE.num_points3D()
 
 
+def test_models_without_points_are_joined_by_the_images_that_they_share():
+    models = [piece(IDS[:6]), piece(IDS[3:], moved=True)]
+    for model in models:
+        for point in [*model.points3D]:
+            model.delete_point3D(point)
+    found = sfm_shapefit.join(models)
+    assert "3 by images that both have" in found.joins[0].statement
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-5))
+    models[1].frame(models[1].image(IDS[4]).frame_id).rig_from_world = pycolmap.Rigid3d()
+    found = sfm_shapefit.join(models)  # a wrong pose of one image, which tells no scale, is no rival
+    assert "2 of 3 pairs of images between them, 2 by images that both have" in found.joins[0].statement
+
+
 def test_keypoints_of_another_program_are_found_in_the_database_by_their_pixels():
     second = piece(IDS[4:], moved=True, compact=True)
     firsts = [model.find_image_with_name("0006.jpg").points2D[0].xy for model in (second, WHOLE)]

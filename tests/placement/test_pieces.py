@@ -48,9 +48,9 @@ class Drawn:
         self.is_metric = np.full(num_pieces, metric)
         self.pairs, self.rays, self.points, self.is_shared = [], [], [], []
 
-    def see(self, v, w, count=30, *, known=True, moved=None, turned=False):
+    def see(self, v, w, count=30, *, known=True, moved=None, turned=False, spread=1.0):
         """Let two cameras see the same points; `moved`: the second piece stands elsewhere for this pair."""
-        points = self.rng.normal(size=(count, 3))
+        points = spread * self.rng.normal(size=(count, 3))
         there = points if moved is None else invert(moved).apply(points)
         rays, own = [], []
         for end, at in ((v, points), (w, there)):
@@ -142,6 +142,22 @@ def test_wrong_pairs_do_not_pull_even_where_most_are_wrong():
         assert is_right(drawn, join)
         assert join.agreeing.tolist() == list(range(6))
         assert not len(join.rivals)
+
+
+def test_few_right_pairs_whose_turns_are_poorly_known_are_found_by_one_of_them_alone():
+    """Narrow pairs vote for no turn within degrees, and sound wrong ones each for another."""
+    for seed in range(3):
+        drawn = Drawn(seed)
+        for k in range(4):
+            drawn.see(k, NUM_CAMERAS + k, 10, spread=0.4)
+        for k in range(4):
+            turn = Rotation.random(random_state=100 * seed + k).as_matrix()
+            false = Similarity(scale=1.0, rotation=turn, translation=drawn.rng.normal(size=3))
+            drawn.see(k, NUM_CAMERAS + k, moved=false)
+        join = drawn.join()[1]
+        assert not join.reason
+        assert join.agreeing.tolist() == list(range(4))
+        assert drawn.off(join)[2] < 0.1
 
 
 def test_pieces_in_a_chain_each_have_their_scale():
