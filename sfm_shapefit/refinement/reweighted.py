@@ -40,6 +40,7 @@ from sfm_shapefit.solver.solve import solve
 POOR_SHARE = 0.7
 """Share of right pairs that the usual answer explains; from here on it is believed, since nothing gained."""
 _FEW = 0.35  # share of right pairs; answers that explain fewer are looked for among triangles too
+_FEW_OF_MOVED = 0.5  # likewise, where a consensus has moved cameras and pairs are not too many
 _FEWEST_NODES = 10  # nodes; the residuals of fewer say nothing of noise and shares
 _LEAST_REDUNDANCY = 2.0  # equations per unknown; with fewer any answer explains about half of the pairs
 _LEAST_WEIGHT = 1e-4  # relative weight of a pair that is certainly wrong; 0 would leave cameras loose
@@ -92,8 +93,8 @@ def solve_reweighted(
     search = _Search(measured, options, refine)
     mixture = fit_mixture(measured, usual)
     found = search.climb(usual, mixture)
-    few = (mixture if found is None else found.mixture).shares[0] < _FEW
-    if few or (found is not None and measured.graph.num_edges <= PAIRS_AT_SCALE):
+    few = _FEW if found is None or measured.graph.num_edges > PAIRS_AT_SCALE else _FEW_OF_MOVED
+    if (mixture if found is None else found.mixture).shares[0] < few:
         from_triangles = search.follow(weigh_by_triangles(measured.graph))
         if found is None or from_triangles.mixture.evidence > found.mixture.evidence:
             found = from_triangles
