@@ -12,8 +12,8 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.tracks.joining import number_trees, sampson_px
 
-# Between two slices Python can be interrupted: about 50 ms.
-_MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 1_000_000, 100_000
+# Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
+_MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 4_000_000, 100_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

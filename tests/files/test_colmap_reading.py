@@ -1,5 +1,6 @@
 """COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
 
+import contextlib
 import itertools
 import os
 import shutil
@@ -20,10 +21,11 @@ from sfm_shapefit.files.colmap.database import find_database, relative_poses
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.points import observed_points
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
-from tests.scenes import edit_database, fingerprint, real_scene, view_of
+from tests.scenes import COURTYARD, edit_database, fingerprint, real_scene, view_of
 
 EPS = np.finfo(np.float64).eps
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
@@ -862,3 +864,23 @@ def test_a_real_scene_is_read_in_well_under_ten_seconds():
     assert len(batch.pairs) == 378
     assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
     assert sum(np.sum(np.diff(batch.offsets) >= 15) for batch in own) == 273
+
+
+def test_images_observe_what_pycolmap_says():
+    model = read_model(COURTYARD / "truth")
+    assert len(model.observed) == model.images.num_images
+    for image_id, told in model.observed.items():
+        for of_file, of_pycolmap in zip(
+            told, observed_points(model.reconstruction.image(image_id)), strict=True
+        ):
+            np.testing.assert_array_equal(of_file, of_pycolmap)
+
+
+def test_rows_are_looked_up_in_the_order_of_their_ids(tmp_path):
+    rowids = np.random.default_rng(0).permutation(3 * sqlite_file._AT_ONCE // 2).tolist()
+    with contextlib.closing(sqlite3.connect(tmp_path / "database.db")) as written:
+        written.execute("CREATE TABLE squares (id INTEGER PRIMARY KEY, square INTEGER)")
+        written.executemany("INSERT INTO squares VALUES (?, ?)", ((k, k * k) for k in range(len(rowids))))
+        written.commit()
+    with contextlib.closing(sqlite_file.DatabaseFile(tmp_path / "database.db")) as file:
+        assert file.look_up("squares", "square", rowids) == [(k * k,) for k in rowids]

@@ -8,9 +8,11 @@ from multiprocessing import Pipe
 import pytest
 
 from sfm_shapefit.base import kernel_cache
+from sfm_shapefit.laplacian import cholesky
 from sfm_shapefit.pipeline import examples
 from sfm_shapefit.pipeline import warm_up as module
 from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED, WarmUp, compile_together, warm_up
+from sfm_shapefit.solver.splitting.anderson import Anderson
 from tests.program import run, run_python
 
 
@@ -21,6 +23,20 @@ def test_every_example_is_run():
         if python_inspect.isfunction(value) and value.__module__ == examples.__name__ and name[0] != "_"
     ]
     assert sorted(defined) == sorted(NEEDED + FURTHER)
+
+
+def test_examples_call_the_kernels_of_large_and_of_exact_graphs(tmp_path, monkeypatch):
+    called = set()
+
+    def hear(owner, name):
+        function = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *given: called.add(name) or function(*given))
+
+    hear(cholesky, "gemm")
+    hear(Anderson, "advance")
+    examples.solve_sparse(tmp_path)
+    examples.solve_by_splitting(tmp_path)
+    assert called == {"gemm", "advance"}
 
 
 def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
