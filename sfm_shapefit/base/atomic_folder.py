@@ -235,9 +235,11 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
         raise InputError(f"{folder} cannot be read ({error.strerror}); choose another folder") from error
     if is_empty:  # users of COLMAP make it first
         return
+    is_replaceable = any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER))
     if not overwrite:
-        raise InputError(f"{folder} exists already; choose another folder, or replace it (overwrite=True)")
-    if not any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
+        hint = ", or replace it (overwrite=True)" if is_replaceable else ""
+        raise InputError(f"{folder} exists already; choose another folder{hint}")
+    if not is_replaceable:
         raise InputError(
             f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; "
             "choose another folder"

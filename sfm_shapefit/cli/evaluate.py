@@ -117,7 +117,10 @@ def _evaluation_rows(errors: "Evaluation") -> list[Row]:
     ]
     return [
         Row("missing", errors.missing),
-        row("position error", f"{_describe(errors.position, smallest)}, of an extent of {errors.extent:.4g}"),
+        row(
+            "position error",
+            f"{_describe(errors.position, smallest)} (REF's units; it spans {errors.extent:.4g})",
+        ),
         row("rotation error", f"{_describe(errors.rotation_deg)} deg"),
         *_trajectory_rows(errors, smallest),
         Row("worst cameras", worst),

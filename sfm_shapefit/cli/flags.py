@@ -19,12 +19,7 @@ from sfm_shapefit.cli.root import convert_plainly
 Command = TypeVar("Command", bound=Callable[..., None])
 
 # COLMAP's own names for paths are accepted beside the positional ones.
-ModelArgument = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="MODEL", help="COLMAP model folder; for `locate` and `inspect` also transforms.json or TUM."
-    ),
-]
+ModelArgument = Annotated[Path | None, typer.Argument(metavar="MODEL", help="COLMAP model folder.")]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
 OutputPath = Annotated[Path | None, typer.Option("--output_path", hidden=True)]

@@ -31,7 +31,7 @@ _FLAGS = (
     "map",
     cls=GroupedCommand,
     short_help="Make models from the matches of a COLMAP database.",
-    epilog="Example: sfm-shapefit map database.db out --adjust full",
+    epilog="Example: sfm-shapefit map database.db out --images images",
 )
 @takes(flags_of(MapOptions, *_FLAGS), flags_of(OutputFlags), settings=MapOptions)
 def map_command(

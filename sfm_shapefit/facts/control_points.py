@@ -76,10 +76,11 @@ def control_warnings(
         there = np.isfinite(fit.residuals[:, 0])
         errors = np.where(there & ~known.is_check & ~fit.fitting, np.linalg.norm(fit.residuals, axis=1), 0.0)
         if errors.any():
-            worst = int(np.argmax(errors))
+            worst, count = int(np.argmax(errors)), int(np.sum(errors > 0.0))
+            say, most = ("contradicts", "") if count == 1 else ("contradict", " most")
             yield (
-                f"{int(np.sum(errors > 0.0))} of the control points contradict the others and set nothing, "
-                f"{known.names[worst]} most, which is {errors[worst]:.3g} off; check coordinates and marks"
+                f"{counted(count, 'control point')} {say} the others and set{'s' * (count == 1)} nothing: "
+                f"{known.names[worst]}{most}, {errors[worst]:.3g} off; check coordinates and marks"
             )
         lost = np.flatnonzero(~there)
         if len(lost):

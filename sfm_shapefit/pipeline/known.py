@@ -134,8 +134,8 @@ def _turn_upright(seeded: Seeded, gravity: Gravity) -> tuple[Seeded, list[str]]:
         worst = np.flatnonzero(wrong)[np.argsort(-off[wrong], kind="stable")]
         names = [images.names[members[own.indices[k]]] for k in worst[:_NAMED].tolist()]
         warnings.append(
-            f"the gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no "
-            f"part: above all those of {', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"
+            f"gravities of {len(worst)} of {len(wrong)} images contradict their rotations and have no part: "
+            f"{', '.join(names)}, by up to {np.degrees(off[worst[0]]):.0f} deg"
         )
     if seeded.gauge.axes is not None:
         return seeded, warnings

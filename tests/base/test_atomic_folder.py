@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import stat
 import sys
@@ -151,6 +152,10 @@ def test_an_existing_folder_is_refused_and_kept_and_one_that_came_into_being_mea
     advice = "exists already; choose another folder, or replace it (overwrite=True)"
     with pytest.raises(InputError, match=re.escape(advice)):
         check_output(out)
+    (tmp_path / "foreign" / "inner").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"exists already; choose another folder$"):  # never replaced
+        check_output(tmp_path / "foreign")
+    shutil.rmtree(tmp_path / "foreign")
     with pytest.raises(InputError, match="exists already"), atomic_folder(out):
         pytest.fail("the block must not run")
     assert (out / "old.bin").read_bytes() == b"old"

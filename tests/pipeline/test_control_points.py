@@ -75,7 +75,7 @@ def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp
     np.testing.assert_allclose(rows["P4"]["residual"], [0.0, 0.0, -1.0], atol=1e-3)
     assert rows["P0"]["num_agreeing_marks"] == rows["P0"]["num_marks"] - 1 == 7
     said = " ".join(found.warnings)
-    assert "1 of the control points contradict the others and set nothing, P4 most, which is 1 off" in said
+    assert "1 control point contradicts the others and sets nothing: P4, 1 off; check" in said
     assert "1 mark of control points miss where the others put the point, that of P0 in" in said
 
 

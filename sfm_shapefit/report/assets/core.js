@@ -26,7 +26,7 @@ const numPairs = pairs.first.length;
 const breakable = (text) => text.split(/(?<=[/ ])/).flatMap((part) => [element("span", part, part.length < 25 ? "whole" : ""), element("wbr")]);
 const element = (tag, text = "", className = "") => {
   const made = document.createElement(tag);
-  if (tag === "td") made.append(...breakable(String(text)));
+  if (tag === "td" && text !== "") made.append(...breakable(String(text)));
   else if (text !== "") made.textContent = text;
   if (className) made.className = className;
   return made;
