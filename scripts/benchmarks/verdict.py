@@ -6,11 +6,16 @@ then bundle adjusted. They are judged as models of any program (`check`), each b
 made of the same database. A ring that looks alike from two sides has a block of cameras on the wrong one,
 where false pairs put it, or a third of it is folded over; points are triangulated again. And one image gets
 a wrong lens of its own, or a third of them one that they share, of which `locate` is not told: it may find
-it, and its model is right then. All are judged unspoiled, too.
+it, and its model is right then. All are judged unspoiled, too. And `map` is given databases where a few
+pairs, drawn at random, are all that is left between two halves of the images: a wrong model is not to be
+called good, nor a right one doubted.
 """
 
 import argparse
+import shutil
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -32,6 +37,7 @@ from sfm_shapefit.synthetic import scenes as synthetic_scenes
 from sfm_shapefit.synthetic.layouts import lay_out_scene
 
 BUNDLED = ROOT / "data_synthetic"
+CUT_REAL = ("castle-P19", "castle-P30")
 REAL = ("fountain-P11", "Herz-Jesus-P25", "castle-P30")
 DRAWN = {
     "drawn ring": {"shape": "ring", "num_images": 24, "num_points": 1500},
@@ -46,6 +52,8 @@ SINGLES = ("one moved 5 %", "one turned 3 deg")
 ALL_LENSES = ("lenses x 0.8", "lenses x 1.1", "lenses x 1.3")
 ONE_LENS, SHARED_LENS = (0.67, 0.77, 0.91, 1.1, 1.3), (0.77, 1.1)
 """Factors on the focal length of one image, and of the lens of a third of them."""
+CUTS = ((2, range(8)), (3, range(8)), (5, range(4)))
+"""Pairs that are left between the halves of a scene, and seeds of which."""
 MOST_OFF = 0.03
 """Share of the extent by which cameras are off at most in a model that is right."""
 MOST_OTHERS = 0.1
@@ -74,7 +82,48 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     for name in REAL:
         scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
         found[name] = partial(judge_scene, name, scene) if scene.model.is_dir() else NOT_FOUND
+    found["cut courtyard"] = partial(judge_cuts, "cut courtyard", bundled["courtyard"])
+    for name in CUT_REAL:
+        scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
+        found[f"cut {name}"] = (
+            partial(judge_cuts, f"cut {name}", scene) if scene.model.is_dir() else NOT_FOUND
+        )
     return found
+
+
+def judge_cuts(name: str, scene: Scene) -> list[Row]:
+    """Judge what `map` makes of a database with few pairs between the halves of its images, by name."""
+    truth, rows = pycolmap.Reconstruction(scene.model), []
+    names = sorted(truth.image(k).name for k in truth.reg_image_ids())
+    for num, seeds in CUTS:
+        for seed in seeds:
+            with TemporaryDirectory() as folder:
+                database = Path(folder) / "database.db"
+                shutil.copy(scene.database, database)
+                cut(database, set(names[: len(names) // 2]), num, seed)
+                found = sfm_shapefit.map_database(database)
+            compared = sfm_shapefit.evaluate(found.reconstruction, truth)
+            off, is_whole = compared.position.max / compared.extent, len(compared.names) == len(names)
+            state = "wrong" if off > MOST_OFF else "right" if is_whole else "a part"
+            row = tell(name, f"{num} pairs left, {seed}: {state}", found.verdict, set(), set(), off)
+            rows.append(replace(row, checks=at_most(good=(int(row["good"]), 0 if off > MOST_OFF else None))))
+    return rows
+
+
+def cut(database: Path, half: Set[str], num_left: int, seed: int) -> None:
+    """Delete all pairs between a half of the images, by name, and the others but a few that share matches."""
+    with closing(sqlite3.connect(database)) as connection, connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        pairs = connection.execute(
+            "SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id"
+        ).fetchall()
+        ends = {pair: pycolmap.pair_id_to_image_pair(pair) for pair, _ in pairs}
+        across = [row for row in pairs if len({names[k] in half for k in ends[row[0]]}) == 2]
+        usable = [pair for pair, count in across if count >= 15]
+        left = {usable[k] for k in np.random.default_rng(seed).permutation(len(usable))[:num_left]}
+        gone = [(pair,) for pair, _ in across if pair not in left]
+        for table in ("two_view_geometries", "matches"):
+            connection.executemany(f"DELETE FROM {table} WHERE pair_id = ?", gone)
 
 
 def judge_drawn(name: str) -> list[Row]:
@@ -155,7 +204,7 @@ def look(model: pycolmap.Reconstruction, scene: Scene) -> tuple[ModelVerdict, se
     """Return the verdict on a model as it stands, and the members of groups that it names as such."""
     facts = sfm_shapefit.check(model, scene.database, second_opinion=map_of(scene.database)).facts
     told = facts.evidence
-    apart = {name for seam in told.seams for name in seam.images}
+    apart = {name for group in told.apart for name in group}
     if told.second and len(told.second.wrong) > 1:
         apart = apart.intersection(facts.verdict.cameras).union(told.second.wrong)
     return facts.verdict, apart
@@ -319,6 +368,9 @@ def summarize(rows: Sequence[Row]) -> Iterator[str]:
         "all lenses, adjusted": ALL_LENSES.__contains__,
         "one lens, locate": lambda how: how.startswith("one lens"),
         "a third's lens, locate": lambda how: how.startswith("third"),
+        "few pairs left, map: wrong": lambda how: how.endswith(": wrong"),
+        "few pairs left, map: right": lambda how: how.endswith(": right"),
+        "few pairs left, map: a part": lambda how: how.endswith(": a part"),
     }
     lines = []
     for family, belongs in families.items():

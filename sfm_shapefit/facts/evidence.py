@@ -86,6 +86,27 @@ class GroupApart(Record):
         )
 
 
+class UntiedGroup(Record):
+    """A group of cameras that so little ties to the rest that nothing checks how it stands to it."""
+
+    images: Annotated[tuple[str, ...], "Names of its members."]
+    num_agreeing: Annotated[int, "Pairs between it and the rest that agree."]
+    num_contradicting: Annotated[int, "Pairs between it and the rest that contradict."]
+    num_points: Annotated[int, "Points of three images or more that both see, and that fit."]
+    is_loose: Annotated[bool, "Whether these do not even say how it stands to the rest."]
+
+    @property
+    def statement(self) -> str:
+        """The same in a sentence."""
+        does = "says" if self.is_loose else "checks"
+        agree = f"{counted(self.num_agreeing, 'pair')} and {counted(self.num_points, 'point')}"
+        return (
+            f"nothing {does} how {len(self.images)} cameras ({first_of(list(self.images))}) stand to the "
+            f"rest: {agree} between them agree, {counted(self.num_contradicting, 'pair')} contradict; match "
+            "more images across"
+        )
+
+
 class ToldOpinion(Record):
     """How the model compares with another one of the same matches, which took nothing of it."""
 
@@ -128,8 +149,14 @@ class ToldEvidence(Record):
     lenses: Annotated[tuple[ContradictedLens, ...], "Lenses whose images ask for another focal length."] = ()
     places: Annotated[tuple[AmbiguousPlace, ...], "Cameras that two sets of pairs put at two places."] = ()
     seams: Annotated[tuple[GroupApart, ...], "Groups of cameras that stand apart from the rest."] = ()
+    untied: Annotated[tuple[UntiedGroup, ...], "Groups of cameras that little ties to the rest."] = ()
     contradicted: Annotated[tuple[str, ...], "Images that many pairs contradict, and no points confirm."] = ()
     second: Annotated[ToldOpinion | None, "How another model of the same matches compares."] = None
+
+    @property
+    def apart(self) -> list[tuple[str, ...]]:
+        """The members of each group that stands apart, or that little ties to the rest."""
+        return [*(seam.images for seam in self.seams), *(group.images for group in self.untied)]
 
     @property
     def statements(self) -> list[str]:
@@ -137,7 +164,14 @@ class ToldEvidence(Record):
         seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
         lenses, second = (told.statement for told in self.lenses), self.second
         differs = second is not None and (second.wrong or second.undecided or second.ambiguous)
-        told = [*seams, *places, *lenses, *([second.statement] if second is not None and differs else [])]
+        untied = (told.statement for told in self.untied)
+        told = [
+            *seams,
+            *untied,
+            *places,
+            *lenses,
+            *([second.statement] if second is not None and differs else []),
+        ]
         if self.contradicted:
             told.append(
                 f"{_cameras(self.contradicted)} where many pairs contradict, and no points confirm it"
@@ -176,6 +210,16 @@ def tell_evidence(
                 turn_deg=seam.turn_deg,
             )
             for seam in evidence.seams
+        ),
+        untied=tuple(
+            UntiedGroup(
+                images=tuple(images.names[k] for k in group.cameras.tolist()),
+                num_agreeing=group.num_agreeing,
+                num_contradicting=group.num_contradicting,
+                num_points=group.num_points,
+                is_loose=group.is_loose,
+            )
+            for group in evidence.untied
         ),
         contradicted=tuple(images.names[one.camera] for one in evidence.contradicted),
         second=None if evidence.second is None else _tell_opinion(evidence.second, images),

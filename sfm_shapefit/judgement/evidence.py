@@ -17,7 +17,8 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
-from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts
+from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images
@@ -95,10 +96,11 @@ class PairFits:
         rows = edges[parallel_rigid_pieces(count, edges, 3) == 0] if len(edges) else edges
         return np.asarray(np.isin(frame_of, rows) & np.isfinite(self.centers).all(axis=1))
 
-    def cuts(self, held: BoolArray) -> tuple[Cut, ...]:
-        """Return the groups that contradictions cut off; `held` are the cameras (n,) of one rigid piece."""
+    @property
+    def sides(self) -> tuple[IntArray, IntArray]:
+        """Pairs of cameras that agree (a, 2), and that contradict (b, 2)."""
         pairs = self.directions.pairs
-        return find_cuts(pairs[self.agrees], pairs[self.contradicts], held)
+        return pairs[self.agrees], pairs[self.contradicts]
 
 
 def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
@@ -159,7 +161,9 @@ class ModelEvidence:
     """By rows of the images."""
     contradicted: tuple[Contradicted, ...] = ()
     """By rows of the images; those that the pixels confirm are not among them."""
+    untied: tuple[Untied, ...] = ()
+    """By rows of the images; those that stand apart are not among them."""
     num_held: int | None = None
-    """Cameras of the largest rigid piece of pairs that agree, and points that fit; None without pairs."""
+    """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""

@@ -7,11 +7,11 @@ correlation clustering with a weight of 1 for each pair that agrees, and of -1 f
 
 Pairs of repeated structure contradict in numbers, too. A cut is a seam
 
-    untied   if the pairs that agree leave the group loose: it is in no rigid piece with the rest
+    untied   if neither pairs nor points tie most of the group to what most of the rest is in (`ties`)
     turned   else, if more than a tenth of the contradictions, and five, agree on one turn of the group, by
              the relative rotations that their matches have by themselves: Q = R_j^T R_ij R_i, i outside, j in
-             the group. Where they agree on none, the rotations are right and the group is shifted or scaled;
-             moving things make pairs say so, too, so that hardly any pair across may agree then
+             the group. Where they agree on none, the rotations are right and the group is shifted or scaled,
+             but moving things make pairs say so, too
 
 castle-P19 and P30 have a cut from repeated walls, with 48 and 103 contradictions of which hardly any agree
 on a turn; at lego100, five cameras whose contradictions do are wrong. `scripts/results/verdict.md` has groups
@@ -22,18 +22,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.scene.points import Points
 
 _SMALLEST_GROUP = 2  # cameras; a single one is no group, and has tests of its own
 _FEWEST_CONTRADICTING = 5  # pairs across a cut, and pairs on one turn; fewer are chance
 _OUTNUMBERED = 2.0  # contradicting pairs over agreeing ones across a cut; it was 3 or more in wrong models
 _LEAST_ON_ONE_TURN = 0.1  # share of the contradictions with a rotation that agree on one turn; see the header
-_BY_CHANCE = 0.1  # agreeing pairs over contradicting ones across a group that is shifted; chance makes a few
-_FEWEST_POINTS = 15  # points across a cut that fit; fewer are chance
 _ALIKE_DEG = 3.0  # degrees between turns that agree; a single pair knows its rotation to about one
 _MOST_TURNS = 300  # turns across one cut that are compared, evenly taken; the time grows with the square
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
@@ -49,9 +46,7 @@ class Cut(NamedTuple):
     contradicting: IntArray
     """(m, 2) pairs across that contradict."""
     is_tied: bool
-    """Whether the agreeing pairs hold most of the group in one rigid piece with the rest."""
-    is_seen: bool = False
-    """Whether points that fit tie it to the rest."""
+    """Whether pairs or points tie most of the group to what most of the rest is in."""
 
 
 class Seam(NamedTuple):
@@ -69,15 +64,15 @@ class Seam(NamedTuple):
     """Angle of that turn; NaN without any."""
 
 
-def find_cuts(agreeing: IntArray, contradicting: IntArray, held: BoolArray) -> tuple[Cut, ...]:
+def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> tuple[Cut, ...]:
     """Return the groups of cameras that contradictions cut off, the largest first.
 
     Args:
         agreeing: (k, 2) pairs of cameras that agree with the model.
         contradicting: (m, 2) pairs that contradict it, by their direction or by their rotation.
-        held: (n,) cameras of the largest rigid piece; those without a pair are in no group.
+        group: (n,) what cameras are tied to, by pairs and points; those without a pair are in no cut.
     """
-    count = len(held)
+    count = len(group)
     pairs = np.concatenate([agreeing, contradicting])
     weights = np.repeat([1.0, -1.0], [len(agreeing), len(contradicting)])
     bodies = _moved(find_bodies(count, pairs, weights), pairs, weights)
@@ -90,23 +85,9 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, held: BoolArray) -> t
         inside = bodies == body
         across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
         if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > _OUTNUMBERED * len(across[0]):
-            is_tied = 2 * np.sum(held & inside) > sizes[body]
-            cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], bool(is_tied)))
+            is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
+            cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], is_tied))
     return tuple(cuts)
-
-
-def tied_by_points(cut: Cut, points: Points, fits: BoolArray, count: int) -> Cut:
-    """Return a cut of so many cameras that says whether points tie it, by observations (o,) that fit or not.
-
-    A point speaks if three images see it, some of them on either side of the cut.
-    """
-    inside = np.isin(np.arange(count), cut.cameras)[points.images]
-    inner = np.diff(np.append(0, np.cumsum(inside))[points.offsets])
-    lengths = points.lengths()
-    across = (lengths > 2) & (inner > 0) & (inner < lengths)
-    fitting = np.diff(np.append(0, np.cumsum(fits))[points.offsets]) == lengths
-    num = int(np.sum(across & fitting))
-    return cut._replace(is_seen=num >= max(_FEWEST_POINTS, _OUTNUMBERED * (int(across.sum()) - num)))
 
 
 def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: FloatArray) -> tuple[Seam, ...]:
@@ -129,10 +110,14 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         share = num_turned / max(len(rows), 1)
         num = len(cut.contradicting)
         is_turned = num_turned >= _FEWEST_CONTRADICTING and share > _LEAST_ON_ONE_TURN
-        is_shifted = not cut.is_seen and cut.num_agreeing <= _BY_CHANCE * num
-        if (is_turned and (turn_deg > _ALIKE_DEG or is_shifted)) or not (cut.is_tied or cut.is_seen):
+        if (is_turned and turn_deg > _ALIKE_DEG) or not cut.is_tied:
             seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
     return tuple(seams)
+
+
+def _most_frequent(values: IntArray) -> int:
+    """Return the value that occurs most often, the smallest of equals."""
+    return int(np.argmax(np.bincount(values)))
 
 
 def _moved(bodies: IntArray, pairs: IntArray, weights: FloatArray) -> IntArray:

@@ -110,4 +110,5 @@ def _count(found: LocateResult) -> int:
     """Return the number of lenses and cameras that evidence names, and of cameras that are left out."""
     evidence, left_out = found.evidence, int(np.sum(~found.kept))
     apart = sum(len(seam.cameras) for seam in evidence.seams)
+    apart += sum(len(group.cameras) for group in evidence.untied)
     return len(evidence.lenses) + left_out + len(evidence.places) + apart

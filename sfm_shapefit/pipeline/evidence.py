@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
-from sfm_shapefit.judgement.grade import LEAST_HELD
-from sfm_shapefit.judgement.seams import Cut, Seam, find_seams, tied_by_points
+from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts, find_seams
+from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs
 from sfm_shapefit.judgement.witnesses import FITTING_PX, are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
@@ -15,8 +15,6 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
-
-_MOST_POINTS = 40  # points per image that are asked what they hold; a few of each suffice
 
 _MOST_ASKED = 200  # images of a lens that are left out; each takes 1.4 ms, and a median of so many is exact
 
@@ -51,24 +49,19 @@ def gather_evidence(
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
     if fits is None:
         return ModelEvidence(lenses=lenses)
-    held = fits.held(images)
-    cuts, num_held = fits.cuts(held), int(held.sum())
-    if cuts or num_held < LEAST_HELD * images.num_images:
-        fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
-        cuts = tuple(tied_by_points(cut, points, fitting, images.num_images) for cut in cuts)
-        if num_held < LEAST_HELD * images.num_images:
-            step = max(points.num_points // (_MOST_POINTS * images.num_images), 1)
-            some = points.taken(fitting & (points.points_seen() % step == 0))
-            num_held = max(num_held, int(fits.held(images, some).sum()))
+    tied, untied = _tie(source, fits, structure)
+    seams = _question_cuts(source, find_cuts(*fits.sides, tied), threads)
+    apart = [camera for seam in seams for camera in seam.cameras.tolist()]
     contradicted = fits.contradicted(images)
     doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
     sure = ask_pixels(source, structure, doubted)
     return ModelEvidence(
         lenses=lenses,
         places=fits.other_places(),
-        seams=_question_cuts(source, cuts, threads),
+        seams=seams,
         contradicted=tuple(one for one in contradicted if not sure[one.camera]),
-        num_held=num_held,
+        untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
+        num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)),
     )
 
 
@@ -96,6 +89,30 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) ->
         return np.zeros_like(doubted)
     links = list(view.links(without=view.pairs[~doubted[view.pairs].any(axis=1)]))
     return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
+
+
+def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[IntArray, tuple[Untied, ...]]:
+    """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
+
+    Frames move as one, and what is fixed stays. Where too few points are known for that, what pairs and
+    points hold is one, and no group is named.
+    """
+    points, images, pictures = structure[:3]
+    frames = images.frame_of
+    fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
+    rays = Rays(points.points_seen(), frames[points.images], fitting)
+    pairs = links_of_pairs(*(frames[side] for side in fits.sides))
+    fixed = np.zeros(0, dtype=np.int64) if source.fixed is None else np.unique(frames[source.fixed])
+    known = [np.column_stack([fixed[step:], fixed[:-step]]) for step in (1, 2)]  # a rigid strip
+    tied, groups = find_groups(len(images.frames.ids), rays, pairs, np.concatenate(known))
+    posed = np.unique(frames[images.is_posed])
+    if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
+        held = fits.held(images)
+        if 2 * held.sum() < images.is_posed.sum():
+            held = fits.held(images, points.taken(fitting))
+        return np.where(held, 0, 1 + frames), ()
+    images_of = (np.flatnonzero(np.isin(frames, group.cameras)) for group in groups)
+    return tied[frames], tuple(map(lambda group, rows: group._replace(cameras=rows), groups, images_of))
 
 
 def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:

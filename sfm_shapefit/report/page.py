@@ -201,9 +201,9 @@ def _doubts(drawing: Drawing, facts: Facts, order: IntArray, display: _Display) 
     evidence = facts.evidence if isinstance(facts, FactsOfModel) else ToldEvidence()
     row_of = {name: k for k, name in enumerate(drawing.cameras.names)}
     groups = np.full(len(row_of), -1)
-    groups[[row_of[name] for name in getattr(evidence.second, "wrong", ())]] = len(evidence.seams)
-    for k in sorted(range(len(evidence.seams)), key=lambda k: -len(evidence.seams[k].images)):
-        groups[[row_of[name] for name in evidence.seams[k].images]] = k  # the smallest wins
+    groups[[row_of[name] for name in getattr(evidence.second, "wrong", ())]] = len(evidence.apart)
+    for k, names in sorted(enumerate(evidence.apart), key=lambda one: -len(one[1])):
+        groups[[row_of[name] for name in names]] = k  # the smallest wins
     others, counts = np.full((len(row_of), 3), np.nan), np.zeros((len(row_of), 2))
     for place in evidence.places:
         row = row_of[place.image]

@@ -11,6 +11,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
@@ -151,6 +152,17 @@ def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(fo
     verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.DO_NOT_USE, (names[1], names[2]))
     assert verdict.reasons == ("2 of 8 cameras stand apart from the rest",)
+
+
+def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
+    names = found.images.names
+    for is_loose, grade, reason in (
+        (True, Grade.DO_NOT_USE, "2 of 8 cameras stand apart from the rest"),
+        (False, Grade.LOOK, "nothing checks how groups of cameras stand to one another"),
+    ):
+        group = Untied(np.array([1, 2]), 1, 2, 0, is_loose)
+        verdict = altered(found, evidence=ModelEvidence(untied=(group,))).verdict
+        assert (verdict.grade, verdict.cameras, verdict.reasons) == (grade, (names[1], names[2]), (reason,))
 
 
 def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is_looked_at(found):

@@ -7,6 +7,7 @@ import pytest
 
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.judgement.seams import find_cuts
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.scene.images import Frames
 from sfm_shapefit.scene.points import Points
@@ -128,7 +129,7 @@ def test_a_shifted_group_is_cut_and_a_moved_camera_has_its_other_place(centers):
     moved = centers.copy()
     moved[GROUP] += [0.0, 3.0, 0.0]
     fits = fit_pairs(moved, measured(centers))
-    (cut,) = fits.cuts(fits.held(each_alone(moved)))
+    (cut,) = find_cuts(*fits.sides, ~fits.held(each_alone(moved)) * np.arange(1, N + 1))
     assert cut.cameras.tolist() == GROUP.tolist()
     moved = centers.copy()
     moved[5] += [0.0, 3.0, 0.0]

@@ -9,7 +9,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.pipeline import evidence
 from sfm_shapefit.pipeline.check import check
-from tests.scenes import COURTYARD, RING
+from tests.scenes import COURTYARD, RING, copied, edit_database
 
 
 def with_own_lenses(source, factors):
@@ -98,6 +98,29 @@ def test_a_group_that_is_moved_as_a_whole_is_named_and_the_model_not_to_be_used(
     assert facts.verdict.grade is Grade.DO_NOT_USE
     assert any("stand apart from the rest" in reason for reason in facts.verdict.reasons)
     assert any("cameras stand apart from the rest (" in warning for warning in facts.warnings)
+
+
+def cut(folder, *kept):
+    """The courtyard's database with few pairs between the first twelve images and the others."""
+    pair, rows = 2147483647, ", ".join(str(pycolmap.image_pair_to_pair_id(*ends)) for ends in kept)
+    across = f"pair_id / {pair} <= 12 AND pair_id % {pair} > 12 AND pair_id NOT IN ({rows})"
+    database = copied(COURTYARD, folder) / "database.db"
+    return edit_database(
+        database, *(f"DELETE FROM {table} WHERE {across}" for table in ("matches", "two_view_geometries"))
+    )
+
+
+def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected_and_no_point_crosses(
+    tmp_path,
+):
+    wrong = sfm_shapefit.map_database(cut(tmp_path / "wrong", (5, 21), (10, 13)))  # 6.6 % of the extent off
+    (told,) = wrong.models[0].located.told_evidence.untied
+    assert told.images == tuple(f"{k:04d}.jpg" for k in range(1, 13))
+    assert (told.num_agreeing, told.num_points, told.is_loose) == (1, 0, True)
+    assert told.statement in wrong.models[0].located.warnings
+    assert wrong.verdict.grade is Grade.DO_NOT_USE
+    right = sfm_shapefit.map_database(cut(tmp_path / "right", (4, 25), (5, 24)))
+    assert right.verdict.grade is Grade.GOOD
 
 
 def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path):

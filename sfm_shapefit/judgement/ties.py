@@ -1,0 +1,220 @@
+"""Ties: what crosses between two groups of cameras and fits, and whether it checks how they stand.
+
+Groups that are each sound stand to one another by a similarity of seven unknowns, so that whatever little
+crosses between them determines it, and fits: it is no evidence. Cameras are a group if they are one rigid
+piece by the points that two of them share, which three images see: as many as no chance makes, and twice as
+many as miss. Two groups are one if more crosses than seven unknowns explain,
+
+    points   so many again, also without those of any one camera of either side
+    pairs    that agree, three of them, and two without any one camera, half of those that contradict or more
+
+since a single camera that stands in two groups tells nothing of the scale of the one in the other.
+
+A group that remains by itself is held by few pairs and points, or by none: pairs that an adjustment believed
+may be rejected since. A pair that agrees says five things (its rotation, its direction), a point at least
+two, where more than chance fit. A group with seven of these or more is unchecked; with fewer, or if one
+camera has them all, it is loose: nothing says how it stands.
+`scripts/results/verdict.md` has halves of scenes that few pairs tie.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
+
+# NodeLinks that fit, those of them without any one camera, and how many may miss for each; see the header.
+_BY_POINTS, _BY_PAIRS = (15, 15, 0.5), (3, 2, 2.0)
+_MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
+_UNKNOWNS = 7  # numbers; turn, shift and scale: fewer facts leave some of them open
+_PAIR_SAYS, _POINT_SAYS = 5, 2  # numbers; see the header
+
+
+class Untied(NamedTuple):
+    """A group of cameras that so little ties to the rest that nothing checks it."""
+
+    cameras: IntArray
+    """Their rows, ascending."""
+    num_agreeing: int
+    """Pairs between it and the rest that agree."""
+    num_contradicting: int
+    """Pairs between it and the rest that contradict."""
+    num_points: int
+    """Points of three images or more between it and the rest that fit."""
+    is_loose: bool
+    """Whether nothing says how it stands to the rest."""
+
+
+class NodeLinks(NamedTuple):
+    """What links two nodes, which are cameras, or frames: points, or pairs of images."""
+
+    ids: IntArray
+    """(k,) which point or pair it is; a point links each two nodes that see it."""
+    ends: IntArray
+    """(k, 2) its two nodes."""
+    fits: BoolArray
+    """(k,) whether it agrees with where these stand."""
+
+    def taken(self, chosen: BoolArray) -> "NodeLinks":
+        """Return some of them (k,)."""
+        return NodeLinks(self.ids[chosen], self.ends[chosen], self.fits[chosen])
+
+    @property
+    def number(self) -> int:
+        """How many points or pairs they are."""
+        return len(np.unique(self.ids))
+
+
+class Rays(NamedTuple):
+    """Which nodes see which points."""
+
+    points: IntArray
+    """(r,) ascending."""
+    nodes: IntArray
+    """(r,)"""
+    fits: BoolArray
+    """(r,) whether the observation fits."""
+
+    def taken(self, chosen: BoolArray) -> "Rays":
+        """Return some of them (r,)."""
+        return Rays(self.points[chosen], self.nodes[chosen], self.fits[chosen])
+
+    def links(self) -> NodeLinks:
+        """Return a link for each two rays of a point."""
+        ids, ends, fits = [self.points[:0]], [np.zeros((0, 2), dtype=np.int64)], [self.fits[:0]]
+        for step in range(1, int(np.bincount(self.points).max(initial=1))):
+            there = np.flatnonzero(self.points[step:] == self.points[:-step])
+            ids.append(self.points[there])
+            ends.append(np.column_stack([self.nodes[there], self.nodes[there + step]]))
+            fits.append(self.fits[there] & self.fits[there + step])
+        return NodeLinks(np.concatenate(ids), np.concatenate(ends), np.concatenate(fits))
+
+
+def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
+    """Return the links by pairs (., 2) of nodes that agree, and that contradict."""
+    ends = np.concatenate([agreeing, contradicting])
+    return NodeLinks(np.arange(len(ends)), ends, np.arange(len(ends)) < len(agreeing))
+
+
+def find_groups(
+    count: int, rays: Rays, pairs: NodeLinks, known: IntArray
+) -> tuple[IntArray, tuple[Untied, ...]]:
+    """Return the group of each of so many nodes, (n,), and those that are not tied to the largest.
+
+    What is unchecked is one group with the largest all the same.
+
+    Args:
+        count: number of nodes, n.
+        rays: to points.
+        pairs: links by pairs.
+        known: (k, 2) nodes that are known to stand rightly to one another.
+    """
+    rays = _of_three(rays)
+    group = _rigid_groups(count, rays, known)
+    lowest = np.full(int(rays.points.max(initial=-1)) + 1, count)
+    np.minimum.at(lowest, rays.points, group[rays.nodes])
+    others = np.bincount(rays.points, group[rays.nodes] != lowest[rays.points])
+    points, is_done = rays.taken((others > 0)[rays.points]).links(), False
+    while not is_done:
+        united = _unite(_unite(group, points, *_BY_POINTS), pairs, *_BY_PAIRS)
+        is_done, group = len(np.unique(united)) == len(np.unique(group)), united
+    sizes = np.bincount(group)
+    names = np.argsort(-sizes, kind="stable")[: np.sum(sizes > 1)].tolist()
+    untied = tuple(_tell(group == name, points, pairs) for name in names[1:])
+    for one in untied:
+        if not one.is_loose:
+            group[one.cameras] = names[0]
+    return group, untied
+
+
+def _of_three(rays: Rays) -> Rays:
+    """Return the rays of points that three nodes see; none of a point fits unless three do."""
+    rays = rays.taken((np.bincount(rays.points) > 2)[rays.points])
+    return rays._replace(fits=rays.fits & (np.bincount(rays.points, rays.fits) > 2)[rays.points])
+
+
+def _rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
+    """Return the group of each node (n,) by the points that two of them share, a share of all points."""
+    group = np.arange(count)
+    step = len(rays.points) // (_MOST_RAYS * count) + 1
+    strong = _tied(group, rays.taken(rays.points % step == 0).links(), *_BY_POINTS)[0]
+    strong = np.unique(np.sort(np.concatenate([strong, known]), axis=1), axis=0)
+    if len(strong):
+        piece = parallel_rigid_pieces(count, strong, 3)
+        order = np.argsort(-piece, kind="stable")  # a node of several pieces is in the largest
+        order = order[(np.bincount(piece) > 1)[piece[order]]]  # two nodes are no piece
+        group += len(strong)
+        group[strong[order].ravel()] = np.repeat(piece[order], 2)
+    return np.unique(group, return_inverse=True)[1]
+
+
+def _unite(group: IntArray, links: NodeLinks, least: int, spare: int, most_missing: float) -> IntArray:
+    """Return the groups (n,) after each has united with the larger one that most links tie it to, if any.
+
+    A node by itself unites with a single group: it may stand in two that nothing else ties.
+    """
+    pairs, numbers = _tied(group, links, least, spare, most_missing)
+    sizes = np.bincount(group, minlength=len(group))
+    order = np.lexsort((pairs, sizes[pairs]), axis=1)
+    pairs = np.take_along_axis(pairs, order, axis=1)
+    rows = np.flatnonzero(sizes[pairs[:, 1]] > 1)
+    rows = rows[np.argsort(-numbers[rows], kind="stable")]
+    rows = rows[np.unique(pairs[rows, 0], return_index=True)[1]]
+    return connected_components(len(group), pairs[rows])[group]
+
+
+def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
+    """Return a group, the nodes inside, with what crosses between it and the rest."""
+    ends, facts = [np.zeros((0, 2), dtype=np.int64)], 0
+    numbers: list[int] = []
+    for links, says, most_missing in (
+        (pairs, _PAIR_SAYS, _BY_PAIRS[2]),
+        (points, _POINT_SAYS, _BY_POINTS[2]),
+    ):
+        across = links.taken(inside[links.ends].sum(axis=1) == 1)
+        fitting, missing = across.taken(across.fits), across.taken(~across.fits)
+        numbers += [fitting.number, missing.number]
+        if missing.number <= most_missing * fitting.number:
+            ends.append(fitting.ends)
+            facts += says * fitting.number
+    every = np.concatenate(ends)
+    of_one = any((every == node).any(axis=1).all() for node in np.unique(every).tolist())
+    agreeing, contradicting, shared, _ = numbers
+    return Untied(np.flatnonzero(inside), agreeing, contradicting, shared, facts < _UNKNOWNS or of_one)
+
+
+def _tied(
+    group: IntArray, links: NodeLinks, least: int, spare: int, most_missing: float
+) -> tuple[IntArray, IntArray]:
+    """Return the pairs of groups (p, 2) that links tie, of the groups of nodes (n,), and how many fit (p,).
+
+    Args:
+        group: (n,) group of each node.
+        links: between nodes.
+        least: links that fit.
+        spare: of these, without those of any one node of a group of several; a point counts for each.
+        most_missing: links that do not fit, for each that does.
+    """
+    across = group[links.ends[:, 0]] != group[links.ends[:, 1]]
+    ids, ends, fits = links.ids[across], links.ends[across], links.fits[across]
+    swapped = group[ends[:, 0]] > group[ends[:, 1]]
+    ends[swapped] = ends[swapped, ::-1]
+    count, span, sizes = len(group), int(ids.max(initial=0)) + 1, np.bincount(group, minlength=len(group))
+    names, pair = np.unique(group[ends] @ np.array([count, 1]), return_inverse=True)
+    both = np.column_stack(np.divmod(names, count))
+    number, missing = (
+        np.bincount(np.unique(pair[rows] * span + ids[rows]) // span, minlength=len(names))
+        for rows in (slice(None), ~fits)
+    )
+    enough = (number - missing >= least) & (missing <= most_missing * (number - missing))
+    for side in range(2):
+        if (several := sizes[both[:, side]] > 1).any():
+            seen = np.unique((pair[fits] * count + ends[fits, side]) * span + ids[fits]) // span
+            nodes, counts = np.unique(seen, return_counts=True)
+            total, most = np.zeros((2, len(names)))
+            np.add.at(total, nodes // count, counts)
+            np.maximum.at(most, nodes // count, counts)
+            enough &= ~several | (total - most >= spare)
+    return both[enough], (number - missing)[enough]

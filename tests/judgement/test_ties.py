@@ -1,0 +1,131 @@
+"""What crosses between two groups of cameras, and whether it checks how they stand to one another."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs
+
+HALF = 6
+N = 2 * HALF
+INNER = 40
+
+
+def rays_of(*seen, misses=(), by=range(HALF, N)):
+    """Rays of points, each seen by a tuple of cameras; those of some points miss in some cameras."""
+    points, nodes = np.repeat(np.arange(len(seen)), [len(each) for each in seen]), np.concatenate(seen)
+    return Rays(points, nodes, ~(np.isin(nodes, by) & np.isin(points, list(misses))))
+
+
+def halves():
+    """Points that three neighbors of each half see."""
+    return [
+        tuple(side + (k + step) % HALF for step in range(3))
+        for side in (0, HALF)
+        for k in range(HALF)
+        for _ in range(INNER)
+    ]
+
+
+def found(*crossing, agreeing=(), contradicting=(), known=(), inside=None, misses=(), **more):
+    """The groups of two halves that points, and pairs, cross."""
+    points = halves() if inside is None else inside
+    rays = rays_of(*points, *crossing, misses=[len(points) + k for k in misses], **more)
+    sides = (np.array(side, dtype=int).reshape(-1, 2) for side in (agreeing, contradicting))
+    return find_groups(N, rays, links_of_pairs(*sides), np.array(known, dtype=int).reshape(-1, 2))
+
+
+FROM_BOTH = (0, 1, 7, 8)
+"""Cameras that see a point: two of either half."""
+
+
+def test_halves_that_nothing_crosses_are_two_groups_of_which_the_further_one_is_loose():
+    group, (half,) = found()
+    assert len(set(group[:HALF])) == len(set(group[HALF:])) == 1
+    assert group[0] != group[HALF]
+    assert half.cameras.tolist() == list(range(HALF, N))
+    assert half[1:] == (0, 0, 0, True)
+
+
+@pytest.mark.parametrize(("count", "misses", "ties"), [(15, 7, True), (14, 0, False), (15, 8, False)])
+def test_fifteen_points_tie_two_groups_if_at_most_half_as_many_miss(count, misses, ties):
+    group, groups = found(*[FROM_BOTH] * (count + misses), misses=range(misses))
+    told = [(one.num_points, one.is_loose) for one in groups]
+    assert told == ([] if ties else [(count, misses > count / 2)])
+    assert len(set(group)) == 1 + (misses > count / 2)  # what is unchecked is not apart
+
+
+def test_points_of_two_images_tie_nothing_and_nor_do_those_of_three_if_one_misses():
+    (half,) = found(*[(0, 7)] * 100)[1]
+    assert (half.num_points, half.is_loose) == (0, True)
+    (half,) = found(*[(0, 7, 8), (1, 9, 8)] * 20, misses=range(40), by=[8])[1]
+    assert (half.num_points, half.is_loose) == (0, True)
+
+
+def test_two_cameras_alone_are_no_group():
+    inside = [tuple((k + step) % 4 for step in range(3)) for k in range(4) for _ in range(INNER)]
+    inside += [tuple(8 + one for one in seen) for seen in inside]
+    between = [(6, 7, other) for other in (0, 0, 1, 1, 2, 2, 3, 3, 8, 8, 9, 9, 10, 10, 11)]
+    _, groups = found(*between, inside=inside)
+    assert [group.cameras.tolist() for group in groups] == [[8, 9, 10, 11]]
+
+
+def test_points_that_one_camera_sees_of_the_other_half_say_where_that_stands_but_not_how_large_the_half_is():
+    _, (half,) = found(*[(0, 7, 8)] * 100)
+    assert set(half.cameras.tolist()) - {0} in ({*range(1, HALF)}, {*range(HALF, N)})
+    assert half.is_loose
+    tied, groups = found(*[(0, 7, 8)] * 100, *[(1, 7, 8)] * 15)
+    assert (len(set(tied)), groups) == (1, ())
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "num_against", "ties", "is_loose"),
+    [
+        ([(0, 6), (1, 7), (2, 8)], 6, True, False),
+        ([(0, 6), (1, 7), (2, 8)], 7, False, True),
+        ([(0, 6), (1, 7)], 0, False, False),
+        ([(0, 6)], 0, False, True),
+        ([(0, 6), (0, 7), (0, 8)], 0, False, True),
+        ([(0, 6), (0, 7), (1, 8)], 0, False, False),
+        ([(0, 6), (0, 7), (1, 8), (2, 9)], 0, True, False),
+    ],
+)
+def test_three_pairs_tie_two_groups_if_two_are_left_without_any_camera(agreeing, num_against, ties, is_loose):
+    against = [(k // HALF, HALF + k % HALF) for k in range(num_against)]
+    group, groups = found(agreeing=agreeing, contradicting=against)
+    assert len(set(group)) == 1 + is_loose
+    told = [(one.num_agreeing, one.num_contradicting, one.is_loose) for one in groups]
+    assert told == ([] if ties else [(len(agreeing), num_against, is_loose)])
+
+
+def test_facts_add_up_one_pair_and_one_point_say_as_much_as_a_similarity_has_unknowns():
+    (half,) = found(FROM_BOTH, agreeing=[(2, 9)])[1]
+    assert not half.is_loose
+    assert found(FROM_BOTH, FROM_BOTH, FROM_BOTH)[1][0].is_loose
+    assert not found(FROM_BOTH, FROM_BOTH, FROM_BOTH, FROM_BOTH)[1][0].is_loose
+
+
+def test_groups_that_are_known_to_be_right_need_no_link():
+    strip = [(3, 8), (4, 8), (4, 9)]
+    assert found(known=strip)[1] == ()
+    assert len(found(known=strip[:1])[1]) == 1
+
+
+def test_a_chain_is_one_group_and_single_cameras_are_none():
+    chain = [(k, k + 1, k + 2) for k in range(N - 2) for _ in range(15)]
+    assert len(set(found(inside=chain)[0])) == 1
+    group, groups = found(inside=[seen for seen in chain if N - 1 not in seen])
+    assert (len(set(group)), groups) == (2, ())
+    few = [seen for k, seen in enumerate(chain) if k % 15]
+    assert found(inside=few)[1] == ()
+
+
+def test_all_points_are_asked_between_groups_that_a_share_of_them_leaves_apart():
+    many = [seen for seen in halves() for _ in range(40)]
+    assert len(set(found(*[FROM_BOTH] * 15, inside=many)[0])) == 1
+
+
+def test_nothing_links_nothing():
+    none = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0, dtype=bool))
+    links = NodeLinks(np.zeros(0, dtype=int), np.zeros((0, 2), dtype=int), np.zeros(0, dtype=bool))
+    group, groups = find_groups(3, none, links, np.zeros((0, 2), dtype=int))
+    assert (group.tolist(), groups) == ([0, 1, 2], ())
