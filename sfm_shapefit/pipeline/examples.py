@@ -116,8 +116,8 @@ def solve_by_splitting(_folder: Path) -> None:
         solve(graph, solver="admm", threads=2)
         solve(graph, solver="admm", threads=1, factor_memory_mb=0, max_iterations=20)
     solve(_long_graph(500), solver="admm", threads=1, max_iterations=20)  # its factor is of float32
-    exact = synthetic.ring_graph_problem(60, 8.0, q=0.1, seed=1).view_graph
-    solve(exact, solver="admm", threads=1, max_iterations=200)  # many edges fit exactly: it is accelerated
+    exact = synthetic.ring_graph_problem(60, 8.0, q=0.1, seed=1)
+    solve(exact.view_graph, solver="admm", threads=1, max_iterations=200)  # which is accelerated
 
 
 def solve_iteratively(_folder: Path) -> None:

@@ -131,9 +131,8 @@ class _Beside:
         self._begins = np.append(0, np.cumsum(view.num_keypoints))
         # Pairs of most keypoints are far below the limit of the type, 65,535.
         self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
-        self.joiner = None
-        if wanted.tracks:
-            self.joiner = TrackJoiner(threshold_px, view.num_keypoints, view.num_matches)
+        given = threshold_px, view.num_keypoints, view.num_matches
+        self.joiner = TrackJoiner(*given) if wanted.tracks else None
 
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Take a batch and its directions."""

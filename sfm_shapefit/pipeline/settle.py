@@ -106,6 +106,7 @@ def settle(
         limited, near = economy.limit(options.placement), None if first is None else first.near
         place = partial(place_cameras, options=limited, nodes=options.nodes, clock=clock, near=near)
         if not (measured.checks and may_be_checked(graph)):
+            measured = replace(measured, tracks=None)  # which are large
             graph = add_evidence(graph, measured)
             del measured
             pieces = list(place(graph))

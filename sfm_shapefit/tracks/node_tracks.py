@@ -102,7 +102,7 @@ class TrackJoiner:
         row = np.where(is_usable(directions.status), np.arange(len(batch.pairs)), -1)
         counts = np.diff(batch.offsets)
         drawn = _draw_matches(batch, counts, self._share)
-        keypoints = self._begins[np.repeat(batch.pairs, counts, axis=0)] + batch.keypoints
+        keypoints = np.repeat(self._begins[batch.pairs], counts, axis=0) + batch.keypoints
         new_rays = np.empty((min(2 * len(keypoints), len(self._places) - self._count), 3))
         largest = self._count + len(new_rays)
         if largest > len(self._parents):
