@@ -20,7 +20,8 @@ def test_a_fifth_of_wrong_pairs_does_no_harm(drawn_workspace):
 
 
 def test_photographs_drawn_by_opencv_become_a_model(rendered_workspace, tmp_path):
-    workspace = rendered_workspace("facade")
+    small = {"image_width": 400, "image_height": 300, "focal_length_px": 350.0}
+    workspace = rendered_workspace("facade", **small)
     models = global_mapping(workspace / "database.db", workspace / "images", tmp_path / "models")
     assert_reconstruction_near(models[0], workspace / "sparse/0", max_median_error=0.05)
 

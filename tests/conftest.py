@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+import sfm_shapefit
 from sfm_shapefit.synthetic import (
     RenderedScene,
     Scene,
@@ -16,6 +17,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.scenes import COURTYARD
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
 
@@ -34,6 +36,12 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
     folder = tmp_path_factory.mktemp("drawn") / "workspace"
     write_rendered_workspace(scene, folder, WorkspaceOptions(relative_poses=True))
     return scene, folder
+
+
+@pytest.fixture(scope="session")
+def courtyard_mapped() -> sfm_shapefit.MapResult:
+    """What `map` makes of the courtyard's database."""
+    return sfm_shapefit.map_database(COURTYARD / "database.db")
 
 
 @pytest.fixture(scope="session")

@@ -51,7 +51,7 @@ def measure(name: str, folder: Path, truth: str, args: argparse.Namespace) -> li
         mapped, seconds = timed(lambda: sfm_shapefit.map_database(database, threads=args.threads))
         error = sfm_shapefit.evaluate(mapped.models[0].located, folder / truth).position.mean
         poses, rows = Path(work) / "transforms.json", []
-        for sigma_deg in SIGMAS_DEG:
+        for sigma_deg in SIGMAS_DEG[:1] if args.quick else SIGMAS_DEG:
             runs = [
                 one_run(folder / truth, database, poses, sigma_deg, seed, args.threads)
                 for seed in range(args.repeats)

@@ -7,7 +7,7 @@ ones. The results are kept in a file with the settings they belong to, so that a
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -114,10 +114,8 @@ def run_trials(
     kept = Kept(cache, {"methods": list(methods), "trials": trials, "seed": seed})
     missing = sorted((cell for cell in cells if str(cell) not in kept), key=lambda cell: -cell.n)
     step = max(len(missing) // _BATCH, 1)
-    # The spawned workers read it when they load numpy.
-    os.environ.update(thread_environment(1))
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        batches = [missing[k::step] for k in range(step)] if missing else []
+    batches = [missing[k::step] for k in range(step)] if missing else []
+    with _pool(processes) as pool:
         running = {pool.submit(run_batch, batch, methods, trials, seed): batch for batch in batches}
         for count, done in enumerate(as_completed(running), start=1):
             for cell, values in zip(running[done], done.result(), strict=True):
@@ -125,6 +123,14 @@ def run_trials(
             print(f"{count} of {len(batches)} batches of cells", file=sys.stderr)
     values = np.array([kept.get(str(cell), lambda: None) for cell in cells])
     return Results(tuple(cells), tuple(methods), values)
+
+
+def _pool(processes: int) -> Executor:
+    """Return processes that are started anew, each on one thread; a single one is a thread of this one."""
+    if processes == 1:
+        return ThreadPoolExecutor(1)
+    os.environ.update(thread_environment(1))  # which the others read when they load numpy
+    return ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
 
 
 def run_batch(cells: Sequence[Cell], methods: Sequence[str], trials: int, seed: int) -> FloatArray:

@@ -7,6 +7,7 @@ An edge (i, j) carries the unit direction of t_i - t_j: it points from camera j 
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +74,10 @@ class ViewGraph:
         object.__setattr__(self, "weights", frozen(weight_array))
         object.__setattr__(self, "names", None if names is None else tuple(names))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Make it anew where it is unpickled: arrays that can be written to are another type for kernels."""
+        return ViewGraph, (self.num_nodes, self.edges, self.directions, self.weights, self.names)
+
     @property
     def num_edges(self) -> int:
         """Number of pairs, m."""
@@ -130,8 +135,9 @@ def _check_arrays(
         raise InputError(f"edges must be integers, got {raw_edges.dtype}; give camera indices in [0, n)")
     if raw_edges.size and raw_edges.shape[1:] != (2,):
         raise InputError(f"edges have shape {raw_edges.shape}; give one row (i, j) per pair, shape (m, 2)")
-    i = raw_edges.astype(np.int64).reshape(-1, 2)
-    v = np.array(directions, dtype=np.float64)
+    # By rows, whatever the caller has them by: kernels are compiled anew for every other layout.
+    i = raw_edges.astype(np.int64, order="C").reshape(-1, 2)
+    v = np.array(directions, dtype=np.float64, order="C")
     if v.ndim != 2 or len(v) != len(i) or v.shape[1] < 2:
         raise InputError(
             f"directions have shape {v.shape} for {len(i)} edges; give one row of length d >= 2 per edge"

@@ -53,8 +53,8 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.tracks.options import StructureOptions
 
 
-def _random_graph(dimension: int = 3) -> ViewGraph:
-    return synthetic.random_graph_problem(20, 0.6, dimension, sigma=0.02, q=0.1, seed=1).view_graph
+def _random_graph(dimension: int = 3, num_nodes: int = 20) -> ViewGraph:
+    return synthetic.random_graph_problem(num_nodes, 0.6, dimension, sigma=0.02, q=0.1, seed=1).view_graph
 
 
 def _long_graph(num_nodes: int = 300) -> ViewGraph:
@@ -69,8 +69,8 @@ def _workspace(folder: Path, options: WorkspaceOptions | None = None) -> Path:
 
 
 def solve_dense(_folder: Path) -> None:
-    """Solve small graphs by Newton steps, one from a rough start and one from least squares."""
-    for graph in (_random_graph(), _long_graph(40)):
+    """Solve graphs by Newton steps: from a rough start, from least squares, and with a float32 factor."""
+    for graph in (_random_graph(), _long_graph(40), _random_graph(num_nodes=160)):
         solve(graph, threads=2)
 
 

@@ -78,13 +78,6 @@ def test_a_kernel_that_closes_over_a_value_is_refused():
         kernel(lambda x: factor * x)
 
 
-def test_a_second_process_compiles_nothing(tmp_path):
-    done = run_python("-m", "tests.every_command", tmp_path / "first")
-    if done.returncode:  # it had to compile: the next one must not
-        done = run_python("-m", "tests.every_command", tmp_path / "second")
-    assert done.returncode == 0, done.stderr[-500:]
-
-
 COMPILE = """
 from sfm_shapefit.base.jit import kernel, on_compilation
 def plus_one(x):

@@ -1,6 +1,7 @@
 """The view graph: what it refuses, what it merges, and what it keeps to the last bit."""
 
 import dataclasses
+import pickle
 
 import numpy as np
 import pytest
@@ -38,6 +39,18 @@ def test_a_graph_is_a_value_stored_as_given_that_neither_its_user_nor_its_inputs
     with pytest.raises(dataclasses.FrozenInstanceError):
         graph.num_nodes = 5
     np.testing.assert_array_equal(ViewGraph(2, [(0, 1)], [X]).weights, [1.0])
+
+
+def test_kernels_see_one_type_of_array_however_a_graph_was_made():
+    """Each further layout, and arrays that can be written to, would be compiled for anew."""
+    by_columns = np.array([X, Y, Z]).T.copy().T, np.array([[0, 1, 2], [1, 2, 0]]).T
+    graph = ViewGraph(3, by_columns[1], by_columns[0])
+    again = pickle.loads(pickle.dumps(ViewGraph(3, graph.edges, graph.directions, [1.0, 2.0, 3.0], "abc")))
+    np.testing.assert_array_equal(again.weights, [1.0, 2.0, 3.0])
+    assert again.names == ("a", "b", "c")
+    for array in (graph.edges, graph.directions, again.edges, again.directions, again.weights):
+        assert array.flags.c_contiguous
+        assert not array.flags.writeable
 
 
 @pytest.mark.parametrize(

@@ -88,10 +88,12 @@ def spoiled(amount_deg=0.0, shift=0.0):
 
 
 @pytest.mark.parametrize(("amount_deg", "shift"), [(10.0, 0.0), (90.0, 0.0), (0.0, 3.0)])
-def test_a_group_that_is_moved_as_a_whole_is_named_and_the_model_not_to_be_used(tmp_path, amount_deg, shift):
+def test_a_group_that_is_moved_as_a_whole_is_named_and_the_model_not_to_be_used(
+    tmp_path, courtyard_mapped, amount_deg, shift
+):
     model, wrong = spoiled(amount_deg, shift)
     model.write(tmp_path)
-    facts = check(tmp_path, COURTYARD / "database.db").facts
+    facts = check(tmp_path, COURTYARD / "database.db", second_opinion=courtyard_mapped).facts
     named = {name for seam in facts.evidence.seams for name in seam.images}
     assert len(named & wrong) >= 7
     assert len(named - wrong) <= 1
@@ -123,13 +125,13 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     assert right.verdict.grade is Grade.GOOD
 
 
-def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path):
+def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path, courtyard_mapped):
     model = pycolmap.Reconstruction(COURTYARD / "truth")
     image = model.image(sorted(model.reg_image_ids())[7])
     pose = image.frame.rig_from_world
     image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([2.0, 0.0, 0.0]))
     model.write(tmp_path)
-    facts = check(tmp_path, COURTYARD / "database.db").facts
+    facts = check(tmp_path, COURTYARD / "database.db", second_opinion=courtyard_mapped).facts
     (told,) = [place for place in facts.evidence.places if place.image == image.name]
     assert np.linalg.norm(told.offset) == pytest.approx(2.0, rel=0.05)
     assert told.num_there > 2 * told.num_here

@@ -540,10 +540,10 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
 
 @pytest.mark.slow
 def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
-    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 24}
+    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 16}
     scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
     write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
-    # Twelve frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
+    # Eight frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
     assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, adjust="full")
 
 

@@ -32,12 +32,26 @@ def spoiled():
 
 
 @pytest.fixture(scope="module")
-def found(spoiled):
-    return sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
+def tried():
+    """Pairs whose rotations were asked for while `found` was placed."""
+    return []
 
 
-def test_rough_rotations_lead_to_the_model_of_map(found):
-    mapped = sfm_shapefit.map_database(DATABASE).models[0].located
+@pytest.fixture(scope="module")
+def found(spoiled, tried):
+    estimate = rough.estimate_relative_rotations
+
+    def note(batch, *args, **known):
+        tried.append(batch.pairs)
+        return estimate(batch, *args, **known)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rough, "estimate_relative_rotations", note)
+        return sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
+
+
+def test_rough_rotations_lead_to_the_model_of_map(found, courtyard_mapped):
+    mapped = courtyard_mapped.models[0].located
     errors = [sfm_shapefit.evaluate(one, TRUTH).position.mean for one in (found, mapped)]
     assert found.reconstruction.num_reg_images() == mapped.reconstruction.num_reg_images()
     assert errors[0] <= 1.05 * errors[1]
@@ -54,28 +68,26 @@ def test_what_was_wrong_is_told_per_camera(found):
     assert np.isfinite(table["moved"]).all()
 
 
-def test_only_pairs_of_turned_images_are_tried(spoiled, monkeypatch):
-    tried, estimate = [], rough.estimate_relative_rotations
-
-    def count(batch, *args, **known):
-        tried.append(batch.pairs)
-        return estimate(batch, *args, **known)
-
-    monkeypatch.setattr(rough, "estimate_relative_rotations", count)
-    found = sfm_shapefit.locate(spoiled, DATABASE, rotations=2.0)
+def test_only_pairs_of_turned_images_are_tried(found, tried):
     rows = [found.images.names.index(name) for name in WRONG]
     pairs = np.concatenate(tried)
     assert 0 < len(pairs) < len(found.directions.pairs) / 2
     assert np.isin(pairs, rows).any(axis=1).all()
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.05])
-def test_lists_with_focal_lengths_off_and_no_distortion_lead_to_the_model_of_map(tmp_path, factor):
-    database, poses = tmp_path / "database.db", tmp_path / "transforms.json"
+@pytest.fixture(scope="module")
+def guessed(tmp_path_factory):
+    """The photographs' database with a guessed focal length and no distortion, and what `map` makes of it."""
+    database = tmp_path_factory.mktemp("guessed") / "database.db"
     shutil.copyfile(PHOTOGRAPHED / "database.db", database)
     guess = np.array([1.05 * 480.0, 320.0, 240.0, 0.0, 0.0], dtype="<f8").tobytes().hex()
     edit_database(database, f"UPDATE cameras SET params = x'{guess}', prior_focal_length = 0")
-    mapped = sfm_shapefit.map_database(database).models[0].located
+    return database, sfm_shapefit.map_database(database).models[0].located
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.05])
+def test_lists_with_focal_lengths_off_and_no_distortion_lead_to_the_model_of_map(guessed, tmp_path, factor):
+    (database, mapped), poses = guessed, tmp_path / "transforms.json"
     rng = np.random.default_rng(1)
 
     def change(_name, rotation, _center):
