@@ -14,13 +14,14 @@ from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
 from sfm_shapefit.adjustment.sources import Links
+from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
 _MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
 _NOTHING_GIVEN = GivenPoses()
-LensesAtFirst = Literal["wanted", "free", "known"]
+LensesAtFirst = Literal["wanted", "free", "known", "near", "tried"]
 
 
 def adjust_seed(
@@ -78,7 +79,10 @@ def adjust_thinly(
         lenses: "wanted": they alone are of use, and how well centers are known stays open. "free" or "known":
             all points follow where a lens or a rig has changed, up to 2,000 frames: a shape bends with a
             focal length that few points leave a thousandth off; "known" ones, as an adjustment has found
-            them before, are held in the first solve.
+            them before, are held in the first solve. "near": free, where rotations are known from elsewhere;
+            all points follow the first solve at once. "tried": the same, but where its rays have changed by a
+            hundredth, the first solve is all, since what the start was measured through is to be measured
+            again.
 
     Returns:
         The gauge is as from `adjust_seed`.
@@ -89,6 +93,12 @@ def adjust_thinly(
     run = steps.begin(images, read_links(), options, freedom, given)
     if run.frees_more_than_poses:
         by_all = lenses != "wanted" and len(images.frames.ids) <= MOST_FRAMES
+        if by_all and lenses in ("near", "tried"):
+            run, last = steps.solve_coarsely(run)
+            if lenses == "tried" and differ_in_rays(run.images, images):
+                return run.judge_lenses(last)[0].estimate(last, judged=False)
+            run, _, last = steps.solve_by_all_points(run)
+            return run.estimate(last)
         solve = partial(steps.solve_twice_thinly, lenses_known=lenses == "known")
         again = steps.solve_thinly_again
         run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=lenses == "wanted")
