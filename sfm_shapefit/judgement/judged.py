@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, hand_back_memory
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, hand_back_memory
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.placement.place import Placement
@@ -28,6 +28,16 @@ class Judged(Placement):
     """What these covariances take errors of the lenses for."""
     scale_sigma: float | None = None
     """Relative standard deviation of the scale, where an adjustment knows it."""
+
+    def loosened(self, loose: BoolArray) -> "Judged":
+        """Return the same where nothing says how some of the cameras (k,) stand to the rest."""
+        own, adjusted = self.assessment.covariances.copy(), self.adjusted_covariances
+        own[: len(loose)][loose] = np.diag(np.full(own.shape[1], np.inf))
+        if adjusted is not None:
+            adjusted = np.where(loose[:, None, None], np.nan, adjusted)
+        return replace(
+            self, assessment=replace(self.assessment, covariances=own), adjusted_covariances=adjusted
+        )
 
     @property
     def covariances(self) -> FloatArray:

@@ -175,6 +175,8 @@ def finish_piece(
     kept &= images.is_posed[judged.cameras]
     with clock("trust"):
         evidence = _question(stand, kept, seeded, clock)
+        for group in (group for group in evidence.untied if group.is_loose):
+            judged = judged.loosened(np.isin(judged.cameras, group.cameras))
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)

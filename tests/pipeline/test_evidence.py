@@ -120,6 +120,8 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     assert told.images == tuple(f"{k:04d}.jpg" for k in range(1, 13))
     assert (told.num_agreeing, told.num_points, told.is_loose) == (1, 0, True)
     assert told.statement in wrong.models[0].located.warnings
+    unknown = {row.name for row in wrong.models[0].located.cameras if not np.isfinite(row.sigma).all()}
+    assert unknown == set(told.images)
     assert wrong.verdict.grade is Grade.DO_NOT_USE
     right = sfm_shapefit.map_database(cut(tmp_path / "right", (4, 25), (5, 24)))
     assert right.verdict.grade is Grade.GOOD
