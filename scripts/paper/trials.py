@@ -8,9 +8,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -125,12 +127,20 @@ def run_trials(
     return Results(tuple(cells), tuple(methods), values)
 
 
-def _pool(processes: int) -> Executor:
-    """Return processes that are started anew, each on one thread; a single one is a thread of this one."""
+@contextmanager
+def _pool(processes: int) -> Iterator[Executor]:
+    """Yield processes that are started anew, each on one thread; a single one is a thread of this one.
+
+    They read the environment when they load numpy. Here it is as before afterwards: numba forgets for which
+    processor it compiles when its part changes, and no kernel on disk would be found.
+    """
     if processes == 1:
-        return ThreadPoolExecutor(1)
-    os.environ.update(thread_environment(1))  # which the others read when they load numpy
-    return ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+        with ThreadPoolExecutor(1) as pool:
+            yield pool
+        return
+    spawning = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+    with patch.dict(os.environ, thread_environment(1)), spawning as pool:
+        yield pool
 
 
 def run_batch(cells: Sequence[Cell], methods: Sequence[str], trials: int, seed: int) -> FloatArray:
