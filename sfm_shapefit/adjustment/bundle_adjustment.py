@@ -14,7 +14,6 @@ from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
 from sfm_shapefit.adjustment.sources import Links
-from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
@@ -95,7 +94,7 @@ def adjust_thinly(
         by_all = lenses != "wanted" and len(images.frames.ids) <= MOST_FRAMES
         if by_all and lenses in ("near", "tried"):
             run, last = steps.solve_coarsely(run)
-            if lenses == "tried" and differ_in_rays(run.images, images):
+            if lenses == "tried" and run.images.differ_in_rays(images):
                 return run.judge_lenses(last)[0].estimate(last, judged=False)
             run, _, last = steps.solve_by_all_points(run)
             return run.estimate(last)

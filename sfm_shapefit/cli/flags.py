@@ -193,6 +193,7 @@ class GroupedCommand(TyperCommand):
         """Refuse flags that are keys of --config; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
         groups = () if settings is None else setting_groups(settings)
+        key_names.clear()
         key_names.update(item.name for one in groups for item in one.options)
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]

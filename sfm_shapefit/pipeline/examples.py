@@ -24,9 +24,6 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import assess
-from sfm_shapefit.laplacian.cholesky import factorize
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.symbolic import elimination_tree, plan_factorization
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.adjust import read_bundle
 from sfm_shapefit.pipeline.evaluate import evaluate
@@ -35,7 +32,7 @@ from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.refinement.angular import Metric, allocate_normal, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
@@ -105,9 +102,10 @@ def measure_pairs(folder: Path) -> None:
 def solve_sparse(_folder: Path) -> None:
     """Solve a long graph by Newton steps, and factor one of so many entries that threads share it."""
     solve_newton_sparse(_long_graph(), 1e-8, 50)
-    edges = np.stack(np.triu_indices(1010, k=1), axis=1)
-    full = adjacency(1010, edges)
-    factorize(plan_factorization(full, edges, elimination_tree(full, np.arange(1010))), np.ones(len(edges)))
+    full = synthetic.random_graph_problem(340, 1.0, sigma=0.02, seed=1).view_graph
+    plan = plan_refinement(full)
+    assert plan is not None
+    allocate_normal(plan, 3).refactor(np.tile(np.eye(3), (full.num_edges, 1, 1)))
 
 
 def solve_by_splitting(_folder: Path) -> None:

@@ -4,6 +4,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
     -> position priors where these are not enough -> groups merged -> adjusted -> judged as `check` does
 """
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -253,7 +254,10 @@ class _Growing:
             self.ids[number] = {point: renamed.get(now, now) for point, now in ids.items()}
         self.ids[done.model] = new
         worlds = {**self.group.world_from, done.model: world_from}
-        self.group = JoinedGroup(merged, worlds, (*self.group.joins, done))
+        ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.model, done.to)]
+        names = dict.fromkeys(tied.names[v] for v in np.concatenate(ends).tolist())
+        known = (*self.group.tied, *itertools.combinations(names, 2))
+        self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
 
     def _fits(self, tied: TiedPieces, pair: int, done: Joined) -> BoolArray:
         """Return which matches of a pair see, from each side, the point that the other side has."""

@@ -70,6 +70,8 @@ class JoinedGroup(NamedTuple):
     world_from: Mapping[int, Similarity]
     """By the number of each model, the first one's first."""
     joins: Sequence[Joined]
+    tied: Sequence[tuple[str, str]] = ()
+    """Images of models that are joined, which stand rightly to one another as far as the joins do."""
 
 
 def tell_group(
@@ -94,7 +96,9 @@ def tell_group(
         gauge, rescale = _choose_scale(group, located[first].gauge, told.distances)
         group = _rescaled(group, rescale)
     model = read_model(group.reconstruction)
-    found = check_source(model, source.at(model.images), options, clock)
+    rows = {name: k for k, name in enumerate(model.images.names)}
+    known = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
+    found = check_source(model, source.at(model.images), options, clock, known=known)
     seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     cameras = list(_camera_rows(found.cameras, group, located))
     facts = JoinedFacts.taken_from(

@@ -16,7 +16,6 @@ from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.map_result import MapResult, tell_joins
 from sfm_shapefit.facts.map_warnings import lost_distances, map_warnings
 from sfm_shapefit.facts.options import MapOptions
-from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -120,7 +119,7 @@ def measure_run(run: MapRun) -> MeasuredPairs:
     relative = run.measure()
     if run.options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
-        if differ_in_rays(known, run.images):
+        if known.differ_in_rays(run.images):
             run = run._replace(images=known, lenses_found=True)
             relative = run.measure()
     videos = run.find_videos(relative)

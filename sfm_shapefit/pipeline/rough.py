@@ -18,7 +18,6 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.warnings import rotation_warnings
-from sfm_shapefit.files.colmap.intrinsics import differ_in_rays
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
     estimate_relative_rotations,
@@ -51,7 +50,7 @@ def settle_rough(
         relative, believed = measure_near(source, sigma_rad, clock)
     corrected = _averaged(source, relative, believed, clock)
     given, corrected, first = start_from_first(given, corrected, options, clock, lenses="tried")
-    if differ_in_rays(corrected.images, rough):
+    if corrected.images.differ_in_rays(rough):
         source = source.at(rough.with_lenses(corrected.images.lenses))
         with clock("relative rotations"):
             relative = _measure(source, clock)

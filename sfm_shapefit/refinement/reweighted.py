@@ -40,7 +40,8 @@ from sfm_shapefit.solver.solve import solve
 POOR_SHARE = 0.7
 """Share of right pairs that the usual answer explains; from here on it is believed, since nothing gained."""
 _FEW = 0.35  # share of right pairs; answers that explain fewer are looked for among triangles too
-_FEW_OF_MOVED = 0.5  # likewise, where a consensus has moved cameras and pairs are not too many
+# Likewise, where a consensus has moved cameras and pairs are not too many: the usual answer was off there.
+_FEW_OF_MOVED = 0.5
 _FEWEST_NODES = 10  # nodes; the residuals of fewer say nothing of noise and shares
 _LEAST_REDUNDANCY = 2.0  # equations per unknown; with fewer any answer explains about half of the pairs
 _LEAST_WEIGHT = 1e-4  # relative weight of a pair that is certainly wrong; 0 would leave cameras loose

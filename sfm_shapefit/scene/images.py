@@ -129,6 +129,10 @@ class Images:
         """Mean focal lengths, (i,); of a lens without one, pixels per radian."""
         return np.array([lens.focal_px for lens in self.lenses], dtype=np.float64)[self.lens_of]
 
+    def differ_in_rays(self, other: "Images") -> bool:
+        """Return whether the rays of a lens differ by a hundredth between the same images."""
+        return any(map(Lens.differs_in_rays, self.lenses, other.lenses))
+
     @property
     def sizes_px(self) -> FloatArray:
         """Widths and heights, (i, 2)."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import normalized
 
 _FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
 
@@ -35,6 +36,7 @@ _ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how the names of models with a sing
 # Newton steps that undo a distortion at most, and their length over the focal length at which they end;
 # double precision is reached.
 _MOST_STEPS, _STILL = 30, 1e-12
+_SAME_RAYS = 0.01  # difference of unit rays; more makes relative rotations worth measuring anew
 _PIXELS_A_SLICE = 20_000  # pixels undistorted at once; their arrays stay in the cache
 
 LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, the observations leave it open
@@ -135,6 +137,20 @@ class Lens:
             part = slice(first, first + _PIXELS_A_SLICE)
             found[part] = _undistort(distorted[part].T, *distortion).T
         return found
+
+    def differs_in_rays(self, other: "Lens") -> bool:
+        """Return whether the unit rays of a corner or of edges differ by a hundredth from those of another.
+
+        Lenses that cannot be adjusted differ if their parameters do.
+        """
+        if self.parameters == other.parameters or not (self.is_adjustable and other.is_adjustable):
+            return self.parameters != other.parameters
+        w, h = self.width, self.height
+        pixels = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
+        rays, those = (
+            normalized(np.insert(lens.undistort(pixels), 2, 1.0, axis=1)) for lens in (self, other)
+        )
+        return not bool(np.abs(rays - those).max() <= _SAME_RAYS)  # NaN differs too
 
     def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
         """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""

@@ -29,3 +29,22 @@ def test_distortion_is_undone_as_by_pycolmap_and_where_the_picture_is_folded_the
     assert has_ray.all() == (parameters[-1] != -0.3)
     ahead = np.concatenate([found[has_ray], np.ones((has_ray.sum(), 1))], axis=1)
     np.testing.assert_allclose(camera.img_from_cam(ahead), pixels[has_ray], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "focal", "distortion", "differs"),
+    [
+        ("SIMPLE_RADIAL", 900.0, 0.0, False),
+        ("SIMPLE_RADIAL", 910.0, 0.0, False),  # 0.4 % of the angle at the edge, which is 34 deg
+        ("SIMPLE_RADIAL", 960.0, 0.0, True),
+        ("SIMPLE_RADIAL", 900.0, 0.1, True),
+        ("SIMPLE_RADIAL_FISHEYE", 901.0, 0.0, True),  # it cannot be adjusted
+    ],
+)
+def test_lenses_differ_where_their_rays_do_by_a_hundredth(model, focal, distortion, differs):
+    one, other = (
+        Lens(model, (f, 600.0, 400.0, k), width=1200, height=800)
+        for f, k in ((900.0, 0.0), (focal, distortion))
+    )
+    assert one.differs_in_rays(other) is differs
+    assert one.differs_in_rays(one) is False

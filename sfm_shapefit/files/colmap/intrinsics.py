@@ -41,7 +41,6 @@ _MOST_PAIRS = 50_000
 _DIGITS = 8
 """Digits of the factors that pycolmap finds which are kept: it adds up in the order in which its threads end,
 so the thirteenth digit differs from run to run, and an adjustment from there in more."""
-_SAME_RAYS = 0.01  # difference of unit rays; more makes relative rotations worth measuring anew
 
 
 class Uncalibrated(NamedTuple):
@@ -117,19 +116,6 @@ def with_focal_length(lens: Lens, factor: float) -> Lens:
     params = np.array(lens.parameters)
     params[camera_of(lens).focal_length_idxs()] *= factor
     return replace(lens, parameters=tuple(params.tolist()))
-
-
-def differ_in_rays(one: Images, other: Images) -> bool:
-    """Return whether the rays of a lens's corner or edges differ by a hundredth between the same images."""
-    for lens, against in zip(one.lenses, other.lenses, strict=True):
-        if lens.parameters == against.parameters:
-            continue
-        w, h = lens.width, lens.height
-        xy = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
-        rays, those = (np.asarray(camera_of(through).cam_ray_from_img(xy)) for through in (lens, against))
-        if not np.abs(rays - those).max() <= _SAME_RAYS:  # NaN differs too
-            return True
-    return False
 
 
 def calibrate_view_graph(
