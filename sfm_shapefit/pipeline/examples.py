@@ -58,9 +58,11 @@ def _long_graph(num_nodes: int = 300) -> ViewGraph:
     return synthetic.ring_graph_problem(num_nodes, 8.0, sigma=0.02, q=0.1, seed=1).view_graph
 
 
-def _workspace(folder: Path, options: WorkspaceOptions | None = None) -> Path:
-    """Write eight images of a ring, and return the folder of the model."""
-    scene = synthetic.make_scene(SceneOptions(shape="ring", num_images=8, num_points=300))
+def _workspace(folder: Path, options: WorkspaceOptions | None = None, *, wrong: float = 0.0) -> Path:
+    """Write eight images of a ring, a share of whose pairs is wrong, and return the folder of the model."""
+    scene = synthetic.make_scene(
+        SceneOptions(shape="ring", num_images=8, num_points=300, corrupted_pair_fraction=wrong)
+    )
     write_workspace(scene, folder / "ring", options)
     return folder / "ring" / "sparse" / "0"
 
@@ -153,8 +155,8 @@ def place_flat_graph(_folder: Path) -> None:
 
 
 def locate_model(folder: Path) -> None:
-    """Locate the cameras of a model from its database, and compare them with the truth."""
-    model = _workspace(folder, WorkspaceOptions(model="rotations"))
+    """Locate the cameras of a model from its database, with checked tracks, and compare with the truth."""
+    model = _workspace(folder, WorkspaceOptions(model="rotations"), wrong=0.2)
     found = locate(model, threads=2)
     evaluate(found.reconstruction, model.parents[1] / "truth")
 
