@@ -19,7 +19,7 @@ from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, Joine
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
-from sfm_shapefit.judgement.grade import ModelVerdict
+from sfm_shapefit.judgement.grade import FEW_PLACED, Grade, ModelVerdict, in_another_model
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
 if TYPE_CHECKING:
@@ -133,8 +133,13 @@ class MapResult(Written):
 
     @property
     def verdict(self) -> ModelVerdict:
-        """Whether the largest model can be used, and why."""
-        return self.models[0].located.verdict
+        """Whether the largest model can be used, and why; look at one that leaves many images to others."""
+        verdict = self.models[0].located.verdict
+        sizes = int(self.models[0].located.kept.sum()), *(one.facts.num_placed for one in self.joined)
+        here = max(sizes) / self.num_placed
+        if verdict.grade is not Grade.GOOD or here >= FEW_PLACED:
+            return verdict
+        return replace(verdict, grade=Grade.LOOK, reasons=(*verdict.reasons, in_another_model(here)))
 
     @property
     def facts(self) -> MapFacts:

@@ -54,7 +54,7 @@ MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model i
 # Share of observations that contradict, and share that sees a point: see the header.
 _MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_KEPT = 0.5  # share of placed cameras in the output; below, the model is not to be used
-_LEAST_PLACED, _FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
+_LEAST_PLACED, FEW_PLACED = 0.5, 0.95  # share of images in the output; below, not to be used, and to look at
 LEAST_HELD = 0.5  # share of cameras that the agreeing pairs hold; below, the model is not to be used
 _MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
 _MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
@@ -195,13 +195,18 @@ def judge_model(
         unnamed.append("many rejected pairs agree on a second configuration")
     if shares.observations < _FEW_OBSERVATIONS:
         unnamed.append(f"only {shares.observations:.0%} of the observations see a 3D point")
-    if shares.placed < _FEW_PLACED:
+    if shares.placed < FEW_PLACED:
         unnamed.append(f"only {shares.placed:.0%} of the images are placed")
-    elif shares.here < _FEW_PLACED:
-        unnamed.append(f"{1.0 - shares.here:.0%} of the images stand in another model")
+    elif shares.here < FEW_PLACED:
+        unnamed.append(in_another_model(shares.here))
     reasons = bad or tuple(unnamed)
     grade = Grade.DO_NOT_USE if bad else Grade.LOOK if named or unnamed else Grade.GOOD
     return ModelVerdict(grade=grade, cameras=named, reasons=reasons)
+
+
+def in_another_model(here: float) -> str:
+    """Say that a model has only a share of the images that stand in some model."""
+    return f"{1.0 - here:.0%} of the images stand in another model"
 
 
 def _reasons_against(shares: Shares) -> Iterator[str]:

@@ -362,6 +362,8 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     assert list(found.left_out) == ["0008.jpg"]
     assert "no matches" in found.left_out["0008.jpg"]
     assert any("is in no model" in warning for warning in found.warnings)
+    assert found.models[0].located.verdict.statement == "good"
+    assert found.verdict.statement == "look: 43% of the images stand in another model"
     sfm_shapefit.write_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
 
