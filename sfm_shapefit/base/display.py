@@ -50,8 +50,8 @@ class Telling(NamedTuple):
     elsewhere: str = "see locate.json"
     """Where lines stand that are too many to be shown."""
     step: NextStep = NextStep("", "")
-    folder: str = "."
-    """The folder in OUT that the next step is about, which has the report."""
+    folders: tuple[str, ...] = (".",)
+    """The folders in OUT that have a report; the next step is about the first."""
 
 
 class Displayed:

@@ -36,9 +36,8 @@ PriorsFile = Annotated[
     typer.Option(
         "--priors",
         metavar="FILE|FOLDER|database",
-        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; the "
-        "folder of the images, for the GPS positions of their EXIF data; or the database's own pose priors. "
-        "Priors with standard deviations pull the cameras accordingly.",
+        help="Position priors of a file (name x y z [sigma], or name,lat,lon,alt with that header), of the "
+        "EXIF data of a folder of images, or of the database; by standard deviations they pull the cameras.",
     ),
 ]
 
@@ -65,12 +64,10 @@ Config = Annotated[Path | None, typer.Option("--config", help="Options from a TO
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 ImageFolder = Annotated[
     Path | None,
-    typer.Option(
-        "--images", metavar="DIR", help="Folder of the images, small pictures of which are in the report."
-    ),
+    typer.Option("--images", "--image_path", metavar="FOLDER", help="Folder of the images, for the report."),
 ]
 
-_SHORT = {"quiet": "-q", "verbose": "-v"}
+_ALSO = {"quiet": "-q", "verbose": "-v", "images": "--image_path"}
 
 _METAVARS: dict[Any, str] = {
     "known_distance": "NAME NAME DISTANCE",
@@ -255,7 +252,7 @@ def flags_of(settings: type[Settings], *names: str) -> list[inspect.Parameter]:
             is_switch = settings is OutputFlags and item.default is False
             has_opposite = item.kind is bool and not is_switch
             spelled = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
-            spelled += [_SHORT[item.name]] if item.name in _SHORT else []
+            spelled += [_ALSO[item.name]] if item.name in _ALSO else []
             shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
             default = "" if item.default in (None, "", ()) or is_switch else f" [default: {shown}]"
             flagged = typer.Option(

@@ -13,6 +13,7 @@ import typer
 
 from sfm_shapefit.base.display import row
 from sfm_shapefit.base.settings import S, flat_values
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     print_answer,
@@ -70,7 +71,7 @@ class Run(Generic[S]):
 
     def _tell(self, found: "Result", source: Path, out: Path) -> None:
         """Print the details if they are wanted, the answer, the verdict, and what to do next."""
-        told, page = found.told, out / found.told.folder / "report.html"
+        told, pages = found.told, [str(out / folder / "report.html") for folder in found.told.folders]
         if self.flags.verbose:
             known = dict(found.timings_s)
             rest = time.perf_counter() - self.started - sum(known.values())
@@ -78,8 +79,8 @@ class Run(Generic[S]):
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
         pictures = row("warning", self._missing_pictures(found.image_names))
         print_answer(told._replace(rows=[*told.rows, pictures]), self._describe_time())
-        opened = f"; open {shlex.quote(str(page))}" if self.flags.report else ""
-        step = self._with_folder(told.step.command, out / told.folder)
+        opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
+        step = self._with_folder(told.step.command, out / told.folders[0])
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _missing_pictures(self, names: Iterable[str]) -> str:

@@ -134,7 +134,7 @@ class ToldOpinion(Record):
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
         if self.ambiguous:
             where = f"{_cameras(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}, but as many matches speak for another rotation")
+            parts.append(f"{where}, but matches speak as much for another rotation")
         percent = f"{100.0 * self.usual:.2g}" if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
         if not parts and self.usual > _ALIKE:

@@ -50,7 +50,7 @@ class Inspection(Record, Displayed, repr=False):
         ]
         rows = [
             row("directions", self.directions),
-            Row("pairs", ["\n".join(f"{count} {status}" for status, count in self.statuses.items())]),
+            Row("pairs", ["\n".join(f"{count}: {status}" for status, count in self.statuses.items())]),
             row("points as nodes", self.points),
             row("rigs", self.rigs),
             row("components", f"{len(seen.components)} (of {sizes} cameras)"),

@@ -178,7 +178,8 @@ class MapResult(Written):
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
         rows += [Row("warning", self.warnings)]
         step = largest.next_step
-        return Telling(lines, rows, details, elsewhere="see map.json", step=step, folder="0")
+        folders = tuple(map(str, range(len(self.models))))
+        return Telling(lines, rows, details, elsewhere="see map.json", step=step, folders=folders)
 
     @property
     def image_names(self) -> tuple[str, ...]:

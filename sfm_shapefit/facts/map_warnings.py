@@ -18,10 +18,11 @@ def map_warnings(
 ) -> Iterator[str]:
     """Yield what the user should know, a sentence each."""
     if incomplete_rigs:
+        rig, count = f"rig {incomplete_rigs[0]} of the database", len(incomplete_rigs)
         yield (
-            f"{len(incomplete_rigs)} rigs of the database are not used, rig "
-            f"{incomplete_rigs[0]} for one, because a sensor has no pose in them or an image no "
-            "frame: their cameras are placed one by one"
+            f"{f'{count} rigs, {rig} for one, are' if count > 1 else f'{rig} is'} not used, since "
+            "a sensor has no pose or an image no frame; their cameras are placed one by one: configure them "
+            "with colmap rig_configurator to place them together"
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements

@@ -220,11 +220,10 @@ class FactsOfModel(Facts):
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
-    def told_lines(self, verb: str, against: tuple[int, int], more: str = "") -> list[str]:
+    def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
         """Return the answer in lines.
 
         Args:
-            verb: what became of the images.
             against: how many pairs contradict it, and of how many.
             more: what else is told of the matches.
         """
@@ -236,7 +235,7 @@ class FactsOfModel(Facts):
         )
         contradict = contradict if against[1] else "no pair says where cameras stand"
         return [
-            f"{self.num_placed:,} of {counted(self.num_images, 'image')} {verb}, "
+            f"{self.num_placed:,} of {counted(self.num_images, 'image')} placed, "
             f"{counted(self.num_points, 'point')}{points}",
             "; ".join(part for part in (f"matches: {source}", contradict, more) if part),
             self.figures.uncertainty(self.sigma_of),
@@ -342,15 +341,15 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         turned = self.rotation_refinement
         is_given = turned is not None and self.inputs.model != IN_MEMORY
         rotations = turned.statement if turned and is_given else ""
-        lines = self.told_lines("placed", (self.pairs["outlier"], self.pairs["usable"]), rotations)
+        lines = self.told_lines((self.pairs["outlier"], self.pairs["usable"]), rotations)
         return Telling(lines, rows, details, step=self.next_step)
 
     def _pair_lines(self) -> list[str]:
         """Say what became of the pairs, in the words of `inspect`."""
         counts = dict(self.pairs)
         contradicting, usable = counts.pop("outlier"), counts.pop("usable")
-        others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
-        return [f"{usable} usable ({contradicting} contradict the solution)", *others]
+        others = [f"{count}: {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
+        return [f"{usable}: usable ({contradicting} contradict the solution)", *others]
 
 
 def next_of_model(grade: Grade, inputs: ModelInputs) -> NextStep:
@@ -404,7 +403,7 @@ class CheckedFacts(FactsOfModel):
         doubted = (row for row in cameras if not row.placed or row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]
         judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
-        lines = self.told_lines("posed", (judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
+        lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
         return Telling(lines, [Row("weak", weak), second], elsewhere="see the report", step=self.next_step)
 

@@ -102,7 +102,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
     against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
-            f"the matches of {against} of {len(directions.pairs)} pairs contradict the given rotations: the "
+            f"the matches of {against} of {len(directions.pairs)} pairs contradict the rotations: the "
             "scene repeats itself, or rotations or intrinsics are wrong"
         )
 
@@ -147,7 +147,7 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))
         yield (
             f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} by {by} "
-            "degrees as for the rotation given"
+            "degrees as against it"
         )
 
 

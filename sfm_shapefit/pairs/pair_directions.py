@@ -17,7 +17,7 @@ class DirectionStatus(enum.Enum):
     USABLE = "usable"
     TOO_FEW_MATCHES = "too few matches"
     FEW_INLIERS = "too few inlier matches in front of both cameras"
-    LOW_INLIER_RATIO = "most matches contradict the given rotations"
+    LOW_INLIER_RATIO = "most matches contradict the rotations"
     NO_PARALLAX = "no parallax: the matches do not determine the direction"
     TWO_MOTIONS = "the matches agree on two different directions"
     AMBIGUOUS_SIGN = "points lie in front of the cameras for either sign of the direction"

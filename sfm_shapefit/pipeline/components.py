@@ -50,9 +50,7 @@ class ComponentAveraging(NamedTuple):
             members = waiting.pop(0)
             if len(members) < least:
                 if len(members) > 1:
-                    few = (
-                        f"matched with {counted(len(members) - 1, 'other image')} only; a model needs {least}"
-                    )
+                    few = f"matched with only {_others(len(members) - 1)}; a model needs {least}"
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
             inside, local = pairs_among(relative, members)
@@ -70,7 +68,7 @@ class ComponentAveraging(NamedTuple):
             if len(kept) >= least:
                 yield kept, answer.subset(answer.registered)
             else:
-                tied = f"tied to {counted(len(kept) - 1, 'other image')} only by pairs that can be believed"
+                tied = f"pairs that can be believed tie it to only {_others(len(kept) - 1)}"
                 reasons |= dict.fromkeys(kept.tolist(), f"{tied}; a model needs {least}")
 
     def _average_component(
@@ -124,6 +122,11 @@ def pairs_among(
     """Return the pairs among some images or frames, ascending, and the same by their place among these."""
     inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
     return inside, replace(inside, pairs=np.searchsorted(members, inside.pairs))
+
+
+def _others(count: int) -> str:
+    """Count other frames, which are images where no rig is."""
+    return f"{counted(count, 'other image')} (or frame of a rig)"
 
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:

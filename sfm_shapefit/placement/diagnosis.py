@@ -12,7 +12,7 @@ corruption     In a triangle without errors each direction lies on the arc betwe
                0.09 at 0.5, on six synthetic families (`scripts/results/notes.md#corruption-by-triangles`). It
                does not see wrong pairs that agree with one another; in the plane it is too low.
 
-A camera most of whose matches contradict the given rotations is named as well. Where the scene repeats itself
+A camera most of whose matches contradict the rotations is named as well. Where the scene repeats itself
 right cameras are among these, unless the pairs' own relative rotations (`judgement.turns`) confirm them.
 """
 
@@ -186,7 +186,7 @@ def _find_weak_cameras(
             )
         if num_against[camera] > num_pairs[camera] and not confirmed[camera]:
             reasons.append(
-                f"the matches of {num_against[camera]} further pairs contradict the given rotations, more "
+                f"the matches of {num_against[camera]} further pairs contradict the rotations, more "
                 f"than its {num_pairs[camera]} usable ones, as in scenes that repeat"
             )
         if num_ties[camera] > num_wrong[camera] and spread[camera] < NEARLY_PARALLEL:

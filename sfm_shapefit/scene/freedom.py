@@ -19,9 +19,8 @@ class FreedomOptions(Settings):
 
     adjust: Adjust = option(
         "seed",
-        'How far poses and points are adjusted to the pixels: "seed", once, by all tracks, up to 2,000 '
-        'cameras, with rotations as far as they are in doubt; "full", once more, by a bundle adjustment; '
-        '"none", not at all.',
+        'Whether poses and points are bundle adjusted once ("seed"), twice ("full") or not ("none"): first '
+        "by all tracks, up to 2,000 cameras, with rotations as far as they are in doubt; then all freely.",
     )
     intrinsics: IntrinsicsFreedom = option(
         "auto",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.facts.map_warnings import map_warnings
 from sfm_shapefit.facts.warnings import match_warnings
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
@@ -72,7 +73,7 @@ def test_a_wall_that_repeats_inside_pairs_is_warned_of_and_any_other_wall_is_not
         ({"USABLE": 96, "TWO_MOTIONS": 4}, []),
         ({"USABLE": 8, "TWO_MOTIONS": 2}, []),
         ({"USABLE": 8, "TWO_MOTIONS": 3}, ["of 3 pairs agree on two directions each, those of 8 on one"]),
-        ({"USABLE": 4, "LOW_INLIER_RATIO": 5}, ["of 5 of 9 pairs contradict the given rotations"]),
+        ({"USABLE": 4, "LOW_INLIER_RATIO": 5}, ["of 5 of 9 pairs contradict the rotations"]),
         ({"USABLE": 5, "LOW_INLIER_RATIO": 5}, []),
         ({"USABLE": 1, "TOO_FEW_MATCHES": 99}, []),
     ],
@@ -80,3 +81,12 @@ def test_a_wall_that_repeats_inside_pairs_is_warned_of_and_any_other_wall_is_not
 def test_warnings_need_a_share_of_the_pairs_and_more_than_one_or_two_and_give_numbers(counts, said):
     for warning, words in zip(match_warnings(statuses(**counts)), said, strict=True):
         assert words in warning
+
+
+@pytest.mark.parametrize(
+    ("rigs", "told"), [((4,), "rig 4 of the database is not used"), ((4, 7), "2 rigs, rig 4 of the database")]
+)
+def test_rigs_that_are_not_calibrated_are_counted_and_the_cure_is_told(rigs, told):
+    (warning,) = map_warnings(rigs, [], {})
+    assert warning.startswith(told)
+    assert "colmap rig_configurator" in warning

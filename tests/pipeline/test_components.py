@@ -32,7 +32,7 @@ SOUND, UNSOUND = 0.9, 0.2
 def test_each_frame_of_a_component_too_small_once_averaged_is_told_so():
     groups, reasons = averaged([(0, 1), (1, 2)], [SOUND, UNSOUND])
     assert groups == []
-    few = "tied to 1 other image only by pairs that can be believed; a model needs 3"
+    few = "pairs that can be believed tie it to only 1 other image (or frame of a rig); a model needs 3"
     assert (reasons[0], reasons[1]) == (few, few)
     assert reasons[2].startswith("no pair that can be believed ties it to the others")
 

@@ -376,7 +376,7 @@ def test_images_in_no_model_are_told_their_own_reason(tmp_path):
     assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
     assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
     assert {found.left_out[name] for name in ("0005.jpg", "0006.jpg")} == {
-        "matched with 1 other image only; a model needs 3"
+        "matched with only 1 other image (or frame of a rig); a model needs 3"
     }
     assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
 

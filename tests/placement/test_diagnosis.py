@@ -85,7 +85,7 @@ def test_a_camera_of_contradicting_matches_is_weak():
     assert diagnose(graph).weak == ()
     (weak,) = diagnose(MeasuredGraph(graph, evidence=evidence)).weak
     assert weak.name == "7"
-    assert "matches of 4 further pairs contradict the given rotations" in weak.reasons[0]
+    assert "matches of 4 further pairs contradict the rotations" in weak.reasons[0]
 
 
 def test_rays_to_points_hold_a_camera_too():
@@ -132,7 +132,7 @@ def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
     assert result.exit_code == 0, result.output
     for words in (
         "found beside the model",
-        "176 usable",
+        "176: usable",
         "tracks join as nodes",
         "1 (of 25 cameras)",
         "newton:",
