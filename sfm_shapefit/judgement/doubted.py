@@ -93,7 +93,7 @@ def _factors(doubts: Doubts) -> FloatArray:
 def _reason(doubts: Doubts, camera: int) -> str:
     """Say what speaks against a camera, the likelier cause first; nothing if nothing does."""
     kind, others = doubts.kinds[camera], len(doubts.members(camera)) - 1
-    together = f", with {others} other camera{'s' if others > 1 else ''}" if others else ""
+    together = f", together with {others} other camera{'s' if others > 1 else ''}" if others else ""
     turn = f"a turn by {doubts.angles_deg[camera]:.0f} degrees{together}"
     if kind is Doubt.TURNED:
         return f"its rotation is wrong: {doubts.num_turned[camera]} of its pairs agree on {turn}"

@@ -37,7 +37,7 @@ class NodeOptions(Settings):
             return f"no: more than {limit} cameras, where they would multiply the time of the solve"
         if not num_points:
             return "no: the pairs hold the cameras, or no three cameras see a point together"
-        return f"{num_points} tracks join as nodes: at most {limit} cameras, so they cost little"
+        return f"{num_points} tracks join as nodes: with at most {limit} cameras they cost little"
 
 
 @explained

@@ -54,7 +54,7 @@ def test_right_cameras_of_a_symmetric_scene_are_kept_and_the_group_is_named():
     assert set(found.verdict.cameras) == {"0004.jpg", "0005.jpg"}
     reasons = {row.name: row.reason for row in found.cameras if row.reason}
     assert set(reasons) == {"0004.jpg", "0005.jpg"}
-    assert all("a turn by 90 degrees, with 1 other camera" in reason for reason in reasons.values())
+    assert all("a turn by 90 degrees, together with 1 other camera" in reason for reason in reasons.values())
 
 
 def test_confirmed_cameras_are_trusted_and_no_reason_counts_them():
