@@ -15,7 +15,14 @@ from sfm_shapefit.base.display import Row, Telling, Written, row
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.facts.joins import Joined
-from sfm_shapefit.facts.model import Averaging, Component, DatabaseInputs, JoinedFacts, MapFacts
+from sfm_shapefit.facts.model import (
+    Averaging,
+    Component,
+    DatabaseInputs,
+    JoinedFacts,
+    MapFacts,
+    next_of_model,
+)
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
@@ -177,8 +184,9 @@ class MapResult(Written):
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
         rows += [Row("warning", self.warnings)]
-        step = largest.next_step
-        folders = tuple(map(str, range(len(self.models))))
+        usable = [one for one in self.joined if 0 in one.models and not one.verdict.is_bad]
+        step = next_of_model(usable[0].verdict.grade, largest.inputs) if usable else largest.next_step
+        folders = (*(one.folder for one in usable), *map(str, range(len(self.models))))
         return Telling(lines, rows, details, elsewhere="see map.json", step=step, folders=folders)
 
     @property

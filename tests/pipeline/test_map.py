@@ -450,6 +450,7 @@ def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tm
     assert facts["join"] == json.loads((tmp_path / "out" / "map.json").read_text())["joins"][0]
     assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["join"] is None
     assert ("joined_0" in names) == (told.join is not None) == (not wrong)
+    assert found.told.folders == (*([] if wrong else ["joined_0"]), "0", "1")
     if wrong:
         assert "model 1 is not joined to model 0: " in told.statement
         return
