@@ -16,6 +16,11 @@ CLICK = (
     "[...document.querySelectorAll('#cameras tbody tr')].find(row => row.textContent.includes(%r)).click()"
 )
 
+# Folders of this machine are named from where it was started.
+SHORTEN = (
+    "const told = document.getElementById('command'); told.textContent = told.textContent.replaceAll(%r, '')"
+)
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
@@ -30,8 +35,7 @@ def main() -> None:
         page = args.out / "report.html"
         page = page if page.exists() else args.out / "0/report.html"  # of `map`
         opened(driver, page.resolve())
-        # It names folders of this machine.
-        driver.execute_script("document.getElementById('next').hidden = true")
+        driver.execute_script(SHORTEN % f"{Path.cwd()}/")
         if args.camera:
             driver.execute_script(CLICK % args.camera)
             driver.execute_async_script("setTimeout(arguments[0], 3000)")  # it flies there

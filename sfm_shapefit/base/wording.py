@@ -18,4 +18,6 @@ def counted(number: int, noun: str) -> str:
 
 def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:
     """Return a number in so many digits; one that is smaller than `smallest` is 0."""
+    if 10.0**digits <= abs(value) < 1e6:
+        return f"{value:.0f}"  # no power of ten
     return "0" if abs(value) < smallest else f"{value:.{digits}g}"

@@ -68,14 +68,14 @@ def check_command(
         from sfm_shapefit.files.colmap.model import read_model
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
-        from sfm_shapefit.pipeline.write import refuse_page
+        from sfm_shapefit.pipeline.write import refuse_file
 
         if images is not None and report is None:
             raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite:
                 read_model(source)  # what is wrong with that is said first
-            refuse_page(report, overwrite=overwrite)
+            refuse_file(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)
         if report is not None:

@@ -55,6 +55,7 @@ def evaluate_command(
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
     as_json: Json = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Also AUC of relative poses, and recall.")
@@ -66,7 +67,10 @@ def evaluate_command(
     with report_errors():
         from sfm_shapefit.facts.tables import write_records
         from sfm_shapefit.pipeline.evaluate import evaluate, evaluate_against_table
+        from sfm_shapefit.pipeline.write import refuse_file
 
+        if csv is not None:
+            refuse_file(csv, overwrite=overwrite)
         errors: Evaluation | PositionEvaluation
         if truth.is_file() and truth.suffix.lower() in _TABLES:
             if threshold or trajectory:
@@ -75,8 +79,6 @@ def evaluate_command(
         else:
             errors = evaluate(source, truth, thresholds=threshold or (), trajectory=trajectory)
         if csv is not None:
-            if csv.exists() and csv.suffix.lower() != ".csv":
-                raise InputError(f"{csv} exists and is no .csv file; choose another name")
             write_records(errors.rows(), csv)
         if as_json:
             print_json(errors.summary())

@@ -37,7 +37,7 @@ PriorsFile = Annotated[
         "--priors",
         metavar="FILE|FOLDER|database",
         help="Position priors of a file (name x y z [sigma], or name,lat,lon,alt with that header), of the "
-        "EXIF data of a folder of images, or of the database; by standard deviations they pull the cameras.",
+        "EXIF data of a folder of images, or of the database; standard deviations make them pull.",
     ),
 ]
 
@@ -119,7 +119,7 @@ class OutputFlags(Settings):
     """What is written and shown."""
 
     config: str = option("", "Options from a TOML file; flags win over it.")
-    overwrite: bool = option(False, "Replace an earlier output of this command.")
+    overwrite: bool = option(False, "Replace an earlier output of sfm-shapefit, of any command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
     images: str = option(
         "", "Folder of the images, small pictures of which are in report.html; 4 MB at most."
@@ -324,7 +324,7 @@ def read_options(settings: type[S], given: dict[str, Any], config: Path | None =
     try:
         return settings(**values)
     except (TypeError, ValueError) as error:
-        message = str(error)
+        message = f"{config}: {error}" if config and isinstance(error, TypeError) else str(error)
         for name in flags:  # an option of the file keeps its spelling
             message = re.sub(rf"\b{name}(?=[ =])", _flag_of(name), message)
             message = message.replace(f"{_flag_of(name)}=", f"{_flag_of(name)} ")
@@ -344,8 +344,19 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     homes = homes_of(settings)
     for name in read.keys() - {*homes, *homes.values()}:
-        raise typer.BadParameter(f"{path}: {name!r} is no option; {hint(name, sorted(homes))}")
+        raise typer.BadParameter(f"{path}: {name!r} {_describe_unknown(name, sorted(homes))}")
     return read
+
+
+def _describe_unknown(name: str, known: Sequence[str]) -> str:
+    """Say what a key is that this command does not know: a flag, another command's, or a typo."""
+    from sfm_shapefit.facts.options import InspectOptions, JoinOptions, LocateOptions, MapOptions
+
+    if name in {"database", "priors", "executor", *homes_of(OutputFlags)}:
+        return f"is no key of a file; give it as a flag: {_flag_of(name)}"
+    kinds = {"locate": LocateOptions, "map": MapOptions, "join": JoinOptions, "inspect": InspectOptions}
+    others = [command for command, kind in kinds.items() if name in homes_of(kind)]
+    return f"is an option of {' and '.join(others)}" if others else f"is no option; {hint(name, known)}"
 
 
 def one_path(positional: Path | None, flag: Path | None, name: str) -> Path:

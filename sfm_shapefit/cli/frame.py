@@ -3,7 +3,7 @@
 import re
 import shlex
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +13,7 @@ import typer
 
 from sfm_shapefit.base.display import row
 from sfm_shapefit.base.settings import S, flat_values
-from sfm_shapefit.base.wording import first_of
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     print_answer,
@@ -83,14 +83,17 @@ class Run(Generic[S]):
         step = self._with_folder(told.step.command, out / told.folders[0])
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
-    def _missing_pictures(self, names: Iterable[str]) -> str:
-        """Warn if pictures were asked for, and the folder has none of the images."""
+    def _missing_pictures(self, names: Sequence[str]) -> str:
+        """Warn if pictures were asked for, and the folder lacks images."""
+        if not self.flags.images:
+            return ""
         from sfm_shapefit.base.paths import file_of
 
         folder = Path(self.flags.images)
-        if not self.flags.images or not self.flags.report or any(file_of(folder, name) for name in names):
+        missing = [name for name in names if not file_of(folder, name)]
+        if not missing:
             return ""
-        return f"{folder} has none of the images, so the report has no pictures"
+        return f"{folder} lacks {len(missing)} of {counted(len(names), 'image')}: is it the right folder?"
 
     def _with_folder(self, command: str, out: Path) -> str:
         """Return a command with the folders of the result, and of the images if told, filled in."""

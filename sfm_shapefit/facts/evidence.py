@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
@@ -135,7 +135,7 @@ class ToldOpinion(Record):
         if self.ambiguous:
             where = f"{_cameras(self.ambiguous)} in the same place {by}"
             parts.append(f"{where}, but matches speak as much for another rotation")
-        percent = f"{100.0 * self.usual:.2g}" if self.usual > _LEAST_TOLD else "less than 0.001"
+        percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
         if not parts and self.usual > _ALIKE:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.display import NextStep, Row, Telling, row
 from sfm_shapefit.base.record import Record
-from sfm_shapefit.base.wording import counted
+from sfm_shapefit.base.wording import counted, rounded
 from sfm_shapefit.facts.control_points import ControlPoint, describe_control_points
 from sfm_shapefit.facts.evidence import ToldEvidence
 from sfm_shapefit.facts.intrinsics import CameraIntrinsics, describe_intrinsics
@@ -138,7 +138,8 @@ class RotationRefinement(Record):
         """The same in words."""
         if not self.num_updated:
             return "rotations kept"
-        return f"rotations refined by {self.median_change_deg:.2g} deg (at most {self.max_change_deg:.2g})"
+        usual, most = (rounded(deg, digits=2) for deg in (self.median_change_deg, self.max_change_deg))
+        return f"rotations refined by {usual} deg (at most {most})"
 
     @classmethod
     def of_turns(cls, turned_deg: FloatArray | None) -> Self | None:
@@ -389,6 +390,9 @@ class CheckedFacts(FactsOfModel):
         if second is not None and second.wrong:
             command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
             return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
+        if not self.inputs.database or self.figures.pair_error_deg is None:
+            text = "Next: check it against the database that it was made from."
+            return NextStep(text, f"sfm-shapefit check {path} --database DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 

@@ -78,8 +78,8 @@ class LocateOptions(Composed):
     rotations: Rotations = option(
         "auto",
         'How far the given rotations are believed: "held", as measured by instruments, not doubted; "free", '
-        "ignored by the adjustment; a number, their standard deviation about each axis in degrees, by which "
-        "the adjustment pulls, and which the relative rotations of pairs first correct from 0.3 on; "
+        "ignored by the adjustment; a number, their standard deviation about each axis in degrees: from "
+        "0.3 on, the relative rotations of pairs first correct them; "
         '"auto" asks the matches how far off they are, and which cameras are turned.',
     )
     source: SourceOptions = group(SourceOptions)

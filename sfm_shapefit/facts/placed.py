@@ -464,7 +464,7 @@ class GraphFacts(PlacedFacts):
         """What to do next."""
         return NextStep(
             "Next: the positions are in cameras.csv; look at them from all sides.",
-            "open {out}/cameras.csv",
+            "see {out}/cameras.csv",
         )
 
     def told(self, left_out: Sequence[str], locations: str) -> Telling:

@@ -49,6 +49,13 @@ def rotation_warnings(turned_deg: FloatArray, names: Sequence[str], sigma_deg: f
         yield f"{counted(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 
+def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[str]:
+    """Yield that all given rotations, said to be off by `sigma_deg`, are farther off, as of another scene."""
+    typical = float(np.nanmedian(turned_deg)) / _MEDIAN_TURN if np.isfinite(turned_deg).any() else 0.0
+    if typical > _GROSS * sigma_deg:
+        yield f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: is this the model's database?"
+
+
 def quality_warnings(placement: Judged) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
     if placement.certified.status is not Status.CONVERGED:

@@ -117,9 +117,9 @@ def _drawing_of(source: "ModelSource") -> "Drawing":
 
 def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:
     """Write a file whole or not at all."""
-    from sfm_shapefit.pipeline.write import refuse_page
+    from sfm_shapefit.pipeline.write import refuse_file
 
-    refuse_page(path, overwrite=overwrite)
+    refuse_file(path, overwrite=overwrite)
     partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
     try:
         partial.write_bytes(content)

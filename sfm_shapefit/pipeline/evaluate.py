@@ -61,7 +61,7 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     """
     posed, (rows, geodetic) = read_model(Path(model)), read_position_table(Path(table))
     positions = np.array([position for position, _ in rows.values()]).reshape(-1, 3)
-    datum, statement = None, "positions as they stand, in the same axes and units"
+    datum, statement = None, "positions as they stand, as if both had the same axes and units"
     if geodetic:
         datum = _datum_of(Path(model))
         statement = "meters east, north and up of the model's datum"

@@ -39,7 +39,7 @@ from sfm_shapefit.rotations.average import average_relative_rotations, check_pai
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
-from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
@@ -71,6 +71,7 @@ def solve_dense(_folder: Path) -> None:
     """Solve graphs by Newton steps: from a rough start, from least squares, and with a float32 factor."""
     for graph in (_random_graph(), _long_graph(40), _random_graph(num_nodes=160)):
         solve(graph, threads=2)
+    solve_newton_dense(_long_graph(160), 1e-8, 50)
 
 
 def start_by_lud(_folder: Path) -> None:

@@ -27,7 +27,7 @@ from sfm_shapefit.tracks.node_tracks import TrackJoiner, covering_set, join_poin
 from sfm_shapefit.tracks.options import NodeOptions
 
 _CHECK_ROTATIONS = (
-    "check that rotations and intrinsics belong to these matches; rough rotations need rotations=2"
+    "is this the model's database, with right intrinsics? Rotations that are degrees off need rotations=2"
 )
 _MAX_SAMPLED_PAIRS = 100_000  # pairs; beyond, standard deviations take them as independent, for memory
 _MOST_PAIRS = 200_000  # pairs, usable or not; of more, none is sampled to begin with

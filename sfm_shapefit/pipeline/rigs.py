@@ -228,7 +228,9 @@ def _named_images(model: ColmapModel, path: Path) -> BoolArray:
         if not name or name.startswith("#"):
             continue
         if name not in index:
-            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}")
+            raise InputError(
+                f"{path}, line {number}: the model has no posed image {name!r}; give one name per line"
+            )
         fixed[index[name]] = True
     if not fixed.any():
         raise InputError(f"{path} names no image; give the name of one image per line")

@@ -17,7 +17,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1
 from sfm_shapefit.facts.options import LocateOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.facts.warnings import rotation_warnings
+from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
     estimate_relative_rotations,
@@ -60,7 +60,9 @@ def settle_rough(
     found = settle(given, source, options, clock, first)
     told = _tell_changes(found, rough, given.images)
     assert told.turned_deg is not None
-    wrong = rotation_warnings(told.turned_deg, rough.names, float(np.degrees(sigma_rad)))
+    sigma_deg = float(np.degrees(sigma_rad))
+    wrong = rotation_warnings(told.turned_deg, rough.names, sigma_deg)
+    told = replace(told, suspicions=(*found.suspicions, *rotation_suspicions(told.turned_deg, sigma_deg)))
     further = tuple(_tell_changes(piece, rough, given.images) for piece in found.further)
     return replace(told, further=further, warnings=(*wrong, *found.warnings))
 

@@ -120,7 +120,7 @@ def write_page(
     found: Reported, page: Path | str, *, images: Path | str = "", overwrite: bool = False
 ) -> None:
     """Write the report of a result to a file; see `Reported.report`."""
-    refuse_page(Path(page), overwrite=overwrite)
+    refuse_file(Path(page), overwrite=overwrite)
     try:
         has_pictures = _write_report(found, Path(page), images)
     except OSError as error:
@@ -129,7 +129,7 @@ def write_page(
         raise InputError(f"{images} has none of the images, so {page} has no pictures")
 
 
-def refuse_page(page: Path, *, overwrite: bool) -> None:
+def refuse_file(page: Path, *, overwrite: bool) -> None:
     """Refuse a file to be made that exists, or whose folder does not.
 
     Raises:
@@ -168,7 +168,7 @@ def _write_report(found: Any, page: Path, images: Path | str) -> bool:
     shown = found.models[0].located if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
     pictures = thumbnails_of(drawing, images)
-    write_report(drawing, shown.facts, page, pictures)
+    write_report(drawing, shown.facts, page, pictures, images)
     return pictures is None or bool(pictures)
 
 

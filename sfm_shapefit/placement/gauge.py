@@ -27,6 +27,7 @@ from sfm_shapefit.scene.given import Datum, PositionPriors
 
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
+_MEANINGLESS = 0.5  # spreads; random positions are .6 off
 _COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
 ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
 """What can set a scale, by precedence."""
@@ -84,7 +85,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
     if off > _ROUGH:
         warning = (
             f"the input's centers are {off:.0%} of their spread off the answer, so the scale taken from them "
-            "is rough; use the scale unit if they mean nothing"
+            "is rough; give scale=unit if they mean nothing"
         )
     statement = "input: scale and origin of the input's centers, its axes"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
@@ -301,10 +302,13 @@ def _prior_statement(
 
 def _prior_warning(level: float, size: float, *, turns: bool, axes_known: bool) -> str:
     if level > _ROUGH * size:
-        return (
-            f"the position priors are {level / size:.0%} of their spread off the answer, so scale and axes "
-            "taken from them are rough; check them"
+        rough = (
+            "are rough; check them"
+            if level < _MEANINGLESS * size
+            else "mean nothing: are they of this scene?"
         )
+        off = f"the position priors are {level / size:.0%} of their spread off the answer"
+        return f"{off}, so scale and axes taken from them {rough}"
     if not turns and not axes_known:
         return (
             "the position priors lie on a line or are fewer than three, so the model is turned onto that "

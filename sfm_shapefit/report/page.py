@@ -61,21 +61,30 @@ _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js
 
 
 def write_report(
-    drawing: Drawing, facts: Facts, path: Path, thumbnails: dict[int, str] | None = None
+    drawing: Drawing,
+    facts: Facts,
+    path: Path,
+    thumbnails: dict[int, str] | None = None,
+    images: Path | str = "",
 ) -> None:
     """Write the report of a result; see `report_html`."""
-    path.write_text(report_html(drawing, facts, thumbnails), encoding="utf-8", newline="\n")
+    page = report_html(drawing, facts, thumbnails, str(Path(images).absolute()) if thumbnails else "IMAGES")
+    path.write_text(page, encoding="utf-8", newline="\n")
 
 
-def report_html(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None) -> str:
+def report_html(
+    drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None = None, images: str = "IMAGES"
+) -> str:
     """Return the page.
 
     Args:
         drawing: what is drawn.
         facts: what is told of it.
         thumbnails: data URLs of pictures by row of the cameras, as of `read_thumbnails`; none if None.
+        images: the folder of the images, for the next command.
     """
     data, script = page_data(drawing, facts, thumbnails), _script()
+    data["images"] = images
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
         "hashes": f"'sha256-{_hash(script)}'",

@@ -53,6 +53,7 @@ _MIN_COMMON = 3  # centers in common; fewer never determine a similarity
 # Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
 # failed on some sets of 7 and 11 cameras.
 _CAP_OF_SPREAD = 0.5
+_OTHER_SCENE_DEG = 20.0  # degrees; poses that are only rough are nearer, unlike scenes 30 and more apart
 _COLLINEAR_RATIO = 1e-3  # second over first singular value of the centers; with less they are a line
 # Largest entry of R R^T - I; published references printed with 6 digits are off by 2e-6.
 _ORTHOGONALITY_TOLERANCE = 1e-4
@@ -274,6 +275,7 @@ def evaluate_poses(
     turns = np.swapaxes(reference.rotations[in_ref], 1, 2) @ model.rotations[in_model]
     global_rotation = mean_rotation_l1(turns)
 
+    turned_deg = rotation_angles_deg(turns @ global_rotation.T)
     close = errors < cap
     degenerate = _on_a_line(x, close) or _on_a_line(y, close)
     extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
@@ -285,7 +287,7 @@ def evaluate_poses(
         missing=_only_in(reference.names, model.names),
         extra=_only_in(model.names, reference.names),
         position_errors=frozen(errors),
-        rotation_errors_deg=frozen(rotation_angles_deg(turns @ global_rotation.T)),
+        rotation_errors_deg=frozen(turned_deg),
         aligned_centers=frozen(aligned),
         ref_from_model=ref_from_model,
         rotation_ref_from_model=frozen(global_rotation),
@@ -294,7 +296,7 @@ def evaluate_poses(
         relative_pose_errors_deg=frozen(pair_errors),
         relative_pose_aucs=_relative_pose_aucs(pair_errors, len(in_ref), len(reference.names)),
         trajectory=trajectory_errors(ours.taken(in_time), theirs.taken(in_time)) if trajectory else None,
-        warnings=_warnings(degenerate, close, cap),
+        warnings=_warnings(degenerate, close, cap, turned_deg),
     )
 
 
@@ -395,9 +397,11 @@ def _relative_pose_aucs(
     )
 
 
-def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]:
+def _warnings(degenerate: bool, close: BoolArray, cap: float, turned_deg: FloatArray) -> tuple[str, ...]:
     """Return the sentences that a reader of the figures must know."""
     found = []
+    if (turn := float(np.median(turned_deg))) > _OTHER_SCENE_DEG:
+        found.append(f"rotations differ by {turn:.0f} degrees, median: do both models show the same scene?")
     if degenerate:
         found.append(_ON_A_LINE)
     if 2 * int(close.sum()) <= len(close):

@@ -20,7 +20,7 @@ class FreedomOptions(Settings):
     adjust: Adjust = option(
         "seed",
         'Whether poses and points are bundle adjusted once ("seed"), twice ("full") or not ("none"): first '
-        "by all tracks, up to 2,000 cameras, with rotations as far as they are in doubt; then all freely.",
+        "by all tracks, with rotations as far as they are in doubt (up to 2,000 cameras); then all freely.",
     )
     intrinsics: IntrinsicsFreedom = option(
         "auto",
@@ -31,8 +31,8 @@ class FreedomOptions(Settings):
     )
     rigs: RigFreedom = option(
         "held",
-        'Where sensors stand in their rigs: "held", where they are; "free", the adjustments change it, each '
-        "by one pose for all frames. The reference sensors stay, and so does the mean distance of the others "
+        'Where sensors stand in their rigs: "held", where they are; "free", refined, one pose for all frames '
+        "each. The reference sensors stay, and so does the mean distance of the others "
         "from them: the scale is still that of the rigs. Refused where the matches do not "
         "determine a sensor's pose.",
     )

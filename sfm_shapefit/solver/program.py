@@ -63,12 +63,12 @@ def scale_functional(graph: ViewGraph) -> FloatArray:
 
 def projected_length(graph: ViewGraph, t: FloatArray) -> float:
     """Return L(T), the weighted sum of the baselines' lengths along their directions."""
-    return _sums(t, graph.edges, graph.directions, graph.weights)[1]
+    return _sums_of(graph, t)[1]
 
 
 def objective(graph: ViewGraph, t: FloatArray) -> float:
     """Return R(T) / L(T), the paper's objective; infinite where L(T) <= 0."""
-    residual, length = _sums(t, graph.edges, graph.directions, graph.weights)
+    residual, length = _sums_of(graph, t)
     return residual / length if length > 0.0 else float("inf")
 
 
@@ -107,6 +107,11 @@ def _across(x: Any, v: Any, out: Any) -> None:
             length += x[e, k] * v[e, k]
         for k in range(x.shape[1]):
             out[e, k] = x[e, k] - length * v[e, k]
+
+
+def _sums_of(graph: ViewGraph, t: FloatArray) -> tuple[float, float]:
+    # In one layout: kernels are compiled by layouts.
+    return _sums(np.ascontiguousarray(t), graph.edges, graph.directions, graph.weights)
 
 
 @kernel

@@ -36,11 +36,9 @@ class SceneOptions(Settings):
         2000, "Number of surface points; those seen by fewer than two images stay out of the model."
     )
     pixel_noise_px: float = option(0.5, "Standard deviation of each keypoint coordinate.")
-    wrong_match_fraction: float = option(
-        0.0, "Fraction of each pair's matches that join random keypoints of the list."
-    )
+    wrong_match_fraction: float = option(0.0, "Fraction of each pair's matches that join random keypoints.")
     corrupted_pair_fraction: float = option(
-        0.0, "Fraction of the pairs whose whole list agrees on a false baseline."
+        0.0, "Fraction of the pairs all of whose matches agree on a false baseline."
     )
     rotation_noise_deg: float = option(
         0.0, "Standard deviation, about each axis, of the error of the rotations that the model states."

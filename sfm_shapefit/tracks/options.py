@@ -19,7 +19,7 @@ class NodeOptions(Settings):
         "auto",
         "3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what "
         'directions between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 '
-        "cameras, from 1,000 on only where many pairs of many directions do not hold nearly every camera.",
+        "cameras, from 1,000 on only where pairs do not hold nearly all cameras.",
     )
 
     def uses_points(self, num_cameras: int) -> bool:

@@ -82,7 +82,7 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
 
 def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):
     said = run("locate", RING_MODEL, tmp_path / "out", "--images", tmp_path, code=0).stdout
-    assert "has none of the images" in " ".join(said.replace("│", " ").split())
+    assert "lacks 8 of 8 images: is it the right folder?" in " ".join(said.replace("│", " ").split())
     assert "--images" in run("locate", "--help").stdout
     assert "--images" not in run("place", "--help-all").stdout
     graph = BUNDLED / "graph40.txt"
@@ -397,9 +397,32 @@ def test_evaluate_prints_a_table_json_and_csv_and_writes_over_no_other_file(ring
     lines = (tmp_path / "errors.csv").read_text().splitlines()
     assert lines[0] == "name,position_error,rotation_error_deg,x,y,z"
     assert len(lines) == 9
-    (tmp_path / "images.bin").write_bytes(b"precious")
-    run_refused(*arguments, "--csv", tmp_path / "images.bin")
-    assert (tmp_path / "images.bin").read_bytes() == b"precious"
+    (tmp_path / "cameras.csv").write_bytes(b"precious")
+    assert "exists already" in run_refused(*arguments, "--csv", tmp_path / "cameras.csv")
+    assert (tmp_path / "cameras.csv").read_bytes() == b"precious"
+    run(*arguments, "--csv", tmp_path / "cameras.csv", "--overwrite", code=0)
+    assert (tmp_path / "cameras.csv").read_text().splitlines() == lines
+
+
+def test_models_of_other_scenes_are_not_compared_in_silence(ring_run):
+    said = run("evaluate", ring_run[1], BUNDLED / "photographed" / "truth", code=0).stdout
+    assert "do both models show the same scene?" in " ".join(said.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('sequence = "none"', "'sequence' is an option of map"),
+        ('priors = "gps.csv"', "'priors' is no key of a file; give it as a flag: --priors"),
+        ("min_trsut = 0.5", "'min_trsut' is no option; did you mean min_trust?"),
+        ("[directions]\nmin_inlier = 3", "options.toml: 'min_inlier' is no option of DirectionOptions"),
+    ],
+)
+def test_a_key_that_the_command_does_not_know_is_explained(line, told, tmp_path):
+    (tmp_path / "options.toml").write_text(line)
+    config = ("--config", tmp_path / "options.toml")
+    said = run("locate", RING_MODEL, tmp_path / "out", *config, code=2).output
+    assert told in " ".join(said.replace("│", " ").split())
 
 
 def test_evaluate_refuses_models_without_common_cameras(tmp_path):

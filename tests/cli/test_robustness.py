@@ -91,7 +91,7 @@ def test_an_image_with_a_name_that_is_too_long_has_no_picture(tmp_path):
     (tmp_path / "named").mkdir()
     model.write(tmp_path / "named")
     said = run("locate", tmp_path / "named", tmp_path / "out", "--images", tmp_path, code=0).stdout
-    assert "has none of the images" in said
+    assert "lacks 8 of 8 images" in said
 
 
 @pytest.mark.parametrize("command", [["inspect", "--json"], ["inspect"], ["check", "--no-second-opinion"]])

@@ -110,6 +110,13 @@ def test_lists_with_focal_lengths_off_and_no_distortion_lead_to_the_model_of_map
     assert errors[0] <= 1.01 * errors[1]
 
 
+def test_poses_of_another_scene_are_doubted(tmp_path):
+    """Those of the ring beside the matches of the courtyard: names are common, nothing else."""
+    found = sfm_shapefit.locate(BUNDLED / "ring8/sparse/0", DATABASE, rotations=2.0, min_trust=0.0)
+    assert found.verdict.grade != "good"
+    assert "is this the model's database?" in found.verdict.statement
+
+
 def test_moved_is_not_told_where_the_given_centers_are_no_places(spoiled):
     flat = posed(spoiled, lambda _, rotation, center: (rotation, 0.0 * center))
     found = sfm_shapefit.locate(flat, DATABASE, rotations=2.0)

@@ -246,7 +246,7 @@ def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_wa
 ):
     with pytest.raises(InputError, match=message):
         prior_gauge(cameras(5), priors_of(positions, rows=rows))
-    assert "rough; check them" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
+    assert "mean nothing: are they of this scene?" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
 
 
 @pytest.fixture(scope="module")
@@ -260,6 +260,19 @@ def write_table(path, model, positions, lines=(), sep=" "):
     ]
     path.write_text("\n".join([*lines, *rows]) + "\n")
     return path
+
+
+@pytest.mark.parametrize("header", ["name,lon,lat,alt", "name,lat,lon", "name,latitude,y,z"])
+def test_a_header_that_names_latitudes_elsewhere_is_refused(ring, tmp_path, header):
+    table = tmp_path / "gps.csv"
+    table.write_text(f"{header}\n{ring.names[0]},48.0,11.0,500\n")
+    with pytest.raises(InputError, match=f"the header {header} is not known; give name,lat,lon,alt"):
+        table_priors(table, ring)
+
+
+def test_a_database_given_for_a_table_of_priors_is_told_how_its_own_are_read(ring):
+    with pytest.raises(InputError, match="its own pose priors are priors=database"):
+        table_priors(BUNDLED / "ring8" / "database.db", ring)
 
 
 def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(ring, tmp_path):

@@ -42,7 +42,7 @@ def test_map_is_not_compared_with_positions_that_no_database_has():
 def test_a_bare_graph_has_its_report_too(tmp_path):
     result = run("place", BUNDLED / "graph40.txt", tmp_path / "out", code=0)
     assert "report.html" in result.stdout
-    assert f"open {tmp_path / 'out'}/cameras.csv" in result.stdout
+    assert f"see {tmp_path / 'out'}/cameras.csv" in result.stdout
     assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 

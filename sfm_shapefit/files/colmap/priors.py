@@ -16,7 +16,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.lines import is_number, lines_of_cells
+from sfm_shapefit.files.lines import is_database, is_number, lines_of_cells
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -26,7 +26,8 @@ _SENSOR_IS_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
 """What joins pose priors to their images, of databases whose priors may be of other sensors too."""
 _TABLE_COLUMNS = (4, 5, 7)  # cells of a row; a name, a position, and no, one or three standard deviations
-_GEODETIC_NAMES = {"lat", "latitude"}
+_GEODETIC = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude", "height"})
+"""Names of the columns of latitude, longitude and altitude, in this order."""
 _LARGEST = 1e30  # units; sums of squares of squares of larger coordinates or sigmas overflow
 
 
@@ -118,11 +119,13 @@ def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatAr
     Raises:
         InputError: if the file cannot be read or a line is malformed.
     """
+    if is_database(path):
+        raise InputError(f"{path} is a database; its own pose priors are priors=database")
     found: dict[str, tuple[FloatArray, FloatArray]] = {}
     geodetic, first = False, True
     for number, cells in lines_of_cells(path):
         if first and len(cells) > 1 and not is_number(cells[1]):
-            geodetic = cells[1].lower() in _GEODETIC_NAMES
+            geodetic = _is_geodetic(path, cells)
         else:
             row = _parse(path, number, cells)
             if cells[0] in found:
@@ -130,6 +133,19 @@ def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatAr
             found[cells[0]] = row
         first = False
     return found, geodetic
+
+
+def _is_geodetic(path: Path, header: list[str]) -> bool:
+    """Return whether the columns are latitude, longitude and altitude, by their names."""
+    named = [word.lower() for word in header[1:4]]
+    are_so = [name in names for name, names in zip(named, _GEODETIC, strict=False)]
+    if all(are_so) and len(are_so) == len(_GEODETIC):
+        return True
+    if any(name in names for name in named for names in _GEODETIC[:2]):
+        raise InputError(
+            f"{path}: the header {','.join(header)} is not known; give name,lat,lon,alt or name,x,y,z"
+        )
+    return False
 
 
 def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
@@ -157,8 +173,8 @@ def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, Float
     """Return position and covariance of a line of a table."""
     if len(cells) not in _TABLE_COLUMNS or not all(map(is_number, cells[1:])):
         raise InputError(
-            f"{path}, line {number}: expected a name, three coordinates and at most one standard deviation "
-            "or three"
+            f"{path}, line {number}: expected a name, three coordinates, and none, one or three "
+            "standard deviations"
         )
     values = np.array([float(cell) for cell in cells[1:]])
     if not (np.abs(values) <= _LARGEST).all() or (values[3:] < 1.0 / _LARGEST).any():

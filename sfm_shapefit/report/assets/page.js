@@ -21,7 +21,8 @@ const drawHead = () => {
 const commandHere = (command) => {
   const inside = location.protocol === "file:" ? decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") : "OUT";
   const quote = (path) => (/^[\w@%+=:,./-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`);
-  return command.replaceAll(/\{out(\w*)\}/g, (_, further) => quote(inside + further));
+  const named = command.replace(" IMAGES ", ` ${quote(data.images)} `);
+  return named.replaceAll(/\{out(\w*)\}/g, (_, further) => quote(inside + further));
 };
 const copyCommand = async () => {
   const text = $("command").textContent;
