@@ -178,7 +178,11 @@ class MapResult(Written):
             title = f"model {number}: {model.located.verdict.statement}" if several else ""
             told = model.located.facts.told((), model.located.placement.refined.statement())
             lines += [title, *told.lines] if several else told.lines
-            rows += told.rows
+            rows += (
+                [one._replace(label=f"{one.label} of model {number}") for one in told.rows]
+                if several
+                else told.rows
+            )
             details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
         rows += [row("join", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
