@@ -225,16 +225,16 @@ class _Joint(NamedTuple):
     def support(self, counted: BoolArray) -> IntArray:
         """Return how many agreeing pairs are between every two pieces, (G, G), of those that count (k,).
 
-        Where just one is missing, points that speak for the join stand in for it.
+        Where just one is missing, or all are of one image, points that speak for the join stand in for it.
         """
         pieces, count = self.evidence.pieces, self.evidence.cameras.num_pieces
         support = np.zeros((count, count), dtype=np.int64)
         for two in np.unique(pieces, axis=0):
             own = (pieces == two).all(axis=1) & self.agrees & counted
             weight = self.evidence.weigh(own)
-            if weight == FEWEST_PAIRS - 1:
+            if weight < FEWEST_PAIRS <= max(weight, int(own.sum())) + 1:
                 (points,) = self.evidence.coinciding(two, own, self.between(two))
-                weight += _speaks(points, 0)
+                weight = FEWEST_PAIRS if _speaks(points, 0) else weight
             support[*two] = support[*two[::-1]] = weight
         return support
 

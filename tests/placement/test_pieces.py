@@ -250,6 +250,12 @@ def test_points_stand_in_for_one_pair_that_is_missing():
     join = drawn.join()[1]
     assert is_right(drawn, join)
     assert join.evidence == "2 of 2 pairs of images between them, and points that coincide"
+    of_one = Drawn(15)
+    for w in range(NUM_CAMERAS, NUM_CAMERAS + 3):
+        of_one.see(0, w)
+    assert "are all of one image" in of_one.join()[1].reason
+    of_one.show()
+    assert is_right(of_one, of_one.join()[1])
     alone = Drawn(15)
     alone.see_some(0, 1, 1)
     alone.show()
