@@ -45,7 +45,7 @@ MOST_LINES = {
     "laplacian": 2070,
     "pairs": 1540,
     "pipeline": 6600,
-    "placement": 2690,
+    "placement": 2813,
     "refinement": 2160,
     "report": 1690,
     "rotations": 2290,

@@ -34,7 +34,7 @@ import numpy as np
 
 import sfm_shapefit.pipeline.write  # noqa: F401  so that results have reports
 from sfm_shapefit import __version__
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.display import Reported
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.wording import counted
@@ -120,7 +120,6 @@ def check_source(
     options: DirectionOptions,
     clock: Clock,
     other: OtherModel | None = None,
-    known: IntArray | None = None,
 ) -> CheckResult:
     """Judge a model whose matches are open: measure, judge and grade it.
 
@@ -130,7 +129,6 @@ def check_source(
         options: how directions are measured.
         clock: what it takes is added to its seconds.
         other: for a second opinion.
-        known: (k, 2) images that are known to stand rightly to one another, by joins.
     """
     with clock("points"):
         structure = _structure(model)
@@ -138,7 +136,7 @@ def check_source(
     fits = _measure(model, matches, options, clock)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
-        evidence = gather_evidence(matches, fits, structure, clock.threads, known)
+        evidence = gather_evidence(matches, fits, structure, clock.threads)
         if fits is not None and other is not None:
             evidence = replace(evidence, second=_compare(matches, fits, structure, other))
     cameras = _judge_cameras(model, quality, pairs, evidence)

@@ -39,7 +39,6 @@ def gather_evidence(
     fits: PairFits | None,
     structure: Structure,
     threads: int,
-    known: IntArray | None = None,
 ) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use.
 
@@ -48,13 +47,12 @@ def gather_evidence(
         fits: of all pairs, their directions measured at these rotations; None if there are none.
         structure: the points of the model.
         threads: number of threads to use.
-        known: (k, 2) images that are known to stand rightly to one another, beside those that are fixed.
     """
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
     if fits is None:
         return ModelEvidence(lenses=lenses)
-    tied, untied = _tie(source, fits, structure, known)
+    tied, untied = _tie(source, fits, structure)
     seams = _question_cuts(source, find_cuts(*fits.sides, tied), threads)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
     contradicted = fits.contradicted(images)
@@ -96,13 +94,11 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) ->
     return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
 
 
-def _tie(
-    source: MatchSource, fits: PairFits, structure: Structure, joined: IntArray | None
-) -> tuple[IntArray, tuple[Untied, ...]]:
+def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[IntArray, tuple[Untied, ...]]:
     """Return what each image (i,) is tied to, by number, and the groups that hardly anything ties to it.
 
-    Frames move as one, and what is fixed stays. Where too few points are known for that, what pairs and
-    points hold is one, and no group is named.
+    Frames move as one, and what is fixed or joined stays. Where too few points are known for that, what pairs
+    and points hold is one, and no group is named.
     """
     points, images, pictures = structure[:3]
     frames = images.frame_of
@@ -111,8 +107,9 @@ def _tie(
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
     fixed = np.zeros(0, dtype=np.int64) if source.fixed is None else np.unique(frames[source.fixed])
     known = [np.column_stack([fixed[step:], fixed[:-step]]) for step in (1, 2)]  # a rigid strip
-    if joined is not None:
-        known.append(frames[joined][frames[joined[:, 0]] != frames[joined[:, 1]]])
+    if source.tied is not None:
+        joined = frames[source.tied]
+        known.append(joined[joined[:, 0] != joined[:, 1]])
     tied, groups = find_groups(len(images.frames.ids), rays, pairs, np.concatenate(known))
     posed = np.unique(frames[images.is_posed])
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):

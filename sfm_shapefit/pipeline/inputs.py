@@ -33,6 +33,8 @@ class MatchSource:
     economy: Economy = ECONOMIES[0]
     fixed: BoolArray | None = None
     """(i,) images that stay where they are; None if none does."""
+    tied: IntArray | None = None
+    """(k, 2) images that joins of their models tie to one another; None if no models were joined."""
     alone: RelativeRotations | None = None
     """What pairs, ascending, said of their rotations alone, before anything was placed; None if not asked."""
 

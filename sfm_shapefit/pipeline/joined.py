@@ -97,8 +97,9 @@ def tell_group(
         group = _rescaled(group, rescale)
     model = read_model(group.reconstruction)
     rows = {name: k for k, name in enumerate(model.images.names)}
-    known = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
-    found = check_source(model, source.at(model.images), options, clock, known=known)
+    tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
+    source = replace(source.at(model.images), tied=tied)
+    found = check_source(model, source, options, clock)
     seen, measures = found.facts, (float(np.median(model.images.focal_lengths_px)), UNITS[gauge.scale])
     cameras = list(_camera_rows(found.cameras, group, located))
     facts = JoinedFacts.taken_from(

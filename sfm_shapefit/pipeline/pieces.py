@@ -106,6 +106,10 @@ class _Seen:
             rotations=np.concatenate([images.rotations for images in own]),
             centers=np.concatenate([images.centers for images in own]),
             is_metric=np.array([piece.is_metric for piece in pieces], dtype=np.bool_),
+            points=tuple(
+                np.reshape([point.xyz for point in piece.model.reconstruction.points3D.values()], (-1, 3))
+                for piece in pieces
+            ),
         )
         self.of_name: dict[str, list[int]] = {}
         for v, name in enumerate(self.names):

@@ -5,15 +5,24 @@
     refinement  all seven unknowns of each, by the rays
     judge       pairs that agree: most of their matches that were set aside fit within a few pixels
     rivals      whether pairs that do not agree do so among themselves on another join
+    points      whether, at one of two joins, points of the one piece stand where the other has its own
 
 Shares of matches do not tell right joins from wrong ones: the matches of a wrong pair agree with the place
 that its other matches made. Other pairs do, so that three are asked for, not all of one image, which may be
 taken for another wherever it is matched; an image that both pieces have counts as two, for it knows its turn
-and its place. Where as many as a quarter of the pairs that agree do so on another join, nothing says which is
-right, and these pairs count for neither; a piece may still be joined by its pairs with a third one.
+and its place.
+
+Pairs that agree on a false place, as houses that look the same make them, may be more than the right ones.
+What neither join has used are the points of no pair that agrees with either: where two pieces show one
+surface, hundreds of these coincide at the right join, and at a wrong one about ten. Where they speak for one
+of two joins it is taken, and the pairs of the other are named; they tell even against a join with which all
+pairs agree but one. Where they do not, and as many as a quarter of the pairs that agree do so on another
+join, nothing says which is right, and these pairs count for neither; a piece may still be joined by its pairs
+with a third one.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -25,6 +34,7 @@ from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import Similarity, compose, invert, rotation_angles_deg
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG
+from sfm_shapefit.placement.coinciding import count_coinciding
 from sfm_shapefit.placement.piece_program import (
     Standing,
     misses_px,
@@ -49,6 +59,8 @@ _MOST_TURNS = 4  # turns between two pieces that are tried; bounds the time wher
 _MOST_ALONE = 10  # pairs by each of which alone two pieces are placed; bounds the time where few are right
 _RIVAL_SHARE = 0.25  # share of the agreeing pairs; from as many rivals on nothing says which join is right
 _FEWEST_RIVALS = 2  # pairs that agree on another join, and are named; one always agrees with itself
+_FEWEST_POINTS, _CLEARLY = 20, 3.0
+"""Coinciding points that speak for a join: so many more than of another, and that many times as many."""
 AGREEING_PX = 4.0
 """Pixels by which a match may miss; pieces bend by as much, and wrong pairs miss by hundreds."""
 _LARGEST_SCALE_SIGMA = 0.03  # relative; above, joins come out wrong
@@ -159,6 +171,17 @@ class _Evidence(NamedTuple):
         has_one = len(ends) > 0 and bool((ends == ends[0]).all(axis=0).any())
         return int(np.sum(np.where(shared, _SHARED, 1))) if not has_one or shared.any() else 1
 
+    def coinciding(self, two: IntArray, pairs: BoolArray, *joins: Similarity) -> list[int]:
+        """Return how many points of two pieces coincide by each join, without those that pairs (k,) match."""
+        first, second = (
+            _without(
+                self.cameras.points[piece],
+                *(part.points[pairs[part.pair_of], way] for part in (self.ties, self.aside)),
+            )
+            for way, piece in enumerate(two.tolist())
+        )
+        return [count_coinciding(first, second, one) for one in joins]
+
     def part(self, pieces: IntArray, chosen: BoolArray | None = None) -> "_Evidence":
         """Return some pieces, by their numbers among all, and their pairs, or the chosen ones (k,)."""
         here = np.isin(self.numbers, pieces)
@@ -177,6 +200,11 @@ class _Evidence(NamedTuple):
         )
 
 
+def _without(points: FloatArray, *others: FloatArray) -> FloatArray:
+    """Return the points (k, 3) that are not among others, by their first coordinate."""
+    return points[~np.isin(points[:, 0], np.concatenate(others)[:, 0])]
+
+
 class _Joint(NamedTuple):
     """Pieces in the world of the first, and which pairs agree."""
 
@@ -188,13 +216,26 @@ class _Joint(NamedTuple):
     solved: SolverResult
     """The program's last solve, from which the refinement started."""
 
+    def between(self, two: IntArray) -> Similarity:
+        """Return how the second of two pieces stands in the world of the first."""
+        middles = self.evidence.cameras.middles()
+        to_first, to_second = (self.standing.similarity(k, middles) for k in two.tolist())
+        return compose(invert(to_first), to_second)
+
     def support(self, counted: BoolArray) -> IntArray:
-        """Return how many agreeing pairs are between every two pieces, (G, G), of those that count (k,)."""
+        """Return how many agreeing pairs are between every two pieces, (G, G), of those that count (k,).
+
+        Where just one is missing, or all are of one image, points that speak for the join stand in for it.
+        """
         pieces, count = self.evidence.pieces, self.evidence.cameras.num_pieces
         support = np.zeros((count, count), dtype=np.int64)
-        for first, second in np.unique(pieces, axis=0).tolist():
-            own = (pieces == [first, second]).all(axis=1)
-            support[first, second] = support[second, first] = self.evidence.weigh(own & self.agrees & counted)
+        for two in np.unique(pieces, axis=0):
+            own = (pieces == two).all(axis=1) & self.agrees & counted
+            weight = self.evidence.weigh(own)
+            if weight < FEWEST_PAIRS <= max(weight, int(own.sum())) + 1:
+                (points,) = self.evidence.coinciding(two, own, self.between(two))
+                weight = FEWEST_PAIRS if _speaks(points, 0) else weight
+            support[*two] = support[*two[::-1]] = weight
         return support
 
 
@@ -281,13 +322,22 @@ def _agreeing(evidence: _Evidence, standing: Standing) -> BoolArray:
 
 def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
     """Yield what comes of joining pieces to the first, by their numbers among all."""
+    false = _none()
     while True:
+        believed = evidence.part(evidence.numbers, ~np.isin(evidence.rows, false))
         try:
-            joint = _search_alone(_search(evidence, FEWEST_PAIRS))
+            joint = _search_alone(_search(believed, FEWEST_PAIRS))
         except UnsolvableError as error:
             yield from ((k, str(error)) for k in evidence.numbers[1:].tolist() if evidence.touches(k))
             return
-        joins = list(_judge(joint))
+        every = evidence.part(joint.evidence.numbers)
+        agrees = np.isin(every.rows, joint.evidence.rows[joint.agrees])
+        joint = joint._replace(evidence=every, agrees=agrees)
+        rivals = _find_rivals(joint, false)
+        if len(rivals.beaten):
+            false = np.append(false, rivals.beaten)
+            continue
+        joins = list(_judge(joint, rivals))
         accepted = [join.piece for join in joins if not join.reason]
         yield from ((join.piece, join) for join in joins if join.reason)
         if len(accepted) == len(joins):
@@ -298,21 +348,17 @@ def _grow(evidence: _Evidence) -> Iterator[tuple[int, PieceJoin | str]]:
         evidence = evidence.part(np.append(evidence.numbers[0], accepted))
 
 
-def _judge(joint: _Joint) -> Iterator[PieceJoin]:
+def _judge(joint: _Joint, rivals: "_Rivals") -> Iterator[PieceJoin]:
     """Yield the join of each piece but the first, or why it is refused."""
     evidence = joint.evidence
-    rivals = _find_rivals(joint)
-    in_doubt = np.zeros(len(evidence.rows), dtype=np.bool_)
-    for two in np.unique(evidence.pieces[rivals], axis=0):
-        own = (evidence.pieces == two).all(axis=1)
-        if evidence.weigh(own & rivals) >= _RIVAL_SHARE * evidence.weigh(own & joint.agrees):
-            in_doubt |= own
-    clean, whole = joint.support(~in_doubt), joint.support(np.ones_like(in_doubt))
+    clean, whole = joint.support(~rivals.in_doubt), joint.support(np.ones_like(rivals.in_doubt))
     held = _reached(clean, 0)
     for k in range(1, evidence.cameras.num_pieces):
-        join = _join_of(joint, k, rivals)
+        join = _join_of(joint, k, rivals.named)
         if not held[k]:
             join = replace(join, reason=_reason_of_few(join, has_rival=bool(_reached(whole, 0)[k])))
+        elif evidence.weigh(np.isin(evidence.rows, join.agreeing)) < FEWEST_PAIRS:
+            join = replace(join, evidence=f"{join.evidence}, and points that coincide")
         yield join
 
 
@@ -327,20 +373,69 @@ def _reached(support: IntArray, first: int) -> BoolArray:
         held[best] = True
 
 
-def _find_rivals(joint: _Joint) -> BoolArray:
-    """Return the pairs (k,) that agree on another join of their two pieces than the rest does."""
+class _Rivals(NamedTuple):
+    """Pairs that agree on another join of their two pieces than the rest does."""
+
+    named: BoolArray
+    """(k,)"""
+    in_doubt: BoolArray
+    """(k,) pairs of pieces of which nothing says which join is right."""
+    beaten: IntArray
+    """Pairs, by their numbers among all, that agree with the join where points speak for the other."""
+
+
+def _find_rivals(joint: _Joint, false: IntArray) -> _Rivals:
+    """Look between every two pieces for pairs that agree on another join, and ask points which is right.
+
+    Pairs that were found false are rivals, by their numbers among all.
+    """
     evidence = joint.evidence
-    found = np.zeros(len(evidence.rows), dtype=np.bool_)
+    named = np.isin(evidence.rows, false)
+    in_doubt, beaten = np.zeros((2, len(evidence.rows)), dtype=np.bool_)
     for two in np.unique(evidence.pieces[~joint.agrees], axis=0):
+        own = (evidence.pieces == two).all(axis=1)
+        agreeing = own & joint.agrees
         part = evidence.part(evidence.numbers[two], ~joint.agrees)
+        for rival, most_agree in _rivals_among(part):
+            if not most_agree and evidence.weigh(agreeing) < FEWEST_PAIRS - 1:
+                break  # it is refused anyhow
+            there = _join_of(rival, 1, ~rival.agrees)
+            if there.reason:
+                continue
+            others = own & np.isin(evidence.rows, rival.evidence.rows[rival.agrees])
+            joins = joint.between(two), there.to_from_piece
+            counts = evidence.coinciding(two, agreeing | others, *joins)
+            if agreeing.any() and _speaks(*counts[::-1]):
+                beaten = beaten | agreeing
+                break
+            weight = evidence.weigh(others)
+            if most_agree and weight >= _FEWEST_RIVALS:
+                named = named | others
+                if weight >= _RIVAL_SHARE * evidence.weigh(agreeing) and not _speaks(*counts):
+                    in_doubt |= own
+            if _speaks(counts[0], 0):
+                break
+    return _Rivals(named, in_doubt, evidence.rows[beaten])
+
+
+def _speaks(first: int, second: int) -> bool:
+    """Return whether so many coinciding points speak for the first of two joins."""
+    return first >= _FEWEST_POINTS + _CLEARLY * second
+
+
+def _rivals_among(evidence: _Evidence) -> Iterator[tuple[_Joint, bool]]:
+    """Yield other joins of two pieces: first that with which most pairs agree, then those by single pairs."""
+    alone = np.argsort(-evidence.votes.soundness, kind="stable")[:_MOST_ALONE]
+    with suppress(UnsolvableError):
+        yield _search(evidence, _FEWEST_RIVALS), True
+    for pair in alone.tolist():
         try:
-            rival = _search(part, _FEWEST_RIVALS)
+            rival = _place(evidence.part(evidence.numbers, np.arange(len(evidence.rows)) == pair))
         except UnsolvableError:
             continue
-        enough = rival.evidence.weigh(rival.agrees) >= _FEWEST_RIVALS
-        if enough and not _join_of(rival, 1, ~rival.agrees).reason:
-            found[np.isin(evidence.rows, rival.evidence.rows[rival.agrees])] = True
-    return found
+        agrees = _agreeing(evidence, rival.standing)
+        if agrees.any():
+            yield rival._replace(evidence=evidence, agrees=agrees), False
 
 
 def _join_of(joint: _Joint, k: int, rivals: BoolArray) -> PieceJoin:

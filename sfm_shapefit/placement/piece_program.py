@@ -200,6 +200,8 @@ class Residuals(NamedTuple):
         across = normalized(targets - eyes)
         off = across - looks
         rows = np.flatnonzero(np.isfinite(self.other_looks[:, 0]))
+        if not len(rows):
+            return np.asarray(off / self.pixel_angles[:, None])
         others = np.einsum("rkl,rl->rk", second.turns[rows], self.other_looks[rows])
         planes = [np.linalg.norm(np.cross(across[rows], one), axis=1) for one in (looks[rows], others)]
         volume = np.vecdot(np.cross(looks[rows], others), across[rows])

@@ -47,6 +47,8 @@ class PieceCameras:
     """(v, 3)"""
     is_metric: BoolArray
     """(G,) pieces that know their scale, as those of rigs do; it is the same for all of them."""
+    points: tuple[FloatArray, ...]
+    """Points of each of the G pieces, (n, 3)."""
 
     @property
     def num_pieces(self) -> int:
@@ -60,6 +62,7 @@ class PieceCameras:
             rotations=self.rotations[cameras],
             centers=self.centers[cameras],
             is_metric=self.is_metric[pieces],
+            points=tuple(self.points[g] for g in np.flatnonzero(pieces)),
         )
 
     def centers_of(self, piece: int) -> FloatArray:

@@ -1,5 +1,8 @@
 """Evidence that the fit did not use, in runs of our own and against models as they stand."""
 
+from dataclasses import replace
+from itertools import combinations
+
 import numpy as np
 import pycolmap
 import pytest
@@ -7,8 +10,13 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline import evidence
 from sfm_shapefit.pipeline.check import check
+from sfm_shapefit.pipeline.checked import check_source
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.inputs import inputs_from, open_source
+from sfm_shapefit.solver.options import SolverOptions
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
 
@@ -125,6 +133,17 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     assert wrong.verdict.grade is Grade.DO_NOT_USE
     right = sfm_shapefit.map_database(cut(tmp_path / "right", (4, 25), (5, 24)))
     assert right.verdict.grade is Grade.GOOD
+
+
+def test_halves_that_a_join_ties_are_not_doubted(tmp_path):
+    database = cut(tmp_path / "wrong", (5, 21), (10, 13))
+    model = read_model(sfm_shapefit.map_database(database).models[0].located.reconstruction)
+    joined = np.flatnonzero(np.isin(model.images.ids, [1, 2, 13, 14]))
+    clock = Clock.of(None, SolverOptions())
+    with open_source(model, inputs_from(database)) as source:
+        tied = replace(source, tied=np.array([*combinations(joined.tolist(), 2)]))
+        told = [check_source(model, one, DirectionOptions(), clock).facts.evidence for one in (source, tied)]
+    assert [len(one.untied) for one in told] == [1, 0]
 
 
 def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path, courtyard_mapped):

@@ -13,6 +13,7 @@ from sfm_shapefit.base.geometry import (
     normalized,
     rotation_angles_deg,
 )
+from sfm_shapefit.placement.coinciding import count_coinciding
 from sfm_shapefit.placement.join import UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.piece_ties import PieceCameras, PieceTies
 from sfm_shapefit.placement.prior_join import join_by_priors, place_by_priors
@@ -47,6 +48,15 @@ class Drawn:
             self.worlds.append(Similarity(scale=scale, rotation=turn, translation=self.rng.normal(size=3)))
         self.is_metric = np.full(num_pieces, metric)
         self.pairs, self.rays, self.points, self.is_shared = [], [], [], []
+        self.clouds = (np.zeros((0, 3)),) * num_pieces
+
+    def show(self, count=400, *, common=0.5):
+        """Let each piece have so many points, some of them those of all."""
+        same = 1.0 - 2.0 * self.rng.random((count, 3))
+        own = 1.0 - 2.0 * self.rng.random((len(self.worlds), count, 3))
+        own[:, : round(common * count)] = same[: round(common * count)]
+        noisy = own + 0.5 * PIXEL * self.rng.standard_normal(own.shape)
+        self.clouds = tuple(invert(world).apply(one) for world, one in zip(self.worlds, noisy, strict=True))
 
     def see(self, v, w, count=30, *, known=True, moved=None, turned=False, spread=1.0):
         """Let two cameras see the same points; `moved`: the second piece stands elsewhere for this pair."""
@@ -88,6 +98,7 @@ class Drawn:
             rotations=self.rotations @ turns,
             centers=np.array(centers),
             is_metric=self.is_metric,
+            points=self.clouds,
         )
 
     def join(self):
@@ -200,6 +211,76 @@ def test_two_explanations_are_refused_and_named():
         assert "two joins are possible" in join.reason
         assert len(join.agreeing) + len(join.rivals) == 6 + rivals
         assert len({*join.agreeing.tolist()} & {*join.rivals.tolist()}) == 0
+
+
+@pytest.mark.parametrize(("right", "false"), [(6, 3), (3, 6), (4, 9)])
+def test_points_that_no_pair_used_say_which_of_two_joins_is_right(right, false):
+    drawn = Drawn(11)
+    drawn.see_some(0, 1, right)
+    drawn.see_some(0, 1, false, moved=ELSEWHERE)
+    drawn.show()
+    join = drawn.join()[1]
+    assert is_right(drawn, join)
+    assert join.rivals.tolist() == list(range(right, right + false))
+
+
+def test_points_that_no_pair_used_betray_a_join_that_all_other_pairs_want():
+    drawn = Drawn(12)
+    drawn.see_some(0, 1, 1)
+    drawn.see_some(0, 1, 5, moved=ELSEWHERE)
+    drawn.show()
+    join = drawn.join()[1]
+    assert "1 of 6 pairs of images between them agree" in join.reason
+    assert join.rivals.tolist() == [1, 2, 3, 4, 5]
+
+
+def test_points_that_shrink_to_a_spot_coincide_with_one_alone():
+    points = np.random.default_rng(17).random((200, 3))
+    spot = points[:1] + 1e-6 * points
+    same = Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+    assert count_coinciding(points, points, same) == 200
+    assert count_coinciding(points, spot, same) == count_coinciding(spot, points, same) <= 1
+
+
+def test_points_stand_in_for_one_pair_that_is_missing():
+    drawn = Drawn(15)
+    drawn.see_some(0, 1, 2)
+    assert "it needs 3" in drawn.join()[1].reason
+    drawn.show()
+    join = drawn.join()[1]
+    assert is_right(drawn, join)
+    assert join.evidence == "2 of 2 pairs of images between them, and points that coincide"
+    of_one = Drawn(15)
+    for w in range(NUM_CAMERAS, NUM_CAMERAS + 3):
+        of_one.see(0, w)
+    assert "are all of one image" in of_one.join()[1].reason
+    of_one.show()
+    assert is_right(of_one, of_one.join()[1])
+    alone = Drawn(15)
+    alone.see_some(0, 1, 1)
+    alone.show()
+    assert "it needs 3" in alone.join()[1].reason
+
+
+def test_points_of_matches_that_a_join_used_do_not_speak_for_it():
+    """What the false pairs match is one thing in both pieces where they place them."""
+    drawn = Drawn(13)
+    drawn.see_some(0, 1, 6)
+    for k in range(2):
+        drawn.see(k, NUM_CAMERAS + k, 12, moved=ELSEWHERE)
+    seen = np.concatenate(drawn.points)
+    drawn.clouds = (seen[:, 0], seen[:, 1])
+    assert "two joins are possible" in drawn.join()[1].reason
+    drawn.clouds = (np.zeros((0, 3)), np.zeros((0, 3)))
+    assert "two joins are possible" in drawn.join()[1].reason
+
+
+def test_points_that_coincide_nowhere_say_nothing():
+    drawn = Drawn(14)
+    drawn.see_some(0, 1, 6)
+    drawn.see_some(0, 1, 4, moved=ELSEWHERE)
+    drawn.show(common=0.02)
+    assert "two joins are possible" in drawn.join()[1].reason
 
 
 def test_a_rival_between_two_pieces_is_overcome_by_a_third():
