@@ -37,6 +37,7 @@ POINTS = {
         "sfm_shapefit.scene.matches:View.batches",
         "sfm_shapefit.scene.matches:View.between",
         "sfm_shapefit.scene.matches:View.links",
+        "sfm_shapefit.scene.matches:View.of_pairs",
     ),
     "solves": ("sfm_shapefit.solver.certificate:certify",),
     "assessments": ("sfm_shapefit.judgement.verdicts:assess",),

@@ -104,9 +104,10 @@ def adjust_thinly(
         if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run)
         return run.estimate(last, judged=lenses != "wanted")
-    if len(images.frames.ids) < _MANY_FRAMES or steps.are_coarse(run):
+    problem = None if len(images.frames.ids) < _MANY_FRAMES else steps.problem_of_fine_poses(run)
+    if problem is None:
         run, last = steps.solve_coarsely(run)
-    problem = steps.fine_problem(run)
+        problem = steps.fine_problem(run)
     if problem is not None:
         run = replace(run, links=None)  # all matches, at the peak of the memory
         run, last = steps.solve_finely(run, problem)

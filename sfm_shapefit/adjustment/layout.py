@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.scene.lens import NUM_VALUES
@@ -232,7 +232,7 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     row_of = np.full(len(sizes), -1)
     row_of[small] = np.arange(len(small))
     rows = row_of[problem.lens_of_camera[problem.cameras_seeing]]
-    seen = np.unique(rows[rows >= 0] * problem.num_points + problem.points_seen[rows >= 0])
+    seen = distinct(rows[rows >= 0] * problem.num_points + problem.points_seen[rows >= 0])
     of_rows = (np.ones(len(seen), np.int32), np.divmod(seen, max(problem.num_points, 1)))
     sees = coo_array(of_rows, shape=(len(small), problem.num_points)).tocsr()
     shared, num_packs = sees @ sees.T, 0

@@ -373,13 +373,17 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
 
 def solve_thinly_again(run: AdjustmentRun) -> Solved:
     """Return the run after a fine solve, where poses are fine but for a few, else after two as at first."""
-    problem = None if are_coarse(run) else fine_problem(run)
+    problem = problem_of_fine_poses(run)
     return solve_twice_thinly(run) if problem is None else solve_finely(run, problem)
 
 
-def are_coarse(run: AdjustmentRun) -> bool:
-    """Return whether the poses are coarse, by the points that they let be found."""
-    return _are_coarse(*(run.triangulate(limit, checked=True)[1] for limit in (1.0, _THIN_LIMIT)))
+def problem_of_fine_poses(run: AdjustmentRun) -> AdjustmentProblem | None:
+    """Return the fine problem; None where the poses are coarse, by the points that they let be found."""
+    joined, found = run.triangulate(1.0)
+    checked = found.of_length(run.checked_length)
+    problem = run.thin_problem(joined, found, times=_FINE_TIMES) if len(checked.points) else None
+    del joined, found  # whose arrays have all matches
+    return None if _are_coarse(checked, run.triangulate(_THIN_LIMIT, checked=True)[1]) else problem
 
 
 def _are_coarse(fine: TriangulatedPoints, loose: TriangulatedPoints) -> bool:

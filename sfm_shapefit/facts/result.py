@@ -386,21 +386,6 @@ class LocateResult(_Placed):
     @cached_property
     def pairs(self) -> list[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
-        support = self.directions.num_inliers[self.directions.usable()]
-        usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
-        names = self.images.names
-        axes = self.gauge.axes
-        rows = [
-            _turn(next(usable), axes)
-            if status is DirectionStatus.USABLE
-            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
-            for (i, j), status, support in zip(
-                self.directions.pairs.tolist(),
-                self.directions.status,
-                self.directions.num_inliers.tolist(),
-                strict=True,
-            )
-        ]
         columns: dict[str, FloatArray] = {}
         if self.triplet_scores is not None and self.matched_shares is not None:
             columns |= {"triplet_score": self.triplet_scores, "matched_share": self.matched_shares}
@@ -408,8 +393,25 @@ class LocateResult(_Placed):
         if self.prior_fit is not None:
             columns["prior_angle_deg"] = self.prior_fit.angles_deg
         added = zip(*(column.tolist() for column in columns.values()), strict=True)
-        given = (dict(zip(columns, values, strict=True)) for values in added)
-        return [replace(row, **values) for row, values in zip(rows, given, strict=True)] if columns else rows
+        scores = [dict(zip(columns, values, strict=True)) for values in added]
+        scores = scores or [{}] * len(self.directions.pairs)
+        usable, names, axes = self.directions.usable(), self.images.names, self.gauge.axes
+        further = [piece.placement for piece in self.further]
+        support = self.directions.num_inliers[usable]
+        rows = pair_rows(self.placement, support, further, [scores[k] for k in usable.tolist()])
+        of_usable = iter(rows)
+        return [
+            _turn(next(of_usable), axes)
+            if status is DirectionStatus.USABLE
+            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value, **given)
+            for (i, j), status, support, given in zip(
+                self.directions.pairs.tolist(),
+                self.directions.status,
+                self.directions.num_inliers.tolist(),
+                scores,
+                strict=True,
+            )
+        ]
 
     @cached_property
     def line_sigma(self) -> float | None:

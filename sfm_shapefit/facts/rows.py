@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -134,13 +134,19 @@ def correlations_of(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.clip(found, -1.0, 1.0))
 
 
-def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = ()) -> list[PairRow]:
+def pair_rows(
+    placement: Judged,
+    support: IntArray,
+    further: Sequence[Judged] = (),
+    scores: Sequence[Mapping[str, float]] = (),
+) -> list[PairRow]:
     """Return one row per pair of cameras.
 
     Args:
         placement: the graph and its largest piece.
         support: (m,) the pairs' number of inlier matches.
         further: the other pieces that are solved; their pairs are judged by them.
+        scores: further columns of each pair (m,), if there are any.
     """
     graph, groups = placement.graph, placement.groups
     judged: dict[int, tuple[Any, ...]] = {}
@@ -172,6 +178,7 @@ def pair_rows(placement: Judged, support: IntArray, further: Sequence[Judged] = 
                 verdict=verdict.value,
                 reason=reason,
                 posterior=posterior,
+                **(scores[edge] if scores else {}),
             )
         )
     return rows

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 
@@ -64,7 +64,7 @@ class NodeLinks(NamedTuple):
     @property
     def number(self) -> int:
         """How many points or pairs they are."""
-        return len(np.unique(self.ids))
+        return len(distinct(self.ids))
 
 
 class Rays(NamedTuple):
@@ -205,13 +205,13 @@ def _tied(
     names, pair = np.unique(group[ends] @ np.array([count, 1]), return_inverse=True)
     both = np.column_stack(np.divmod(names, count))
     number, missing = (
-        np.bincount(np.unique(pair[rows] * span + ids[rows]) // span, minlength=len(names))
+        np.bincount(distinct(pair[rows] * span + ids[rows]) // span, minlength=len(names))
         for rows in (slice(None), ~fits)
     )
     enough = (number - missing >= least) & (missing <= most_missing * (number - missing))
     for side in range(2):
         if (several := sizes[both[:, side]] > 1).any():
-            seen = np.unique((pair[fits] * count + ends[fits, side]) * span + ids[fits]) // span
+            seen = distinct((pair[fits] * count + ends[fits, side]) * span + ids[fits]) // span
             nodes, counts = np.unique(seen, return_counts=True)
             total, most = np.zeros((2, len(names)))
             np.add.at(total, nodes // count, counts)

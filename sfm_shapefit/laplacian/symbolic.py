@@ -397,9 +397,9 @@ def _relative_positions(first: Any, parent: Any, row_pointers: Any, rows: Any) -
 def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
     """Cut the supernodes into tasks and what is above them; see `SymbolicFactor`."""
     num, total = len(parent), int(sizes.sum())
+    begin, weight = _subtrees(parent, sizes)  # whose kernel warm-up then compiles, by small plans
     if total < _WORTH_TASKS:
         return np.zeros((0, 2), np.int64), np.array([[0, num]])
-    begin, weight = _subtrees(parent, sizes)
     is_root = (parent < 0) | (weight[parent] > _LARGEST_TASK * total)
     roots = np.flatnonzero(is_root & (weight <= _LARGEST_TASK * total) & (weight >= _SMALLEST_TASK * total))
     tasks = np.stack([begin[roots], roots + 1], axis=1)

@@ -58,14 +58,13 @@ def ask_pairs(
     Only pairs `among` some images are asked, by their index; None: all.
     """
     chosen = _doubtful_pairs(directions, source.images.num_images)
+    if among is not None:
+        chosen &= np.isin(directions.pairs, among).all(axis=1)
     if not chosen.any():
         return concatenate_rotations([])
     num_pairs, parts = len(directions.pairs), []
     row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    without = source.pairs_of_fixed
-    if among is not None:
-        without = source.view.pairs[~np.isin(source.view.pairs, among).all(axis=1)]
-    for batch in source.view.batches(without=without):
+    for batch in source.view.of_pairs(directions.pairs[chosen]):
         rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
         rays = _thin(source.images, batch, rows)
         likely = _poses_alone(source.alone, rays.pairs)
@@ -102,7 +101,7 @@ def _poses_alone(alone: RelativeRotations | None, pairs: IntArray) -> LikelyPose
 def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
     """Return the relative rotations that the matches of some pairs (k, 2) have by themselves."""
     wanted, parts = set(map(tuple, pairs.tolist())), []
-    for batch in source.view.batches():
+    for batch in source.view.of_pairs(pairs):
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
         rays = _thin(source.images, batch, rows)
         likely = _poses_alone(source.alone, rays.pairs)

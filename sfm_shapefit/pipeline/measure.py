@@ -1,5 +1,6 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch, is_among
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, covering_set, join_points
-from sfm_shapefit.tracks.options import NodeOptions
+from sfm_shapefit.tracks.options import NodeOptions, PointNodes
 
 _CHECK_ROTATIONS = (
     "is this the model's database, with right intrinsics? Rotations that are degrees off need rotations=2"
@@ -65,7 +66,8 @@ class Measured:
 class Wanted(NamedTuple):
     """What a pass over the matches is to tell beside the directions."""
 
-    tracks: bool = False
+    tracks: PointNodes = "never"
+    """Whether tracks are joined; by "auto" those of many cameras only where their pairs do not hold them."""
     checked: bool = False
     errors: bool = False
 
@@ -94,12 +96,9 @@ def measure(
         if without is not None and parts:
             every = concatenate(parts)
             parts = [every.subset(np.flatnonzero(~is_among(every.pairs, without)))]
-        if parts and any(wanted):
-            directions = concatenate(parts)
-            row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
-            for batch in source.view.batches(without=without):
-                rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
-                beside.add(batch, directions.subset(rows))
+        if parts and wanted != DIRECTIONS:
+            for batch, directions in _again(source, concatenate(parts)):
+                beside.add(batch, directions)
     else:
         parts = []
         for batch in source.view.batches(without=without, advance=clock.advance):
@@ -111,13 +110,29 @@ def measure(
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
         )
+    directions, asked = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
+    if asked and not _is_held_by_pairs(view_graph(source.images, directions)):
+        beside.joiner = _new_joiner(source, options.inlier_threshold_px)
+        for batch, own in _again(source, directions):
+            beside.joiner.add(batch, own)
     return Measured(
-        directions=concatenate(parts),
+        directions=directions,
         tracks=beside.joiner,
         checks=wanted.checked and beside.joiner is not None and beside.joiner.holds_all,
         errors=beside.errors,
         facts_per_match=beside.facts_per_match(),
     )
+
+
+def _new_joiner(source: MatchSource, threshold_px: float) -> TrackJoiner:
+    return TrackJoiner(threshold_px, source.view.num_keypoints, source.view.num_matches)
+
+
+def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[MatchBatch, PairDirections]]:
+    """Yield the matches of a source once more, with the directions of their pairs."""
+    row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
+    for batch in source.view.batches(without=source.pairs_of_fixed):
+        yield batch, directions.subset(np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()]))
 
 
 class _Beside:
@@ -131,8 +146,9 @@ class _Beside:
         self._begins = np.append(0, np.cumsum(view.num_keypoints))
         # Pairs of most keypoints are far below the limit of the type, 65,535.
         self._num_pairs_of = np.zeros(self._begins[-1], dtype=np.uint16)
-        given = threshold_px, view.num_keypoints, view.num_matches
-        self.joiner = TrackJoiner(*given) if wanted.tracks else None
+        at_once = wanted.tracks == "always" or source.images.num_images < _MANY_CAMERAS
+        joins = wanted.tracks != "never" and at_once
+        self.joiner = _new_joiner(source, threshold_px) if joins else None
 
     def add(self, batch: MatchBatch, directions: PairDirections) -> None:
         """Take a batch and its directions."""
@@ -181,9 +197,10 @@ def view_graph(images: Images, directions: PairDirections) -> ViewGraph:
     )
 
 
-def wants_points(source: MatchSource, options: NodeOptions) -> bool:
-    """Return whether 3D points join the view graph."""
-    return options.uses_points(source.images.num_images) and source.economy.points
+def wants_points(source: MatchSource, options: NodeOptions) -> PointNodes:
+    """Return whether 3D points join the view graph, "auto" where that depends on what the pairs hold."""
+    is_wanted = options.uses_points(source.images.num_images) and source.economy.points
+    return options.points if is_wanted else "never"
 
 
 def build_graph(

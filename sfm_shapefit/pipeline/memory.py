@@ -16,6 +16,7 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.inspected import Forecast
+from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.refinement.options import PlacementOptions
@@ -192,6 +193,8 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
     is_sorted = economy.reading.keeps and work.num_matches <= MOST_MATCHES
     in_memory = MATCH_BYTES * work.num_matches if is_sorted else 0.0
+    if work.num_keypoints <= MOST_KEYPOINTS:
+        in_memory += PIXEL_BYTES * work.num_keypoints
     throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results + in_memory
     peaks = {
         "reading": _STARTED_BYTES + 30e6 + _READ_BYTES * work.num_keypoints,

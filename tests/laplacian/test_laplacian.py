@@ -15,7 +15,7 @@ from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.blas_threads import one_blas_thread
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.laplacian import ordering
+from sfm_shapefit.laplacian import ordering, symbolic
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze, factorize
 from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
@@ -555,3 +555,10 @@ def test_blas_threads_are_restored_after_nested_limits():
     with one_blas_thread(), one_blas_thread():
         assert set(threads()) == {1}
     assert threads() == before
+
+
+def test_a_small_plan_runs_what_cuts_large_ones_into_tasks(monkeypatch):
+    ran, subtrees = [], symbolic._subtrees
+    monkeypatch.setattr(symbolic, "_subtrees", lambda *given: ran.append(given) or subtrees(*given))
+    analyze(4, np.array([[0, 1], [1, 2], [2, 3]]))
+    assert ran  # so that warm-up compiles it, whose examples are small

@@ -63,7 +63,7 @@ def relative_rotations(model, turned=()):
 
 def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_graph_of_them():
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks=True, errors=True))
+        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always", errors=True))
         bare = measure(source, DirectionOptions(), Clock())
     i, j = found.directions.pairs[found.directions.usable()].T
     true = normalized(TRUTH.centers[i] - TRUTH.centers[j])
@@ -88,7 +88,7 @@ def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_grap
 
 def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypatch):
     with opened() as source:
-        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks=True))
+        found = measure(source, DirectionOptions(), Clock(), Wanted(tracks="always"))
     parallel = np.where(np.isfinite(found.directions.directions), [1.0, 0.0, 0.0], np.nan)
     flat = replace(found, directions=replace(found.directions, directions=parallel))
     degree = int(build_graph(TRUTH, found, NodeOptions(points="never")).graph.degrees().min())
@@ -100,8 +100,16 @@ def test_many_cameras_that_pairs_of_many_directions_hold_need_no_points(monkeypa
     monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_CAMERAS", 8)
     monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", 2)
     assert [has_points(found), has_points(found, "always"), has_points(flat)] == [False, True, True]
-    monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", degree + 6)
+    with opened() as source:
+        assert measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto")).tracks is None
+        monkeypatch.setattr("sfm_shapefit.pipeline.measure._MANY_PAIRS", degree + 6)
+        again = measure(source, DirectionOptions(), Clock(), Wanted(tracks="auto", checked=True))
     assert has_points(found)
+    assert again.checks
+    own, usual = again.tracks.tracks(), found.tracks.tracks()  # joined after all directions were known
+    assert usual.num_tracks > 10
+    np.testing.assert_array_equal(own.rays, usual.rays)
+    np.testing.assert_array_equal(own.offsets, usual.offsets)
 
 
 def test_place_yields_the_rigid_pieces_the_largest_first():

@@ -202,9 +202,37 @@ def test_a_part_does_not_read_the_table_of_all_pairs(tiny_ring, model, monkeypat
 def test_what_was_read_once_is_read_again_by_no_view(tiny_ring, model, monkeypatch):
     with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
         expected = columns(matches.at(model.images).batches())
-        monkeypatch.setattr(DatabaseMatches, "_read_matches", None)  # nothing may be read from here on
-        again = columns(matches.at(turned(model).images).links())
-    assert_same_bits(again, expected)
+        for reading in ("_read_matches", "_read_keypoints"):  # nothing may be read from here on
+            monkeypatch.setattr(DatabaseMatches, reading, None)
+        again = columns(matches.at(turned(model).images).batches())
+        np.testing.assert_array_equal(
+            columns(matches.at(model.images).batches())["rays_i"], expected["rays_i"]
+        )
+        matches.forget()
+        with pytest.raises(TypeError):
+            matches.at(model.images).keypoints(0)
+    assert_same_bits({name: again[name] for name in ("pairs", "keypoints", "counts")}, expected)
+
+
+def test_keypoints_of_very_many_are_read_each_time(tiny_ring, model, monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.files.colmap.database.MOST_KEYPOINTS", 10)
+    with closing(open_database(tiny_ring / "database.db", model.images.names)) as matches:
+        view = matches.at(model.images)
+        before = view.keypoints(0)
+        monkeypatch.setattr(
+            DatabaseMatches, "_read_keypoints", lambda _self, _name: np.zeros((1, 2), np.float32)
+        )
+        assert len(before) > len(view.keypoints(0)) == 1
+
+
+def test_of_wanted_pairs_no_others_are_read_unless_they_are_kept(matches, model):
+    view = matches.at(model.images)
+    whole, kept = columns(view.batches()), np.arange(len(view.pairs)) % 3 == 1
+    keeps = not isinstance(matches, TrackMatches)
+    assert len(columns(view.of_pairs(view.pairs[:1]))["pairs"]) == (len(view.pairs) if keeps else 1)
+    again = matches.at(model.images)
+    wanted = again.pairs[kept][:, ::-1]  # whatever the order of their images
+    assert_same_bits(columns(again.of_pairs(wanted)), pairs_in(whole, kept))
 
 
 def test_consumed_links_give_back_very_many_matches_and_what_was_yielded_stays(tiny_ring, model, monkeypatch):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
 from sfm_shapefit.base.errors import InputError
@@ -23,6 +24,10 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_blob
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, RelativePoses, View
+
+PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
+"""Bytes of a keypoint that is kept, and keypoints of a database up to which they are: a run looks at each a
+dozen times."""
 
 _HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
 
@@ -56,7 +61,8 @@ def open_database(path: Path | str, names: Sequence[str], rows: PairRows | None 
 class DatabaseMatches(Matches):
     """The matches of an open database.
 
-    Matches that were read are kept as keypoints, for all views of them, unless they are very many.
+    What was read is kept for all views, unless it is very much: the pixels of keypoints, and matches as their
+    numbers.
     """
 
     def __init__(self, file: DatabaseFile, names: Sequence[str], rows: PairRows | None = None) -> None:
@@ -81,6 +87,7 @@ class DatabaseMatches(Matches):
         counts = dict(file.query(f"SELECT image_id, rows FROM keypoints WHERE {is_sound}"))
         self.num_keypoints = np.array([counts.get(self._ids.get(name), 0) for name in names], dtype=np.int64)
         self.total_keypoints = sum(counts.values())
+        self._pixels: dict[str, npt.NDArray[np.float32]] = {}
         self.rows = read_pairs(file, index_of_id) if rows is None else rows
         self.pairs, self.num_matches = self.rows.pairs, self.rows.num_inliers
         is_kept = float(self.num_matches.sum(dtype=np.float64)) <= MOST_MATCHES
@@ -91,23 +98,32 @@ class DatabaseMatches(Matches):
         self.file.close()
 
     def forget(self) -> None:
-        """Give back the memory of the matches that are kept."""
+        """Give back the memory of the keypoints and matches that are kept."""
+        self._pixels.clear()
         if self._sorted is not None:
             self._sorted.clear()
 
     def keypoints(self, name: str) -> FloatArray:
         """Return the pixels (k, 2) of the keypoints of an image."""
+        if name not in self._pixels:
+            pixels = self._read_keypoints(name)
+            if self.total_keypoints > MOST_KEYPOINTS:
+                return pixels.astype(np.float64)
+            self._pixels[name] = pixels
+        return self._pixels[name].astype(np.float64)
+
+    def _read_keypoints(self, name: str) -> npt.NDArray[np.float32]:
+        """Return the pixels (k, 2) of the keypoints of an image as the file has them."""
         query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
         found = self.file.query(query, self._ids[name]) if name in self._ids else []
         if not found or not found[0][0]:
-            return np.zeros((0, 2))
+            return np.zeros((0, 2), dtype=np.float32)
         rows, cols, data = found[0]
         if cols not in (2, 4, 6) or not is_blob(data, rows, cols, itemsize=4):
             raise InputError(
                 f"{self.file.path}: the keypoints of image {name} are damaged; extract them again"
             )
-        with np.errstate(invalid="ignore"):  # a signaling NaN
-            xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
+        xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float32)
         if np.isfinite(xy).all():
             return xy
         raise InputError(
