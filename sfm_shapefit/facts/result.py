@@ -47,7 +47,13 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
+from sfm_shapefit.judgement.grade import (
+    ModelVerdict,
+    Shares,
+    judge_graph,
+    judge_model,
+    weigh_evidence,
+)
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -270,9 +276,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.agreeing_observations,
             self.contradicting_observations,
-            float(np.mean(self.kept)),
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             here=float(np.mean(is_posed)),
         )
