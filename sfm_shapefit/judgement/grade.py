@@ -23,6 +23,7 @@ can be named, if
     images, left out one by one, or the matches of pairs contradict the focal length of a lens
     fewer than 95 % of the images are placed, or stand in this one of several models
     nothing checks how a group of cameras stands to the rest, which has its cameras named (`ties`)
+    two position priors and more than a tenth contradict where cameras stand (`placement.prior_fit`)
     the images can be arranged in two ways (`rotations.arrangements`), whichever was taken
 
 Otherwise the model is good. How many of the observations see a 3D point is told, and decides nothing: on
@@ -55,7 +56,9 @@ MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model i
 # not contradict; with less of any, the model is not to be used.
 _LEAST = 0.5
 FEW_PLACED = 0.95  # share of images in the output; below, the model is to be looked at
-_MOST_APART = 0.1  # share of cameras in groups that stand apart; above, the model is not to be used
+MOST_APART = 0.1
+"""Share of cameras in groups that stand apart; above, the model is not to be used, and where as many priors
+contradict it, it is to be looked at."""
 _MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
@@ -140,7 +143,7 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     reasons: list[str] = []
     if apart:
         clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
-        (reasons if len(set(apart) - confirmed) > _MOST_APART * count else suspicions).append(clause)
+        (reasons if len(set(apart) - confirmed) > MOST_APART * count else suspicions).append(clause)
     if len(loose) < len(evidence.untied):
         suspicions.append("nothing checks how groups of cameras stand to one another")
     if evidence.num_held is not None and evidence.num_held < _LEAST * count:

@@ -48,7 +48,8 @@ def gather_evidence(
         fits: of all pairs, their directions measured at these rotations; None if there are none.
         structure: the points of the model.
         threads: number of threads to use.
-        known: (k, 2) images that are known to stand rightly to one another, beside those that are fixed.
+        known: (k, 2) images that are known to stand rightly to one another, by joins or priors, beside those
+            that are fixed.
     """
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
@@ -68,6 +69,13 @@ def gather_evidence(
         untied=tuple(one for one in untied if 2 * np.isin(one.cameras, apart).sum() < len(one.cameras)),
         num_held=int(np.bincount(tied[images.is_posed]).max(initial=0)),
     )
+
+
+def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
+    """Return pairs (k, 2) of images that make the frames of those chosen (i,) rigid, one image of each."""
+    rows = np.flatnonzero(chosen)
+    rows = rows[np.unique(images.frame_of[rows], return_index=True)[1]]
+    return np.concatenate([np.column_stack([rows[step:], rows[:-step]]) for step in (1, 2)])
 
 
 def _ask_some(images: Images, asked: BoolArray | None) -> BoolArray | None:
@@ -109,11 +117,11 @@ def _tie(
     fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
     rays = Rays(points.points_seen(), frames[points.images], fitting)
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
-    fixed = np.zeros(0, dtype=np.int64) if source.fixed is None else np.unique(frames[source.fixed])
-    known = [np.column_stack([fixed[step:], fixed[:-step]]) for step in (1, 2)]  # a rigid strip
-    if joined is not None:
-        known.append(frames[joined][frames[joined[:, 0]] != frames[joined[:, 1]]])
-    tied, groups = find_groups(len(images.frames.ids), rays, pairs, np.concatenate(known))
+    known = [] if source.fixed is None else [frames[rigid_strip(images, source.fixed)]]
+    known += [] if joined is None else [frames[joined][frames[joined[:, 0]] != frames[joined[:, 1]]]]
+    tied, groups = find_groups(
+        len(images.frames.ids), rays, pairs, np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
+    )
     posed = np.unique(frames[images.is_posed])
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)

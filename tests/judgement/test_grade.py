@@ -15,6 +15,7 @@ from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
+from sfm_shapefit.placement.prior_fit import PriorFit
 from tests.program import run
 from tests.scenes import BUNDLED, RING
 
@@ -93,6 +94,14 @@ def test_pairs_that_contradict_the_rotations_count_against_a_model(found):
     )
     told = altered(found, directions=replace(found.directions, status=status))
     assert told.agreeing_pairs < found.agreeing_pairs
+
+
+def test_one_prior_may_be_wrong_and_two_of_eight_make_a_look_worthwhile(found):
+    for wrong, grade in ((1, Grade.GOOD), (2, Grade.LOOK)):
+        fit = PriorFit(np.ones(len(found.images.names)), np.arange(wrong), np.zeros(0))
+        verdict = altered(found, prior_fit=fit).verdict
+        assert verdict.grade is grade
+    assert verdict.reasons == ("2 of 8 position priors contradict where cameras stand",)
 
 
 def test_matches_that_agree_on_two_directions_make_a_look_worthwhile(found):
