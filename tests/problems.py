@@ -8,7 +8,6 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.graph.measured import Evidence
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
@@ -97,17 +96,6 @@ def outer(graph: ViewGraph, groups: RigidGroups) -> tuple[ViewGraph, npt.NDArray
     """Return the graph without the pairs inside a rigid group, and which pairs are left."""
     kept = groups.joins(graph.edges)
     return ViewGraph(graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
-
-
-def make_evidence(num_pairs, support=100, against=(), against_support=50, errors=None) -> Evidence:
-    """Return the evidence of pairs of a support each, and of pairs against the rotations."""
-    against = np.array(against, dtype=np.int64).reshape(-1, 2)
-    return Evidence(
-        support=np.full(num_pairs, support),
-        contradicting=against,
-        contradicting_support=np.full(len(against), against_support),
-        errors=errors,
-    )
 
 
 def _measure(baselines: Floats, sigma: float, q: float, rng: np.random.Generator) -> Floats:

@@ -137,9 +137,7 @@ def measured(rng):
         ViewGraph(11, edges, v, rng.uniform(0.5, 2.0, N), names=[f"n{k}" for k in range(11)]),
         covariance=rng.random((N, 1, 1)) * np.eye(2),
         evidence=Evidence(
-            support=rng.integers(1, 100, N),
             contradicting=np.array([(1, 4), (0, 3), (2, 6)]),
-            contradicting_support=np.array([8, 9, 10]),
             errors=rng.standard_normal((N, 5, 2)),
         ),
         num_points=4,
@@ -151,7 +149,7 @@ def measured(rng):
 def say_edges(noun, members):
     """By edge, and by the names of its nodes."""
     graph, evidence, groups = noun.graph, noun.evidence, noun.groups
-    arrays = (graph.directions, graph.weights, noun.covariance, evidence.support, evidence.errors)
+    arrays = (graph.directions, graph.weights, noun.covariance, evidence.errors)
     said = {}
     for k, (edge, ends) in enumerate(zip(members.tolist(), graph.edges, strict=True)):
         nodes = [
@@ -271,7 +269,6 @@ def test_what_contradicts_stays_while_both_of_its_cameras_do_and_a_fixed_group_w
         assert part.graph.names == tuple(f"n{k}" for k in nodes)
         both = np.isin(whole.evidence.contradicting, nodes).all(axis=1)
         np.testing.assert_array_equal(nodes[part.evidence.contradicting], whole.evidence.contradicting[both])
-        assert part.evidence.contradicting_support.tolist() == np.array([8, 9, 10])[both].tolist()
         assert (part.fixed_group is not None) == bool({5, 6} & set(nodes.tolist()))
         assert part.num_points == np.sum(nodes >= 7)
 

@@ -2,7 +2,7 @@
 
 import ctypes
 import os
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +14,7 @@ BoolArray = npt.NDArray[np.bool_]
 _LARGE_KB = 400_000  # kilobytes of memory, at most; the program alone takes 230,000
 
 AnyArray = TypeVar("AnyArray", bound=npt.NDArray[Any])
+Columns = TypeVar("Columns", bound=NamedTuple)
 
 
 def sum_by(labels: IntArray, rows: FloatArray, count: int) -> FloatArray:
@@ -33,6 +34,11 @@ def rows_of_parts(offsets: IntArray, chosen: IntArray) -> tuple[IntArray, IntArr
     counts = np.diff(offsets)[chosen]
     ends = np.append(0, np.cumsum(counts))
     return ends, np.repeat(offsets[chosen] - ends[:-1], counts) + np.arange(ends[-1])
+
+
+def rows_taken(columns: Columns, rows: IntArray | BoolArray) -> Columns:
+    """Return some rows of a tuple of arrays that all have the same, in that order."""
+    return columns._make(column[rows] for column in columns)
 
 
 def frozen(array: AnyArray) -> AnyArray:

@@ -1,6 +1,6 @@
 """What evidence that the fit did not use says against a model: lenses, places and seams, by name."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -8,6 +8,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
@@ -66,12 +68,17 @@ class AmbiguousPlace(Record):
         )
 
 
-class GroupApart(Record):
-    """A group of cameras that agree with one another, and stand apart from the rest."""
+class _Group(Record):
+    """A group of cameras, and the pairs between it and the rest."""
 
     images: Annotated[tuple[str, ...], "Names of its members."]
     num_agreeing: Annotated[int, "Pairs between it and the rest that agree."]
     num_contradicting: Annotated[int, "Pairs between it and the rest that contradict."]
+
+
+class GroupApart(_Group):
+    """A group of cameras that agree with one another, and stand apart from the rest."""
+
     num_turned: Annotated[int, "Contradicting pairs that agree on one turn of the group."]
     turn_deg: Annotated[float | None, "Angle of that turn; null without any."]
 
@@ -86,12 +93,9 @@ class GroupApart(Record):
         )
 
 
-class UntiedGroup(Record):
+class UntiedGroup(_Group):
     """A group of cameras that so little ties to the rest that nothing checks how it stands to it."""
 
-    images: Annotated[tuple[str, ...], "Names of its members."]
-    num_agreeing: Annotated[int, "Pairs between it and the rest that agree."]
-    num_contradicting: Annotated[int, "Pairs between it and the rest that contradict."]
     num_points: Annotated[int, "Points of three images or more that both see, and that fit."]
     is_loose: Annotated[bool, "Whether these do not even say how it stands to the rest."]
 
@@ -201,29 +205,17 @@ def tell_evidence(
             )
             for found in evidence.places
         ),
-        seams=tuple(
-            GroupApart(
-                images=tuple(images.names[k] for k in seam.cameras.tolist()),
-                num_agreeing=seam.num_agreeing,
-                num_contradicting=seam.num_contradicting,
-                num_turned=seam.num_turned,
-                turn_deg=seam.turn_deg,
-            )
-            for seam in evidence.seams
-        ),
-        untied=tuple(
-            UntiedGroup(
-                images=tuple(images.names[k] for k in group.cameras.tolist()),
-                num_agreeing=group.num_agreeing,
-                num_contradicting=group.num_contradicting,
-                num_points=group.num_points,
-                is_loose=group.is_loose,
-            )
-            for group in evidence.untied
-        ),
+        seams=tuple(GroupApart(**_tell_group(seam, images)) for seam in evidence.seams),
+        untied=tuple(UntiedGroup(**_tell_group(group, images)) for group in evidence.untied),
         contradicted=tuple(images.names[one.camera] for one in evidence.contradicted),
         second=None if evidence.second is None else _tell_opinion(evidence.second, images),
     )
+
+
+def _tell_group(group: Seam | Untied, images: Images) -> dict[str, Any]:
+    """Return all that is known of a group, its members by name."""
+    told = group._asdict()
+    return {"images": tuple(images.names[k] for k in told.pop("cameras").tolist()), **told}
 
 
 def _tell_opinion(second: SecondOpinion, images: Images) -> ToldOpinion:

@@ -1,6 +1,7 @@
 """Results of `locate` and `place`: the answer with the evidence for it."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -47,7 +48,14 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
-from sfm_shapefit.judgement.grade import ModelVerdict, Shares, judge_graph, judge_model, weigh_evidence
+from sfm_shapefit.judgement.grade import (
+    MOST_APART,
+    ModelVerdict,
+    Shares,
+    judge_graph,
+    judge_model,
+    weigh_evidence,
+)
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -270,9 +278,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.agreeing_observations,
             self.contradicting_observations,
-            float(np.mean(self.kept)),
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             here=float(np.mean(is_posed)),
         )
@@ -280,7 +286,15 @@ class LocateResult(_Placed):
         repeats = tuple(match_warnings(self.directions))[:1]
         names = [self.images.names[camera] for camera in outside]
         against = weigh_evidence(self.evidence, self.placed)
-        return judge_model(self.placement, shares, names, (*repeats, *self.suspicions), against)
+        suspicions = (*repeats, *self._off_priors(), *self.suspicions)
+        return judge_model(self.placement, shares, names, suspicions, against)
+
+    def _off_priors(self) -> Iterator[str]:
+        """Yield that many position priors contradict the cameras: a few are wrong, many may be right."""
+        if self.prior_fit is not None:
+            wrong, count = len(self.prior_fit.wrong), int(np.isfinite(self.prior_fit.off).sum())
+            if wrong > max(1, MOST_APART * count):
+                yield f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
 
     @property
     def database(self) -> Path | None:

@@ -38,9 +38,8 @@ class CameraRow:
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
-    """How far it is to be trusted, in [0, 1]: the share of its matches with the consensus of cameras that
-    agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
-    `judgement.trust`."""
+    """How far it is to be trusted, in [0, 1]: the share of its pairs, or of their matches, that agree with
+    it, and lower where it is loose; see `judgement.trust` and `judgement.doubted`."""
     sigma: tuple[float, ...] = ()
     """Standard deviation of the center that is delivered, in the output's units, relative to the centroid and
     scale of the model or to fixed cameras; `sigma_of` in locate.json says which, and what errors it knows of.

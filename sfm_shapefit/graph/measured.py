@@ -17,12 +17,8 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 class Evidence:
     """What the matches say beyond the directions of a graph."""
 
-    support: IntArray
-    """(m,) matches of each pair of the graph."""
     contradicting: IntArray
     """(q, 2) other pairs, whose matches contradict the given rotations."""
-    contradicting_support: IntArray
-    """(q,) their number of matches."""
     errors: FloatArray | None = None
     """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
     share keypoints (`judgement.correlated_errors`); the pairs' errors are independent if None."""
@@ -41,11 +37,8 @@ class Evidence:
         new = np.full(num_nodes, -1, dtype=np.int64)
         new[nodes] = np.arange(len(nodes))
         pairs = new[self.contradicting.reshape(-1, 2)]
-        kept = (pairs >= 0).all(axis=1)
         return Evidence(
-            support=self.support[rows],
-            contradicting=pairs[kept],
-            contradicting_support=self.contradicting_support[kept],
+            contradicting=pairs[(pairs >= 0).all(axis=1)],
             errors=None if self.errors is None else self.errors[rows],
             facts_per_match=self.facts_per_match,
         )
@@ -62,7 +55,7 @@ class MeasuredGraph:
     """(m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
     unknown, None where all are."""
     evidence: Evidence | None = None
-    """Support of the edges, and pairs whose matches contradict the given rotations; None if unknown."""
+    """What the matches say beyond them; None if unknown."""
     num_points: int = 0
     """How many of the nodes, the last ones, are 3D points, which only help to place the cameras."""
     groups: RigidGroups | None = None

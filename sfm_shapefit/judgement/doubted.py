@@ -1,23 +1,17 @@
 """Trust where the pairs were asked for rotations of their own.
 
-    trust = min(f, hold'),    hold' = 4 tau^2 / (4 tau^2 + sigma^2), see `trust`
+    trust = min(f, hold),    hold as in `trust`
 
-With the weights of `turns`, in matches, the pairs that agree with a camera as placed, that agree on a turn
-instead, and whose direction is off although the rotation agrees:
+With s = placed / (placed + turned) of `turns`, the share of the pairs that agree with a camera as placed:
 
-    right         f = min(1, (placed + 15) / (placed + turned + contrary + 30) / 0.75)
-    ambiguous     f from 0.62 to 0.72: kept by default, and to be looked at
-    turned        f = placed / (placed + turned), which is less than 0.3
-    unsupported   f = 0.1
-    unknown       trust as by the share of matches alone
+    right         f = min(1, s / 0.75), which is 0.8 or more
+    ambiguous     f = 0.65: kept by default, and to be looked at
+    turned        f = s, which is less than 0.3
+    unsupported   f = 0
+    unknown       trust as by the share of pairs alone
 
-The 30 matches, half of them for the camera, are what every camera has beforehand; 0.75 of its matches are
-enough for a camera to lose nothing. What is astray is contrary up to half of what agrees, and again beyond
-twice of it: a camera that many pairs hold is not left out for repeated structure in others. Where rotations
-are not to be doubted, f = 1.
-
-hold' is half where the pairs leave 20 % of the scene open, twice what it takes without their rotations: a
-standard deviation is drawn from residuals that wrong pairs widen, and these are known better here.
+Where rotations are not to be doubted, f = 1. A pair whose rotation agrees and whose direction does not, as of
+repeated structure, says nothing of a turn: `places` asks those where the camera is instead.
 """
 
 from dataclasses import replace
@@ -25,21 +19,18 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
-from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE
-from sfm_shapefit.judgement.turns import RIGHT_SHARE, TURNED_SHARE, Doubt, Doubts
+from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE, USUAL_SHARE
+from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment
 
-_PRIOR = 30.0  # matches that every camera has beforehand; half of them for it
-_USUAL_SHARE = 0.75  # share of a camera's matches; with that many for it, it loses nothing
-_AMBIGUOUS = (0.62, 0.72)  # range of f; kept by default, but below the trust that goes without reasons
-_UNSUPPORTED = 0.1  # f; low, as no pair speaks for the camera
+_AMBIGUOUS = 0.65  # f; kept by default, but below the trust that goes without reasons
 
 
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
     """Return an assessment whose trust and reasons follow the doubts of the same cameras."""
     factors = _factors(doubts)
     finite = np.isfinite(factors)
-    trust = np.where(finite, np.minimum(factors, _lenient_hold(assessment)), assessment.trust)
+    trust = np.where(finite, np.minimum(factors, assessment.hold), assessment.trust)
     return _with_reasons(replace(assessment, trust=trust, doubts=doubts), finite)
 
 
@@ -63,29 +54,19 @@ def _with_reasons(assessment: Assessment, among: BoolArray) -> Assessment:
 
 def believe_rotations(assessment: Assessment) -> Assessment:
     """Return an assessment whose trust depends only on how well the pairs hold each camera."""
-    hold = _lenient_hold(assessment)
-    return _with_reasons(replace(assessment, trust=hold), np.ones(len(hold), dtype=np.bool_))
-
-
-def _lenient_hold(assessment: Assessment) -> FloatArray:
-    """Return the hold for twice the tau."""
     hold = assessment.hold
-    return np.asarray(4.0 * hold / (1.0 + 3.0 * hold))
+    return _with_reasons(replace(assessment, trust=hold), np.ones(len(hold), dtype=np.bool_))
 
 
 def _factors(doubts: Doubts) -> FloatArray:
     """Return f of each camera; NaN where nothing is known."""
-    placed, turned = doubts.placed, doubts.turned
-    share = placed / np.maximum(placed + turned, 1e-300)
-    contrary = np.minimum(doubts.astray, 0.5 * placed) + np.maximum(doubts.astray - 2.0 * placed, 0.0)
-    right = (placed + 0.5 * _PRIOR) / (placed + turned + contrary + _PRIOR) / _USUAL_SHARE
-    within = np.clip((share - TURNED_SHARE) / (RIGHT_SHARE - TURNED_SHARE), 0.0, 1.0)
+    share = doubts.placed / np.maximum(doubts.placed + doubts.turned, 1e-300)
     by_kind = {
-        Doubt.RIGHT: np.minimum(right, 1.0),
-        Doubt.AMBIGUOUS: _AMBIGUOUS[0] + (_AMBIGUOUS[1] - _AMBIGUOUS[0]) * within,
+        Doubt.RIGHT: np.minimum(share / USUAL_SHARE, 1.0),
+        Doubt.AMBIGUOUS: np.full(len(share), _AMBIGUOUS),
         Doubt.TURNED: share,
-        Doubt.UNSUPPORTED: np.full(len(placed), _UNSUPPORTED),
-        Doubt.UNKNOWN: np.full(len(placed), np.nan),
+        Doubt.UNSUPPORTED: np.zeros(len(share)),
+        Doubt.UNKNOWN: np.full(len(share), np.nan),
     }
     return np.array([by_kind[kind][camera] for camera, kind in enumerate(doubts.kinds)])
 
@@ -101,6 +82,4 @@ def _reason(doubts: Doubts, camera: int) -> str:
         return f"repeated structure, or a wrong rotation: its matches speak as much for {turn}"
     if kind is Doubt.UNSUPPORTED:
         return "none of its pairs agrees with it: its rotation may be wrong"
-    if doubts.astray[camera] > doubts.placed[camera]:
-        return "repeated structure: the directions of more of its matches contradict it than agree"
-    return "pairs of repeated structure" if doubts.turned[camera] > 0.0 else ""
+    return ""

@@ -26,7 +26,6 @@ from sfm_shapefit.scene.points import Points
 
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
 _EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
-_FEWEST_PAIRS = 2  # pairs with a direction; a single one contradicts nothing
 _LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is asked
 _OWN_SIGMAS = 3.0  # standard deviations of the pair's own direction; far points make it inexact
 
@@ -73,7 +72,7 @@ class PairFits:
         total = np.bincount(ends[known].ravel(), minlength=count)
         against = np.bincount(ends[known & self.contradicts].ravel(), minlength=count)
         shares = against / np.maximum(total, 1)
-        asked = total >= _FEWEST_PAIRS
+        asked = total > 0
         usual = float(np.median(shares[asked])) if asked.any() else 0.0
         many = asked & (shares > max(_LARGE_SHARE, _SHARE_OF_USUAL * usual))
         rows = np.flatnonzero(many[images.frame_of] & np.isfinite(self.centers).all(axis=1))

@@ -25,6 +25,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.judgement.limits import FEWEST_POINTS
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import LARGEST_SIGMA
@@ -36,7 +37,6 @@ _STILL = 1e-2  # standard deviations; a shorter step is the last
 _LONGEST_STEP = 0.3  # log of the focal length; its model is linear no farther
 _FARTHEST = 1.8  # log of the focal length; no lens is given 6 times too long, such a fit ran away
 _MOST_OBSERVATIONS = 600  # observations of an image, evenly taken; more cost time and say little
-_FEWEST_OBSERVATIONS = 15  # observations; seven unknowns of fewer are chance
 _MEDIAN_SQUARE = 1.386  # median of the square of a residual of two axes with unit noise: 2 ln 2
 _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (1977) for one axis
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
@@ -184,7 +184,7 @@ def fit_images(
         for a in range(3):
             for b in range(3):
                 rotation[a, b] = rotations[i, a, b]
-        if count >= _FEWEST_OBSERVATIONS:
+        if count >= FEWEST_POINTS:
             _fit_image(
                 held, seen, spread, count, rotation, focal_px[i], angular[i], lines, squares, work, system,
                 figures[i],
@@ -275,7 +275,7 @@ def _fill_system(
         if _linearize(held[k], seen[k], rotation, t, factor, focal_px, angular, lines[ahead]):
             squares[ahead] = work[ahead] = _whiten(spread[k], rotation, lines[ahead])
             ahead += 1
-    if 2 * ahead <= count or ahead < _FEWEST_OBSERVATIONS:
+    if 2 * ahead <= count or ahead < FEWEST_POINTS:
         return 0.0
     scale = max(median(work, ahead) / _MEDIAN_SQUARE, _LEAST_NOISE)
     for k in range(ahead):

@@ -6,7 +6,7 @@ camera. Each two rejected rays have a point nearest to both; where most of them 
 
 That it fits by chance is unlikely, but a camera that its pairs leave loose has many places. So the other one
 counts if three pairs or more are for it, half as many at least as are for this one alone, if most pairs that
-agree with this place do not pass there too, and if it is well away. Directions that are a degree off in
+agree with this place do not pass there too. Directions that are a degree off in
 general, as where things move, tell no places.
 
 castle-P19 and P30, 40 % of whose pairs are rejected, have no camera with another place, nor has any of 13
@@ -18,17 +18,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.geometry import angle_between_deg, median_spread, normalized
+from sfm_shapefit.base.geometry import angle_between_deg, normalized
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE
 
 _LEVELS, _NEAR_DEG = (
     3.0,
     (0.5, 3.0),
 )  # levels of error, and degrees at least; more than at most, and none is asked
 _LEAST_SINE = 0.1  # sine of the angle between two rays that define a place; flatter ones cut anywhere
-_FEWEST_PAIRS = 3  # pairs for another place; two rays always meet, nearly
 _LEAST_SHARE = 0.5  # pairs for the other place over those for this one alone; fewer are a few wrong pairs
 _MOST_SHARED = 0.5  # share of the agreeing pairs that pass at the other place too; more, and it is loose
-_LEAST_DISTANCE = 0.03  # distance over the median one of cameras from their median: about 1 % of the extent
 _MOST_RAYS = 30  # rejected rays of a camera that define places, evenly taken; all of them count
 
 
@@ -65,7 +64,6 @@ def find_other_places(
     near_deg = max(_LEVELS * level_deg, _NEAR_DEG[0])
     if not (near_deg <= _NEAR_DEG[1] and len(pairs)):
         return ()
-    least = _LEAST_DISTANCE * median_spread(centers[known])
     ends, rows = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(ends, kind="stable")
     found = []
@@ -77,9 +75,9 @@ def find_other_places(
         there, place = wrong.best_place(near_deg)
         both = right.pass_at(place[None], near_deg)[0]
         agreeing, shared = len(both), int(both.sum())
-        is_other = there >= max(_FEWEST_PAIRS, _LEAST_SHARE * (agreeing - shared))
+        is_other = there >= max(FEWEST_ALIKE, _LEAST_SHARE * (agreeing - shared))
         is_other &= shared <= _MOST_SHARED * agreeing
-        if is_other and np.linalg.norm(place - centers[camera]) > least:
+        if is_other:
             here = pairs[own[agrees[own]][~both]]
             found.append(OtherPlace(int(camera), len(here), there, place - centers[camera], here))
     return tuple(found)

@@ -25,14 +25,13 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
+from sfm_shapefit.judgement.limits import MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
 _SMALLEST_GROUP = 2  # cameras; a single one is no group, and has tests of its own
 _FEWEST_CONTRADICTING = 5  # pairs across a cut, and pairs on one turn; fewer are chance
-_OUTNUMBERED = 2.0  # contradicting pairs over agreeing ones across a cut; it was 3 or more in wrong models
 _LEAST_ON_ONE_TURN = 0.1  # share of the contradictions with a rotation that agree on one turn; see the header
 _ALIKE_DEG = 3.0  # degrees between turns that agree; a single pair knows its rotation to about one
-_MOST_TURNS = 300  # turns across one cut that are compared, evenly taken; the time grows with the square
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
 
 
@@ -84,7 +83,7 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
             continue
         inside = bodies == body
         across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
-        if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > _OUTNUMBERED * len(across[0]):
+        if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > OUTNUMBERED * len(across[0]):
             is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
             cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], is_tied))
     return tuple(cuts)
@@ -103,7 +102,7 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
     seams = []
     for cut in cuts:
         rows = np.array([row_of[p] for p in map(tuple, cut.contradicting.tolist()) if p in row_of], np.int64)
-        taken = min(len(rows), _MOST_TURNS)
+        taken = min(len(rows), MOST_COMPARED)
         rows = rows[np.arange(taken) * len(rows) // max(taken, 1)]
         turns = _turns(sound.subset(rows), rotations, cut.cameras)
         num_turned, turn_deg = _most_alike(turns)

@@ -8,7 +8,7 @@ degree.
 
 Which of the two is right there, the pairs say that it has with cameras on which both agree, and whose
 direction each model measures by its own rotations and lenses: a pair speaks for one of them if it misses the
-other by four levels of error or more, and by twice as much. A camera that few pairs tie to those follows the
+other by more than twice as much. A camera that few pairs tie to those follows the
 others that stand elsewhere. The one with twice as many pairs is right; without that, neither is believed.
 """
 
@@ -19,6 +19,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
 from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE, OUTNUMBERED
 from sfm_shapefit.scene.images import Images
 
 _FEWEST_COMMON = 4  # cameras of both; of three, one that is off takes the similarity along
@@ -26,10 +27,7 @@ _CAP = 0.03  # spreads; farther off, a camera is lost, and half of them may be
 _OF_USUAL = 6.0  # usual differences; more is elsewhere, if it is more than the next as well
 _ROUNDING, _ROUNDING_DEG = 1e-7, 1e-5  # spreads and degrees; usual differences of the same model are smaller
 _FAR, _TURNED_DEG = 0.01, 0.5  # spreads and degrees; what is nearer needs no judge
-_LEVELS, _RATIO = 4.0, 2.0  # levels, and residuals of the better one; a pair that misses by both speaks
-_LEAST_LEVEL_DEG = 0.05  # degrees; good rotations leave as much in any direction
-_OUTNUMBERED = 2.0  # pairs for one of the two over pairs for the other; it is right then
-_FEWEST_PAIRS = 3  # pairs that speak for one of them; fewer are chance
+_RATIO = 2.0  # residuals of the better one; a pair that misses the other by more speaks for it
 _NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the rotations, as badly as can be
 
 
@@ -63,11 +61,11 @@ def compare_models(
     elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > _TURNED_DEG))
     residuals = _residuals(fits, mine), _residuals(other_fits, theirs)
     votes = _count_votes(*residuals, elsewhere)
-    votes[votes.sum(axis=1) < _FEWEST_PAIRS] = votes.sum(axis=0)
+    votes[votes.sum(axis=1) < FEWEST_ALIKE] = votes.sum(axis=0)
     here, there = votes.T
-    wrong = elsewhere & (there >= np.maximum(_OUTNUMBERED * here, _FEWEST_PAIRS))
-    right = elsewhere & (here >= np.maximum(_OUTNUMBERED * there, _FEWEST_PAIRS))
-    undecided = elsewhere & ~wrong & ~right & (here + there >= _FEWEST_PAIRS)
+    wrong = elsewhere & (there >= np.maximum(OUTNUMBERED * here, FEWEST_ALIKE))
+    right = elsewhere & (here >= np.maximum(OUTNUMBERED * there, FEWEST_ALIKE))
+    undecided = elsewhere & ~wrong & ~right & (here + there >= FEWEST_ALIKE)
     alike = ~(unlike[0] | unlike[1])
     num_for, num_against = _count_votes(*residuals, wrong).sum(axis=0).tolist()
     return SecondOpinion(
@@ -89,7 +87,6 @@ class _Residuals(NamedTuple):
     """(m,) i * k + j of cameras i < j of k common ones; ascending."""
     degrees: FloatArray
     """(m,)"""
-    level_deg: float
 
 
 def _residuals(fits: PairFits, rows: IntArray) -> _Residuals:
@@ -103,7 +100,7 @@ def _residuals(fits: PairFits, rows: IntArray) -> _Residuals:
     there = np.flatnonzero((ends >= 0).all(axis=1) & np.isfinite(residuals))
     keys = ends[there, 0] * len(rows) + ends[there, 1]
     order = np.argsort(keys)
-    return _Residuals(keys[order], residuals[there[order]], max(fits.level_deg, _LEAST_LEVEL_DEG))
+    return _Residuals(keys[order], residuals[there[order]])
 
 
 def _count_votes(here: _Residuals, there: _Residuals, elsewhere: BoolArray) -> IntArray:
@@ -115,8 +112,6 @@ def _count_votes(here: _Residuals, there: _Residuals, elsewhere: BoolArray) -> I
     across = elsewhere[ends].sum(axis=1) == 1
     ends, mine, theirs = ends[across], here.degrees[a][across], there.degrees[b][across]
     away = np.where(elsewhere[ends[:, 0]], ends[:, 0], ends[:, 1])
-    least = _LEVELS * min(here.level_deg, there.level_deg)
     for side, (good, bad) in enumerate(((mine, theirs), (theirs, mine))):
-        speaks = (bad > least) & (bad > _RATIO * good)
-        votes[:, side] = np.bincount(away[speaks], minlength=count)
+        votes[:, side] = np.bincount(away[bad > _RATIO * good], minlength=count)
     return votes

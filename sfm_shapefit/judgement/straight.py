@@ -3,14 +3,14 @@
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE
 
 _MOST_DEG, _SHARE = 1.0, 0.95  # degrees from the line, and share of directions within; a few may be wrong
-_FEWEST_DIRECTIONS = 3  # directions; fewer lie on a line by chance
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:
     """Return the line (d,) within a degree of 19 in 20 unit directions (m, d); None if there is none."""
-    if len(directions) < _FEWEST_DIRECTIONS:
+    if len(directions) < FEWEST_ALIKE:
         return None
     _, _, axes = np.linalg.svd(directions, full_matrices=False)
     line = axes[0]

@@ -9,13 +9,12 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.judgement.limits import CHECKED_BY, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.joining import sampson_px
 
-_FEWEST_FRAMES = 3  # frames; so many stay whatever they see, as a model of fewer is none
-_CHECKED_BY = 2  # matches of a keypoint in other images; with as many its track can be checked
 # Keypoints that can be checked, and share of them that sees points; less is chance. No right image of
 # data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed, 0.
 _FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
@@ -40,7 +39,7 @@ def images_of_few_points(points: Points, images: Images, least: IntArray, fixed:
         most = np.full(len(images.frames.ids), -1)
         np.maximum.at(most, frame_of[there], seen[there])
         poor = (most >= 0) & (most < least) & ~fixed
-        if not poor.any() or np.sum((most >= 0) & ~poor) < _FEWEST_FRAMES:
+        if not poor.any() or np.sum((most >= 0) & ~poor) < SMALLEST_SHAPE:
             return gone
         leaving = there & poor[frame_of]
         gone[leaving] = seen[leaving]
@@ -111,7 +110,7 @@ def count_observations(
             np.ascontiguousarray(batch.rays_j), turns, baselines / lengths[:, None], batch.pixel_angles,
             max_error_px, posed, begins, counts,
         )  # fmt: skip
-    checked, sees = counts[:, 0] >= _CHECKED_BY, np.zeros(len(image_of), dtype=np.bool_)
+    checked, sees = counts[:, 0] >= CHECKED_BY, np.zeros(len(image_of), dtype=np.bool_)
     sees[begins[points.images] + points.keypoints] = True
     misses = 2 * counts[:, 1] > counts[:, 0]
     parts = (checked, checked & sees, checked & ~sees & misses)
@@ -136,7 +135,7 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
     posed[images.frame_of[images.is_posed]] = True
     lost[images.frame_of[could]], support[images.frame_of[does]] = True, True
     lost &= ~support & ~fixed
-    return images.is_posed & (lost & (np.sum(posed & ~lost) >= _FEWEST_FRAMES))[images.frame_of]
+    return images.is_posed & (lost & (np.sum(posed & ~lost) >= SMALLEST_SHAPE))[images.frame_of]
 
 
 @kernel

@@ -21,12 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct
+from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct, rows_taken
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
 
 # NodeLinks that fit, those of them without any one camera, and how many may miss for each; see the header.
-_BY_POINTS, _BY_PAIRS = (15, 15, 0.5), (3, 2, 2.0)
+_BY_POINTS = (FEWEST_POINTS, FEWEST_POINTS, 1.0 / OUTNUMBERED)
+_BY_PAIRS = (FEWEST_ALIKE, FEWEST_ALIKE - 1, OUTNUMBERED)
 _MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
 _UNKNOWNS = 7  # numbers; turn, shift and scale: fewer facts leave some of them open
 _PAIR_SAYS, _POINT_SAYS = 5, 2  # numbers; see the header
@@ -57,10 +59,6 @@ class NodeLinks(NamedTuple):
     fits: BoolArray
     """(k,) whether it agrees with where these stand."""
 
-    def taken(self, chosen: BoolArray) -> "NodeLinks":
-        """Return some of them (k,)."""
-        return NodeLinks(self.ids[chosen], self.ends[chosen], self.fits[chosen])
-
     @property
     def number(self) -> int:
         """How many points or pairs they are."""
@@ -76,10 +74,6 @@ class Rays(NamedTuple):
     """(r,)"""
     fits: BoolArray
     """(r,) whether the observation fits."""
-
-    def taken(self, chosen: BoolArray) -> "Rays":
-        """Return some of them (r,)."""
-        return Rays(self.points[chosen], self.nodes[chosen], self.fits[chosen])
 
     def links(self) -> NodeLinks:
         """Return a link for each two rays of a point."""
@@ -116,7 +110,7 @@ def find_groups(
     lowest = np.full(int(rays.points.max(initial=-1)) + 1, count)
     np.minimum.at(lowest, rays.points, group[rays.nodes])
     others = np.bincount(rays.points, group[rays.nodes] != lowest[rays.points])
-    points, is_done = rays.taken((others > 0)[rays.points]).links(), False
+    points, is_done = rows_taken(rays, (others > 0)[rays.points]).links(), False
     while not is_done:
         united = _unite(_unite(group, points, *_BY_POINTS), pairs, *_BY_PAIRS)
         is_done, group = len(np.unique(united)) == len(np.unique(group)), united
@@ -131,7 +125,7 @@ def find_groups(
 
 def _of_three(rays: Rays) -> Rays:
     """Return the rays of points that three nodes see; none of a point fits unless three do."""
-    rays = rays.taken((np.bincount(rays.points) > 2)[rays.points])
+    rays = rows_taken(rays, (np.bincount(rays.points) > 2)[rays.points])
     return rays._replace(fits=rays.fits & (np.bincount(rays.points, rays.fits) > 2)[rays.points])
 
 
@@ -139,7 +133,7 @@ def _rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     """Return the group of each node (n,) by the points that two of them share, a share of all points."""
     group = np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1
-    strong = _tied(group, rays.taken(rays.points % step == 0).links(), *_BY_POINTS)[0]
+    strong = _tied(group, rows_taken(rays, rays.points % step == 0).links(), *_BY_POINTS)[0]
     strong = np.unique(np.sort(np.concatenate([strong, known]), axis=1), axis=0)
     if len(strong):
         piece = parallel_rigid_pieces(count, strong, 3)
@@ -173,8 +167,8 @@ def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
         (pairs, _PAIR_SAYS, _BY_PAIRS[2]),
         (points, _POINT_SAYS, _BY_POINTS[2]),
     ):
-        across = links.taken(inside[links.ends].sum(axis=1) == 1)
-        fitting, missing = across.taken(across.fits), across.taken(~across.fits)
+        across = rows_taken(links, inside[links.ends].sum(axis=1) == 1)
+        fitting, missing = rows_taken(across, across.fits), rows_taken(across, ~across.fits)
         numbers += [fitting.number, missing.number]
         if missing.number <= most_missing * fitting.number:
             ends.append(fitting.ends)

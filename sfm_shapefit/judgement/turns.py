@@ -43,8 +43,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.judgement.bodies import find_bodies
+from sfm_shapefit.judgement.limits import MOST_COMPARED
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
@@ -56,14 +57,12 @@ _LEAST_TURN_RAD = np.radians(1.0)  # radians; a turn below this and ...
 _AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
 _PREFERENCE = 0.5  # standard deviations; a pair that fits an explanation better by less prefers none
 _LARGEST_SIGMA_RAD = np.radians(3.0)  # radians; agreement says nothing where a turn could as well be larger
-_NEAR_RAD = np.radians(10.0)  # radians; the level of errors is that of pairs with smaller turns
 _LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
 _UNEXPLAINED, _EXPLAINED = 0.7, 0.95  # ratio of robust weights; given rotations fit not at all, and fully
 _MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
 _DIRECTION_ALONE = 0.5  # support of a pair whose direction agrees; its own rotation does not
 RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
 """Shares s: from the first a camera is right, below the second it is turned."""
-_MOST_VOTES = 300  # turns of a body that are compared with one another; those of most weight decide
 _MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
 _AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
 
@@ -91,19 +90,6 @@ class PairTurns(NamedTuple):
     """(k,) what the pair counts: its matches, up to a limit."""
     placed: FloatArray
     """(k,) in [0, 1], how well the matches fit the given rotations and the solved baseline."""
-    astray: FloatArray
-    """(k,) 1 where the rotation agrees and yet the direction is another than the solved baseline's."""
-
-    def subset(self, rows: IntArray | BoolArray) -> "PairTurns":
-        """Return the given pairs, in that order."""
-        return PairTurns(
-            self.pairs[rows],
-            self.turns[rows],
-            self.sigmas_rad[rows],
-            self.weights[rows],
-            self.placed[rows],
-            self.astray[rows],
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,8 +106,6 @@ class Doubts:
     """(n,) the number of these pairs."""
     angles_deg: FloatArray
     """(n,) that turn; NaN where there is none."""
-    astray: FloatArray
-    """(n,) weight of the pairs that agree with the rotation, and whose direction is off the solution."""
     bodies: IntArray
     """(n,) label of the body with which the camera was judged; cameras judged alone have one of their own."""
 
@@ -191,10 +175,9 @@ def weigh_pairs(
     support = np.where(asked & ~(finite & small), _DIRECTION_ALONE * support, support)
     # A pair without a direction that could be compared speaks for the rotation all the same.
     support = np.where(~judged & finite & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
-    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (finite & small))
     weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)
     weights[row] = np.minimum(counts, _MOST_WEIGHT)
-    return PairTurns(directions.pairs, turns, sigmas, weights, support, astray.astype(np.float64))
+    return PairTurns(directions.pairs, turns, sigmas, weights, support)
 
 
 def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
@@ -205,7 +188,7 @@ def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
     count = int(labels.max(initial=-1)) + 1
     ends = labels[pairs.pairs]
     between = ends[:, 0] != ends[:, 1]
-    case = pairs.subset(between)._replace(pairs=ends[between])
+    case = rows_taken(pairs, between)._replace(pairs=ends[between])
     inflation = max(1.0, _level(case))
     case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
     least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
@@ -221,7 +204,6 @@ class _Judged(NamedTuple):
     placed: float = 0.0
     turned: float = 0.0
     num_turned: int = 0
-    astray: float = 0.0
     num_pairs: int = 0
     is_alone: bool = True
     """Whether the body is a single camera."""
@@ -265,7 +247,6 @@ class _Verdicts:
             turned=np.array([one.turned for one in judged]),
             num_turned=np.array([one.num_turned for one in judged], dtype=np.int64),
             angles_deg=np.array([one.angle_deg for one in judged]),
-            astray=np.array([one.astray for one in judged]),
             bodies=self.body_of[labels],
         )
 
@@ -296,12 +277,11 @@ def _angles(rotations: FloatArray) -> FloatArray:
 
 
 def _level(pairs: PairTurns) -> float:
-    """Return by what the turns near 0 are larger than their standard deviations say; 1 without any."""
-    angles = _angles(pairs.turns)
-    near = np.isfinite(pairs.sigmas_rad) & (angles < _NEAR_RAD)
-    if not near.any():
+    """Return by what the smaller turns are larger than their standard deviations say; 1 without any."""
+    known = np.isfinite(pairs.sigmas_rad)
+    if not known.any():
         return 1.0
-    quantile = float(np.quantile(angles[near] / pairs.sigmas_rad[near], _LEVEL_QUANTILE))
+    quantile = float(np.quantile(_angles(pairs.turns[known]) / pairs.sigmas_rad[known], _LEVEL_QUANTILE))
     return quantile / _NORMAL_QUANTILE
 
 
@@ -348,7 +328,7 @@ def _judge_as_placed(
                 continue
             part = np.zeros_like(done)
             part[members] = True
-            own = case.subset(touching.rows_of(members))
+            own = rows_taken(case, touching.rows_of(members))
             verdicts.note(members, _judge(own, part, largest & ~part, least_rad))
 
 
@@ -361,7 +341,7 @@ def _worst_body(
         body = (bodies == label) & ~done
         if not body.any() or 2 * body.sum() > len(body):
             continue
-        own = pairs.subset(touching.rows_of(np.flatnonzero(body)))
+        own = rows_taken(pairs, touching.rows_of(np.flatnonzero(body)))
         judged = _judge(own, body, ~body, least_rad)
         if judged.kind is Doubt.TURNED:
             candidates.append((body, judged))
@@ -383,8 +363,7 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
     weights, support, sigmas = pairs.weights[rows], pairs.placed[rows], pairs.sigmas_rad[rows]
     contradict = _contradicts(pairs)[rows]
     placed, against = float(weights @ support), float(weights[contradict].sum())
-    astray = float(weights @ pairs.astray[rows])
-    judged = _Judged(placed=placed, astray=astray, num_pairs=len(rows), is_alone=bool(body.sum() == 1))
+    judged = _Judged(placed=placed, num_pairs=len(rows), is_alone=bool(body.sum() == 1))
     if against <= placed * (1.0 - RIGHT_SHARE) / RIGHT_SHARE:
         return judged
     votes = np.where(is_first[rows, None, None], pairs.turns[rows], pairs.turns[rows].transpose(0, 2, 1))
@@ -415,7 +394,7 @@ def _common_turn(
     turn.
     """
     voting = np.flatnonzero(np.isfinite(sigmas))
-    voting = voting[np.argsort(-weights[voting], kind="stable")][:_MOST_VOTES]
+    voting = voting[np.argsort(-weights[voting], kind="stable")][:MOST_COMPARED]
     chosen = voting[candidates[voting]]
     if len(chosen) == 0:
         return None

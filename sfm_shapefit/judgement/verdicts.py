@@ -16,7 +16,8 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.trust import PairFit, judge_cameras
+from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
+from sfm_shapefit.judgement.trust import judge_cameras
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (
     GroupGauge,
@@ -29,7 +30,6 @@ from sfm_shapefit.placement.conditioning import LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.tied import largest_tied
 
-_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _PART = 2_000  # directions whose error samples are worked on at a time; bounds the memory
 _LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nodes; with none, none would be
 # Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
@@ -140,8 +140,7 @@ def assess(
     covariances = scale**2 * covariances
     sigmas = standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
-    fit = PairFit(angles, sigma_of_pair, leverages)
-    judged = judge_cameras(measured, locations, fit, sigmas, conditioning)
+    judged = judge_cameras(measured, locations, inliers, sigmas, conditioning)
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,
@@ -206,7 +205,7 @@ def _propagate_nodes(
         rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
         nodes, edges = np.unique(graph.edges[rows], return_inverse=True)
         cameras = int(np.sum(nodes < num_cameras))
-        if cameras < _SMALLEST_RIGID:
+        if cameras < SMALLEST_SHAPE:
             return covariances, leverages
         try:
             samples = None if sampled is None else sampled.parts(graph.directions, rows)

@@ -13,14 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
-_WITNESSES = 2  # observations of a point that a keypoint matches; one may be as false as its pair
-_FEWEST_FITTING = 15  # keypoints; the six unknowns of a pose fit fewer by chance
-_OUTNUMBERED = 2.0  # fitting keypoints over those that miss; right cameras have far more
 FITTING_PX = 4.0  # pixels; what misses its point by more does not fit, as COLMAP has it
 
 
@@ -45,14 +43,14 @@ def are_confirmed(
     asked = np.isin(images.frame_of, images.frame_of[doubted]) & images.is_posed
     left = asked
     while left.any():
-        those = points.taken(points.paired(~left[points.images])).seen_by(left, *matches, least=_WITNESSES)
+        those = points.taken(points.paired(~left[points.images])).seen_by(left, *matches, least=CHECKED_BY)
         own = left[those.images]
         frames = images.frame_of[those.images[own]]
         fits = keypoint_errors_px(those, images, pictures)[own] <= FITTING_PX
         fitting, missing = (
             np.bincount(frames[part], minlength=len(images.frames.ids)) for part in (fits, ~fits)
         )
-        is_right = (fitting >= _FEWEST_FITTING) & (fitting >= _OUTNUMBERED * missing)
+        is_right = (fitting >= FEWEST_POINTS) & (fitting >= OUTNUMBERED * missing)
         if not (left & is_right[images.frame_of]).any():
             break
         left = left & ~is_right[images.frame_of]

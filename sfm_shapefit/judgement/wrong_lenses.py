@@ -16,6 +16,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
+from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 
@@ -23,8 +24,7 @@ from sfm_shapefit.scene.points import Points
 # which half of the images of a lens show that it is; see the header.
 _ONE, _HALF = (0.025, 10.0), (0.004, 3.0)
 # Standard deviations, and how many times those of any other image: so clear is a lens of one image too.
-_CLEAR, _FEWEST_OTHERS = (4.0, 2.5), 5  # other images; fewer are no measure
-_FEWEST_IMAGES = 3  # images of a lens of which a half is asked for; each of fewer is asked alone
+_CLEAR = (4.0, 2.5)
 _RIVAL = 0.5  # share of the highest score; what is named as clearly is taken out at once, for time's sake
 
 
@@ -80,9 +80,9 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         own = images.lens_of == lens
         rows, others = (np.flatnonzero(side & left_out.observable) for side in (own, ~own))
         (least, deviations), clear = _ONE, max(_CLEAR[0], _CLEAR[1] * scores[others].max(initial=0.0))
-        if len(rows) >= _FEWEST_IMAGES:
+        if len(rows) >= SMALLEST_SHAPE:
             least, deviations = _HALF
-        elif own.sum() < _FEWEST_IMAGES and len(others) >= _FEWEST_OTHERS:
+        elif own.sum() < SMALLEST_SHAPE and len(others) >= SMALLEST_SHAPE:
             deviations = min(deviations, clear)
             rows = np.flatnonzero(own & (left_out.observable | (scores > clear)))
         if not len(rows):
@@ -90,7 +90,7 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
         changes = left_out.log_factors[rows]
         middle = float(np.median(changes))
         sigma = float(left_out.sigmas[rows].max())
-        if len(rows) >= _FEWEST_IMAGES:
+        if len(rows) >= SMALLEST_SHAPE:
             sigma = SIGMA_PER_MEDIAN * float(np.median(np.abs(changes - middle)))
         score = float(np.median(scores[rows]))
         if np.median(np.abs(changes)) > least and score > deviations:

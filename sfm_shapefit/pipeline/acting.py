@@ -13,11 +13,10 @@ import numpy as np
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.intrinsics import in_doubt, with_focal_length
+from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.lens import Origin
-
-_OUTNUMBERED = 2  # pairs for another place over those for this one; fewer, and a camera stays
 
 
 class Remedy(NamedTuple):
@@ -83,7 +82,7 @@ def find_remedy(
     # A camera that is fixed, or held by its rig, cannot go where its pairs are.
     may_move = given.rigid.groups is None and not given.rigid.fixed.any()
     places = found.evidence.places if may_move else ()
-    moved = [place for place in places if place.num_there >= _OUTNUMBERED * place.num_here]
+    moved = [place for place in places if place.num_there >= OUTNUMBERED * place.num_here]
     if not (freed or moved):
         return None
     lenses, focal = list(images.lenses), intrinsics.focal.copy()

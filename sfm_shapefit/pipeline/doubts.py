@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
@@ -130,7 +130,7 @@ def doubt_cameras(
     pairs = weigh_pairs(directions, _agreements(placement, directions), relative, images.rotations)
     ends = place_of[pairs.pairs]
     inside = np.flatnonzero((ends >= 0).all(axis=1) & _weighed(directions, images.num_images))
-    pairs = pairs.subset(inside)._replace(pairs=ends[inside])
+    pairs = rows_taken(pairs, inside)._replace(pairs=ends[inside])
     labels = np.arange(len(placement.cameras))
     if placement.groups is not None:
         _, labels = np.unique(placement.groups.group_of[placement.cameras], return_inverse=True)
@@ -146,7 +146,7 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
     images = source.images
     relative = ask_pairs(source, directions, threads)
     pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, images.rotations)
-    pairs = pairs.subset(_weighed(directions, images.num_images))
+    pairs = rows_taken(pairs, _weighed(directions, images.num_images))
     kinds = find_turned(pairs, images.frame_of).kinds
     return np.array([kind is Doubt.RIGHT for kind in kinds])
 

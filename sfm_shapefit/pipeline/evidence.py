@@ -68,6 +68,13 @@ def gather_evidence(
     )
 
 
+def rigid_strip(images: Images, chosen: BoolArray) -> IntArray:
+    """Return pairs (k, 2) of images that make the frames of those chosen (i,) rigid, one image of each."""
+    rows = np.flatnonzero(chosen)
+    rows = rows[np.unique(images.frame_of[rows], return_index=True)[1]]
+    return np.concatenate([np.column_stack([rows[step:], rows[:-step]]) for step in (1, 2)])
+
+
 def _ask_some(images: Images, asked: BoolArray | None) -> BoolArray | None:
     """Return which images (i,) are asked for their focal length: of a lens that took very many, only some."""
     every = np.bincount(images.lens_of[images.is_posed])
@@ -105,12 +112,12 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
     fitting = keypoint_errors_px(points, images, pictures) <= FITTING_PX
     rays = Rays(points.points_seen(), frames[points.images], fitting)
     pairs = links_of_pairs(*(frames[side] for side in fits.sides))
-    fixed = np.zeros(0, dtype=np.int64) if source.fixed is None else np.unique(frames[source.fixed])
-    known = [np.column_stack([fixed[step:], fixed[:-step]]) for step in (1, 2)]  # a rigid strip
+    known = [] if source.fixed is None else [frames[rigid_strip(images, source.fixed)]]
     if source.tied is not None:
-        joined = frames[source.tied]
-        known.append(joined[joined[:, 0] != joined[:, 1]])
-    tied, groups = find_groups(len(images.frames.ids), rays, pairs, np.concatenate(known))
+        tied = frames[source.tied]
+        known.append(tied[tied[:, 0] != tied[:, 1]])
+    together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
+    tied, groups = find_groups(len(images.frames.ids), rays, pairs, together)
     posed = np.unique(frames[images.is_posed])
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)

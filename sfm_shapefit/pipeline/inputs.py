@@ -34,7 +34,7 @@ class MatchSource:
     fixed: BoolArray | None = None
     """(i,) images that stay where they are; None if none does."""
     tied: IntArray | None = None
-    """(k, 2) images that joins of their models tie to one another; None if no models were joined."""
+    """(k, 2) images that joins of models, or position priors, tie to one another; None if these do not."""
     alone: RelativeRotations | None = None
     """What pairs, ascending, said of their rotations alone, before anything was placed; None if not asked."""
 

@@ -242,7 +242,7 @@ def count_work(source: MatchSource, directions: PairDirections) -> Workload:
 
 
 def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
-    """Return the graph with what the matches say of its cameras; a direction to a point has one match.
+    """Return the graph with what the matches say of its cameras.
 
     The errors of directions to points are independent draws of their own covariance. The samples of
     `measured` are given up part by part, since they are the largest arrays of a placement.
@@ -250,7 +250,6 @@ def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
     assert graph.covariance is not None
     directions, usable = measured.directions, measured.directions.usable()
     own = graph.covariance[len(usable) :]
-    against = directions.contradicting()
     errors = None
     if measured.errors is not None:
         errors = np.empty((graph.graph.num_edges, NUM_SAMPLES, own.shape[1]))
@@ -263,9 +262,7 @@ def add_evidence(graph: MeasuredGraph, measured: Measured) -> MeasuredGraph:
         np.random.default_rng(0).standard_normal(out=drawn)
         drawn *= np.sqrt(np.diagonal(own, axis1=1, axis2=2))[:, None, :]
     evidence = Evidence(
-        support=np.concatenate([directions.num_matches[usable], np.ones(len(own), dtype=np.int64)]),
-        contradicting=directions.pairs[against].reshape(-1, 2),
-        contradicting_support=directions.num_matches[against],
+        contradicting=directions.pairs[directions.contradicting()].reshape(-1, 2),
         errors=errors,
         facts_per_match=measured.facts_per_match,
     )

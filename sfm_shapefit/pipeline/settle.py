@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, median_spread
 from sfm_shapefit.base.wording import counted, first_of
@@ -40,13 +40,14 @@ from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
+from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE
 from sfm_shapefit.judgement.judged import Judged, judge
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import ask_pairs, doubt_cameras
-from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
+from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence, rigid_strip
 from sfm_shapefit.pipeline.first_placement import FirstPlacement
 from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE
 from sfm_shapefit.pipeline.given import Given
@@ -288,7 +289,18 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
     pictures = ModelPictures(images, source.view.keypoints)
     asked = None if source.fixed is None else ~source.fixed
     structure = Structure(points, images, pictures, among, asked)
+    source = replace(source, tied=_tied_by_priors(stand, images))
     return gather_evidence(source, fits, structure, clock.threads)
+
+
+def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
+    """Return pairs (k, 2) of images that priors tie: those whose own is as certain as a camera should be."""
+    if stand.held is None:
+        return None
+    centers = images.centers[images.is_posed]
+    most = UNCERTAIN_SHARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    frames = stand.held.indices[stand.held.sigmas() <= most]
+    return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 
 
 def _place_all(stand: Stand, images: Images) -> Images:

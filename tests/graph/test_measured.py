@@ -11,11 +11,7 @@ EDGES = np.array([(0, 1), (1, 2), (2, 4), (3, 4), (1, 5), (4, 6)])
 MEASURED = MeasuredGraph(
     ViewGraph(7, EDGES, np.tile([1.0, 0.0, 0.0], (6, 1)), 1.0 + np.arange(6), [f"n{k}" for k in range(7)]),
     covariance=np.arange(6.0)[:, None, None] * np.eye(2),
-    evidence=Evidence(
-        support=10 * np.arange(6),
-        contradicting=np.array([(1, 4), (0, 3)]),
-        contradicting_support=np.array([8, 9]),
-    ),
+    evidence=Evidence(contradicting=np.array([(1, 4), (0, 3)])),
     num_points=2,
     groups=RigidGroups(group_of=[0, 1, 1, 0, 2, 3, 4], offsets=np.arange(21.0).reshape(7, 3)),
     fixed_group=2,

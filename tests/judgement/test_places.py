@@ -41,15 +41,6 @@ def test_few_pairs_are_none_and_nor_is_one_that_more_than_twice_as_many_contradi
     assert len(find_other_places(*scene(lying=5, agreeing=9), 0.1)) == 1
 
 
-def test_a_place_nearby_is_the_same_however_exactly_pairs_tell_it():
-    centers, pairs, _, agrees = scene(lying=12)
-    centers[1:11] = centers[0] + 0.2 * normalized(centers[1:11] - centers[0])  # 8 degrees
-    seen = np.where(agrees[:, None], centers[0], centers[0] + [0.03, 0.0, 0.0])
-    assert find_other_places(centers, pairs, normalized(seen - centers[1:]), agrees, 0.01) == ()
-    seen = np.where(agrees[:, None], centers[0], centers[0] + [1.0, 0.0, 0.0])
-    assert len(find_other_places(centers, pairs, normalized(seen - centers[1:]), agrees, 0.01)) == 1
-
-
 def test_loose_directions_tell_none_and_nor_do_rays_that_meet_behind():
     assert find_other_places(*scene(), 1.1) == ()
     centers, pairs, directions, agrees = scene()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized, tangent_bases
-from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import Verdict, assess
 from sfm_shapefit.placement.conditioning import Looseness
 from sfm_shapefit.solver.program import differences
-from tests.problems import all_pairs, fit_angles, make_evidence
+from tests.problems import all_pairs, fit_angles
 
 SIGMA = 0.01  # rad, per axis
 
@@ -161,7 +161,7 @@ def test_errors_that_pairs_share_widen_the_standard_deviations():
     unit = np.random.default_rng(0).standard_normal((len(edges), 96, 2))
 
     def sigmas(size):
-        evidence = make_evidence(len(edges), 50, errors=size * SIGMA * unit)
+        evidence = Evidence(contradicting=np.zeros((0, 2), dtype=np.int64), errors=size * SIGMA * unit)
         measured = MeasuredGraph(graph, covariance=covariances(len(edges)), evidence=evidence)
         return assess(measured, where).sigmas
 

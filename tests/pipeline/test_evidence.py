@@ -11,7 +11,7 @@ import sfm_shapefit
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pipeline import evidence
+from sfm_shapefit.pipeline import evidence, settle
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
@@ -144,6 +144,25 @@ def test_halves_that_a_join_ties_are_not_doubted(tmp_path):
         tied = replace(source, tied=np.array([*combinations(joined.tolist(), 2)]))
         told = [check_source(model, one, DirectionOptions(), clock).facts.evidence for one in (source, tied)]
     assert [len(one.untied) for one in told] == [1, 0]
+
+
+@pytest.mark.parametrize(("share", "num_tied"), [(0.002, 25), (0.2, 0)])
+def test_priors_that_are_as_certain_as_cameras_tie_these(tmp_path, monkeypatch, share, num_tied):
+    """A share of the extent of sigma, of all images or so, whose own matches hardly tie them."""
+    truth, told = pycolmap.Reconstruction(COURTYARD / "truth"), []
+    images = [truth.image(k) for k in sorted(truth.reg_image_ids())]
+    centers = np.array([image.projection_center() for image in images])
+    sigma = share * np.linalg.norm(np.ptp(centers, axis=0))
+    centers += sigma * np.random.default_rng(0).standard_normal(centers.shape)
+    lines = [",".join(map(str, (k.name, *c, sigma))) for k, c in zip(images, centers.tolist(), strict=True)]
+    priors = tmp_path / "priors.csv"
+    priors.write_text("\n".join(["name,x,y,z,sigma", *lines, ""]))
+    gather = settle.gather_evidence
+    monkeypatch.setattr(
+        settle, "gather_evidence", lambda *given: told.append(given[0].tied) or gather(*given)
+    )
+    sfm_shapefit.map_database(cut(tmp_path, (4, 25), (5, 24)), priors=priors)
+    assert len(np.unique(told[0])) == num_tied
 
 
 def test_a_displaced_camera_has_its_other_place_with_both_counts(tmp_path, courtyard_mapped):

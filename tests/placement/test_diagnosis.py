@@ -79,9 +79,7 @@ def test_a_camera_of_contradicting_matches_is_weak():
     t = np.random.default_rng(3).standard_normal((8, 3))
     graph = exact_graph(t, [pair for pair in all_pairs(8) if pair not in {(0, 7), (1, 7), (2, 7), (3, 7)}])
     against = np.array([(0, 7), (1, 7), (2, 7), (3, 7)])
-    evidence = Evidence(
-        support=np.full(graph.num_edges, 50), contradicting=against, contradicting_support=np.full(4, 50)
-    )
+    evidence = Evidence(contradicting=against)
     assert diagnose(graph).weak == ()
     (weak,) = diagnose(MeasuredGraph(graph, evidence=evidence)).weak
     assert weak.name == "7"
