@@ -42,7 +42,7 @@ MOST_LINES = {
     "files": 4790,
     "graph": 1340,
     "judgement": 3560,
-    "laplacian": 2070,
+    "laplacian": 2060,
     "pairs": 1540,
     "pipeline": 6600,
     "placement": 2690,
