@@ -29,7 +29,7 @@ def right_triangles(tau, d, count=20_000):
     return sides + tau * rng.standard_normal(sides.shape)
 
 
-@pytest.mark.parametrize("d", [2, 3, 5])
+@pytest.mark.parametrize("d", [2, 3, 4])
 def test_the_ratio_is_a_density_over_random_triangles_and_its_level_is_the_likeliest_one(d):
     rng = np.random.default_rng(7)
     norms, levels = module._normalizers(d), module._RUNGS_RAD
