@@ -1,7 +1,7 @@
 """Build a wheel that carries compiled kernels: `python scripts/kernel_wheel.py dist`.
 
-The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources what is not compiled in this
-checkout, and what it kept becomes the package's folder `_kernels`, see `base/kernel_cache`. Machine
+The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources, where this checkout has not
+compiled all, and what it kept becomes the package's folder `_kernels`, see `base/kernel_cache`. Machine
 code and its wrapping depend on the minor versions of Python and numba, so the wheel requires those, and runs
 where numba's own wheel does.
 """
@@ -19,6 +19,7 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 from sfm_shapefit.base.kernel_cache import RUNTIME, stamp_of
+from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED
 
 ROOT = Path(__file__).parents[1]
 
@@ -39,8 +40,9 @@ def build(out: Path) -> Path:
         with zipfile.ZipFile(pure) as archive:
             archive.extractall(tree)
         unpacked = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
-        _copy_kernels(ROOT / "sfm_shapefit", tree / "sfm_shapefit")
-        _run("-m", "sfm_shapefit", "warm-up", **unpacked)
+        done = _copy_kernels(ROOT / "sfm_shapefit", tree / "sfm_shapefit")
+        if not done >= {*NEEDED, *FURTHER}:
+            _run("-m", "sfm_shapefit", "warm-up", **unpacked)
         made_for = _run("-c", "from sfm_shapefit.base.kernel_cache import here; print(here())", **unpacked)
         _carry_kernels(tree / "sfm_shapefit", made_for)
         (info,) = tree.glob("*.dist-info")
@@ -60,8 +62,9 @@ def _run(*arguments: object, **environment: str) -> str:
     ).stdout
 
 
-def _copy_kernels(checkout: Path, package: Path) -> None:
-    """Copy what is compiled beside the sources of this checkout and not stale."""
+def _copy_kernels(checkout: Path, package: Path) -> set[str]:
+    """Copy what is compiled beside the sources of this checkout and not stale; return the examples done."""
+    done = set()
     for file in checkout.rglob("__pycache__/*.nbc"):
         folder = file.parent.parent
         is_note = folder.name == "pipeline"
@@ -70,6 +73,8 @@ def _copy_kernels(checkout: Path, package: Path) -> None:
             place = package / file.relative_to(checkout)
             place.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, place)
+            done |= {file.name.partition("-")[0]} if is_note else set()
+    return done
 
 
 def _carry_kernels(package: Path, made_for: str) -> None:

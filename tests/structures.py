@@ -8,7 +8,7 @@ import pycolmap
 
 from sfm_shapefit.adjustment import bundle_adjustment
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
@@ -117,11 +117,13 @@ def bundle_adjusted(seed, tracks, options=None, freedom=None):
     return found._replace(reconstruction=structure)
 
 
-def adjusted_thinly(seed, tracks, fixed=None, **freedom):
+def adjusted_thinly(seed, tracks, **freedom):
     """`freedom`: fields of `Freedom`."""
-    given, free, links = GivenPoses(fixed=fixed), Freedom(**freedom), links_of(seed, tracks)
-    options, images = StructureOptions(), posed_images(seed)
-    return placed(seed, bundle_adjustment.adjust_thinly(images, lambda: links, options, free, given))
+    free, links, images = Freedom(**freedom), links_of(seed, tracks), posed_images(seed)
+    found = bundle_adjustment.adjust_thinly(
+        images, lambda: links, StructureOptions(), free, lenses_wanted=True
+    )
+    return placed(seed, found)
 
 
 def adjusted_placement(seed, tracks, **freedom):

@@ -16,6 +16,8 @@ import sfm_shapefit
 from tests.program import run_python
 from tests.scenes import ROOT
 
+ANCHOR = re.compile('id="([^"]+)"')
+
 
 def run_example(name: str, *arguments) -> str:
     """Run an example as a program, in a process of its own; return what it prints."""
@@ -138,9 +140,11 @@ def test_the_documentation_builds_as_a_site_with_a_search_over_pages_and_api(tmp
     index = json.loads(text.removeprefix("const INDEX = ").rstrip(";\n"))
     urls = {entry["url"] for entry in index}
     assert {"glossary.html#glossary", "api/sfm_shapefit.html#locate"} <= urls
-    for url in urls:
-        file, _, anchor = url.partition("#")
-        assert f'id="{anchor}"' in (tmp_path / file).read_text(encoding="utf-8"), url
+    pages = {path: path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.html")}
+    anchors = {
+        f"{path.relative_to(tmp_path)}#{name}" for path in pages for name in ANCHOR.findall(pages[path])
+    }
+    assert urls <= anchors
     home = (tmp_path / "index.html").read_text(encoding="utf-8")
     for link in re.findall(r'(?:href|src)="(?!https:|#)([^"#]+)', home):
         assert (tmp_path / link).is_file(), link

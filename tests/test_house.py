@@ -52,7 +52,7 @@ CHANGES = {
     "a figure in locate.json": Change(2, r"\bline_sigma\b", {"facts/model.py", "facts/result.py"}),
     "something else that adjustments may free": Change(
         5,
-        r"\bhas_sensors\b|\bjudge_sensors\b|\bfree_sensors\b|\bfrees_rigs\b|\bplace_sigma\b",
+        r"\bhas_sensors\b|\bjudge_sensors\b|\bfree_sensors\b|\bplace_sigma\b",
         {
             "adjustment/estimate.py",
             "adjustment/free_sensors.py",
@@ -63,13 +63,12 @@ CHANGES = {
             "adjustment/run.py",
             "adjustment/views.py",
             "facts/rigs.py",
-            "pipeline/given.py",
             "pipeline/settle.py",
             "pipeline/stand.py",
         },
     ),
 }
-STILL_MORE = {"something else that adjustments may free": 12}
+STILL_MORE = {"something else that adjustments may free": 11}
 """Files of the changes that touch more than they may; the list may only become shorter."""
 
 

@@ -18,6 +18,12 @@ PHRASE = re.compile(r"\bwhat there is\b|\bthe latter\b|\btells?(?= *(?:[.,;:)]|$
 
 
 @cache
+def tree_of(path: Path) -> ast.Module:
+    """A module, parsed once."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def texts_of(path: Path) -> tuple[tuple[int, str], ...]:
     """Line and text of each docstring, and of each run of comments at one column."""
     with path.open(encoding="utf-8") as file:
@@ -33,7 +39,7 @@ def texts_of(path: Path) -> tuple[tuple[int, str], ...]:
         else:
             texts.append((line, text))
         last = (line, column) if alone else (-1, -1)
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
             if text := string_of(statement):
                 texts.append((statement.lineno, text))
@@ -57,8 +63,7 @@ def faults_of(text: str) -> Iterator[str]:
 
 def constants_of(path: Path) -> Iterator[tuple[str, str]]:
     """Name and explanation of each numeric constant of a module: beside it, else below, else above."""
-    text = path.read_text(encoding="utf-8")
-    lines, body = text.splitlines(), ast.parse(text).body
+    lines, body = path.read_text(encoding="utf-8").splitlines(), tree_of(path).body
     comments = {
         line: said for line, said in texts_of(path) if lines[line - 1].strip().startswith("#") is False
     }
@@ -116,7 +121,7 @@ def test_a_sentence_names_its_subject_and_a_constant_has_a_reason():
 def test_no_two_public_names_are_alike():
     homes = defaultdict(list)
     for path in MODULES:
-        for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        for statement in tree_of(path).body:
             for name in names_of(statement):
                 if not name.startswith("_"):
                     homes[name].append(str(path.relative_to(PACKAGE)))

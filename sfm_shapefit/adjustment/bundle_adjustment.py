@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from sfm_shapefit.tracks.options import StructureOptions
 
 _MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
 _NOTHING_GIVEN = GivenPoses()
-LensesAtFirst = Literal["wanted", "free", "known", "near", "tried"]
 
 
 def adjust_seed(
@@ -58,9 +56,9 @@ def adjust_thinly(
     read_links: Callable[[], Links],
     options: StructureOptions,
     freedom: Freedom,
-    given: GivenPoses = _NOTHING_GIVEN,
     *,
-    lenses: LensesAtFirst = "wanted",
+    lenses_wanted: bool = False,
+    rotations_known: bool = False,
 ) -> Estimate:
     """Adjust the poses of images on few tracks that hold every camera; for poses that may be coarse.
 
@@ -73,15 +71,13 @@ def adjust_thinly(
             before the last solve, which takes most memory.
         options: filters. Observations may miss by four times their limit.
         freedom: what moves. A lens whose focal length the points leave open gets what was given back, and the
-            poses are adjusted again.
-        given: what is known of the poses.
-        lenses: "wanted": they alone are of use, and how well centers are known stays open. "free" or "known":
-            all points follow where a lens or a rig has changed, up to 2,000 frames: a shape bends with a
-            focal length that few points leave a thousandth off; "known" ones, as an adjustment has found
-            them before, are held in the first solve. "near": free, where rotations are known from elsewhere;
-            all points follow the first solve at once. "tried": the same, but where its rays have changed by a
-            hundredth, the first solve is all, since what the start was measured through is to be measured
-            again.
+            poses are adjusted again. Lenses that an adjustment has found before are held in the first solve.
+            Where a lens or a rig has changed, all points follow, up to 2,000 frames: a shape bends with a
+            focal length that few points leave a thousandth off.
+        lenses_wanted: whether the images are measured anew through the lenses that come out. Few points
+            suffice then, and how well centers are known stays open.
+        rotations_known: whether rotations are known from elsewhere. All points follow the first solve at
+            once; where lenses are wanted, only if their rays have not changed by a hundredth.
 
     Returns:
         The gauge is as from `adjust_seed`.
@@ -89,21 +85,22 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = steps.begin(images, read_links(), options, freedom, given)
+    run = steps.begin(images, read_links(), options, freedom, _NOTHING_GIVEN)
+    only_lenses = lenses_wanted and not rotations_known
     if run.frees_more_than_poses:
-        by_all = lenses != "wanted" and len(images.frames.ids) <= MOST_FRAMES
-        if by_all and lenses in ("near", "tried"):
+        by_all = not only_lenses and len(images.frames.ids) <= MOST_FRAMES
+        if by_all and rotations_known:
             run, last = steps.solve_coarsely(run)
-            if lenses == "tried" and run.images.differ_in_rays(images):
+            if lenses_wanted and run.images.differ_in_rays(images):
                 return run.judge_lenses(last)[0].estimate(last, judged=False)
             run, _, last = steps.solve_by_all_points(run)
             return run.estimate(last)
-        solve = partial(steps.solve_twice_thinly, lenses_known=lenses == "known")
+        solve = partial(steps.solve_twice_thinly, lenses_known=run.has_found_lenses)
         again = steps.solve_thinly_again
-        run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=lenses == "wanted")
+        run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=only_lenses)
         if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run)
-        return run.estimate(last, judged=lenses != "wanted")
+        return run.estimate(last, judged=not only_lenses)
     problem = None if len(images.frames.ids) < _MANY_FRAMES else steps.problem_of_fine_poses(run)
     if problem is None:
         run, last = steps.solve_coarsely(run)
@@ -111,7 +108,7 @@ def adjust_thinly(
     if problem is not None:
         run = replace(run, links=None)  # all matches, at the peak of the memory
         run, last = steps.solve_finely(run, problem)
-    return run.estimate(last, judged=lenses != "wanted")
+    return run.estimate(last, judged=not only_lenses)
 
 
 def adjust_placement(

@@ -116,6 +116,12 @@ class AdjustmentRun:
         """Whether lenses or sensors change."""
         return bool(self.freedom.lenses.any()) or bool(self.freedom.sensors(self.images).any())
 
+    @property
+    def has_found_lenses(self) -> bool:
+        """Whether a lens that moves is no longer what was given."""
+        of_lens = zip(self.images.lenses, self.freedom.lenses, strict=True)
+        return any(is_free and lens.parameters != lens.given for lens, is_free in of_lens)
+
     def triangulate(
         self, widening: float, *, checked: bool = False
     ) -> tuple[ObservedTracks, TriangulatedPoints]:

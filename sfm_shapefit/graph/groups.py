@@ -166,8 +166,7 @@ class RigidGroups:
         members = whole[self.group_of]
         if not members.any():
             return self
-        offsets = self.offsets.copy()
-        origin = centers[members].mean(axis=0)
+        offsets, origin = self.offsets.copy(), centers[members].mean(axis=0)
         anchors = np.zeros((self.num_groups, offsets.shape[1]))
         first = np.flatnonzero(fixed)[::-1]  # the first fixed node of each group says where it stands
         anchors[self.group_of[first]] = centers[first] - self.offsets[first]

@@ -112,13 +112,12 @@ class MeasuredGraph:
         """Return what was measured of all cameras alone, with the numbers that they have."""
         if self.num_points == 0:
             return self
-        rows, cameras = self.pairs, np.arange(self.num_cameras)
-        graph = self.graph
+        rows, graph = self.pairs, self.graph
         names = None if graph.names is None else graph.names[: self.num_cameras]
         bare = ViewGraph(
             self.num_cameras, graph.edges[rows], graph.directions[rows], graph.weights[rows], names
         )
-        return self._with_rows(bare, rows, cameras)
+        return self._with_rows(bare, rows, np.arange(self.num_cameras))
 
     def _with_rows(self, graph: ViewGraph, rows: IntArray, nodes: IntArray) -> "MeasuredGraph":
         """Return what is left of the edges `rows` and of the nodes, whose graph is given."""

@@ -15,11 +15,13 @@ import numpy.typing as npt
 from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import connected_components
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import EliminationTree
 
 _UNIT_NORM_TOLERANCE = 1e-6  # absolute; a direction printed with 7 digits passes, a wrong one does not
-_ROUNDING = (
-    8.0 * np.finfo(np.float64).eps
-)  # rounding of a norm; dividing by 1 to rounding only changes last bits
+# Rounding of a norm; dividing by 1 to rounding only changes last bits.
+_ROUNDING = 8.0 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -40,6 +42,7 @@ class ViewGraph:
     """(m,) positive weights; an edge of weight 2 counts as two equal edges."""
     names: tuple[str, ...] | None
     """Names of the cameras, if they have any."""
+    _tree: EliminationTree | None
 
     def __init__(
         self,
@@ -73,6 +76,7 @@ class ViewGraph:
         object.__setattr__(self, "directions", frozen(direction_array))
         object.__setattr__(self, "weights", frozen(weight_array))
         object.__setattr__(self, "names", None if names is None else tuple(names))
+        object.__setattr__(self, "_tree", None)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Make it anew where it is unpickled: arrays that can be written to are another type for kernels."""
@@ -96,6 +100,12 @@ class ViewGraph:
         """Return the connected component of each camera, shape (n,), numbered from 0 by first camera."""
         return connected_components(self.num_nodes, self.edges)
 
+    def elimination_tree(self) -> EliminationTree:
+        """Return the tree of `best_order`, found once: a placement asks for it four times."""
+        tree = self._tree or best_order(adjacency(self.num_nodes, self.edges))
+        object.__setattr__(self, "_tree", tree)
+        return tree
+
     def name_of(self, node: int) -> str:
         """Return the name of a node, or its number where the graph has no names."""
         return str(node) if self.names is None else self.names[node]
@@ -114,13 +124,8 @@ class ViewGraph:
         """Return the graph of some edges and their cameras, renumbered, and their indices here, ascending."""
         cameras, renumbered = np.unique(self.edges[edge_indices], return_inverse=True)
         names = None if self.names is None else [self.names[c] for c in cameras]
-        graph = ViewGraph(
-            len(cameras),
-            renumbered.reshape(-1, 2),
-            self.directions[edge_indices],
-            self.weights[edge_indices],
-            names,
-        )
+        directions, weights = self.directions[edge_indices], self.weights[edge_indices]
+        graph = ViewGraph(len(cameras), renumbered.reshape(-1, 2), directions, weights, names)
         return graph, cameras.astype(np.int64)
 
 
@@ -173,9 +178,7 @@ def _merge_duplicates(
     if len(first) == len(edges):
         return edges, directions, weights
     order = np.argsort(first)  # groups in order of first occurrence
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    target = rank[group.ravel()]
+    target = np.argsort(order)[group.ravel()]
     first_rows = first[order]
 
     flipped = edges[:, 0] != edges[first_rows][target][:, 0]

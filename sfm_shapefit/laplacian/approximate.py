@@ -317,7 +317,7 @@ def conjugate_gradients(
     *,
     tol: float = 1e-10,
     max_iterations: int = 500,
-    coupled: bool | int = False,
+    coupled_nodes: int | None = None,
 ) -> GradientsResult:
     """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
 
@@ -330,10 +330,11 @@ def conjugate_gradients(
         rhs: (n, k); its column means are ignored, for L has no such vectors in its range.
         tol: stop when each residual is at most this, relative to its right-hand side.
         max_iterations: hard limit, reported in `converged`.
-        coupled: the k columns are one vector of an (nk x nk) system, not k separate systems; a number: so
-            many rows, the first, are those of nodes, which constants move.
+        coupled_nodes: rows, the first, that are nodes, which constants move, of one system whose unknown is
+            all of x; None: the columns are k separate systems, and each row is a node.
     """
-    count = len(rhs) if isinstance(coupled, bool) else coupled
+    coupled = coupled_nodes is not None
+    count = len(rhs) if coupled_nodes is None else coupled_nodes
     r = _centered(rhs, count)
     x, p = np.zeros_like(r), np.zeros_like(r)
     scale = _norms(r, coupled)
@@ -363,12 +364,12 @@ def _centered(x: FloatArray, count: int) -> FloatArray:
     return np.concatenate([x[:count] - x[:count].mean(axis=0), x[count:]])
 
 
-def _products(a: FloatArray, b: FloatArray, coupled: bool | int) -> FloatArray:
+def _products(a: FloatArray, b: FloatArray, coupled: bool) -> FloatArray:
     """Return the inner products of the columns, (k,), or of the whole, (1,)."""
     products: FloatArray = np.einsum("ij,ij->j", a, b)
     return products.sum(keepdims=True) if coupled else products
 
 
-def _norms(a: FloatArray, coupled: bool | int) -> FloatArray:
+def _norms(a: FloatArray, coupled: bool) -> FloatArray:
     """Return the norms of the columns, (k,), or of the whole, (1,)."""
     return np.asarray(np.sqrt(_products(a, a, coupled)))

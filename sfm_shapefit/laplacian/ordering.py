@@ -6,11 +6,9 @@
 
 Neither is best everywhere (minimum degree wins on videos, METIS on networks of areas), and the fill of an
 order is known long before any factor (`symbolic.elimination_tree`). So "auto" tries minimum degree too where
-it can win, and keeps the order with the least work. Both are deterministic, and the trees of the last graphs
-are remembered: a placement asks for that of one graph up to eight times.
+it can win, and keeps the order with the least work. Both are deterministic.
 """
 
-from hashlib import blake2b
 from typing import Any, Literal
 
 import numpy as np
@@ -30,9 +28,6 @@ _BAND_FLOPS = 600  # operations per edge in METIS's order; with more a graph is 
 # METIS refines a cut so often per level; its own 10 take half as long again and save at most 5 % of the work.
 _METIS_REFINEMENTS = 1
 
-_REMEMBERED = 4  # trees; those of a placement are of the graph, of its agreeing and of its rejected pairs
-_trees: dict[tuple[bytes, Ordering], EliminationTree] = {}
-
 
 def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
     """Return the elimination tree of the order with the least work.
@@ -40,19 +35,12 @@ def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
     The method "auto" tries METIS, and minimum degree as well on graphs of up to 400,000 edges where it can be
     better; the one whose factorization takes fewer operations is kept.
     """
-    pattern = blake2b(graph.pointers.data)
-    pattern.update(graph.neighbors.data)
-    key = pattern.digest(), method
-    if key in _trees:
-        return _trees[key]
     trees = [] if method == "minimum-degree" else [elimination_tree(graph, metis_order(graph))]
     edges = len(graph.neighbors) // 2
     worthwhile = edges <= _MINIMUM_DEGREE_LIMIT and all(t.flops <= _BAND_FLOPS * edges for t in trees)
     if method == "minimum-degree" or (method == "auto" and worthwhile):
         trees.append(elimination_tree(graph, minimum_degree_order(graph)))
-    if len(_trees) >= _REMEMBERED:
-        _trees.pop(next(iter(_trees)), None)
-    return _trees.setdefault(key, min(trees, key=lambda tree: tree.flops))  # the first of equals
+    return min(trees, key=lambda tree: tree.flops)  # the first of equals
 
 
 def metis_order(graph: Adjacency) -> IntArray:

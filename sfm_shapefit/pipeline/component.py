@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 
-from sfm_shapefit.adjustment.bundle_adjustment import LensesAtFirst
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MappedModel
@@ -47,7 +46,7 @@ def refine_intrinsics(run: MapRun, relative: RelativeRotations) -> Images:
         source = see_matches(run.matches, given.images, run.inputs, run.options)
         with suppress(UnsolvableError):
             with run.clock("first placement"):
-                first = adjust_first_placement(given, source, run.options, run.clock, lenses="wanted")
+                first = adjust_first_placement(given, source, run.options, run.clock, lenses_wanted=True)
             adjusted, rows = first.adjusted, run.images.lenses_of(first.adjusted.images)
             found = found.with_lenses_of(adjusted.images, adjusted.is_tried & ~is_found[rows])
             is_found[rows] |= adjusted.is_tried
@@ -119,8 +118,7 @@ def _place(run: MapRun, members: IntArray, given: Given, source: MatchSource) ->
     """Adjust a first placement of some images, and locate them from the rotations of that."""
     first = None
     if run.options.freedom.adjust != "none":
-        lenses: LensesAtFirst = "known" if run.lenses_found else "free"
-        given, source, first = start_from_first(given, source, run.options, run.clock, lenses=lenses)
+        given, source, first = start_from_first(given, source, run.options, run.clock)
     with run.clock("locate"):
         return _settle(run, source, _with_told(run, given, members), first)
 

@@ -21,7 +21,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch, RayMatches
+from sfm_shapefit.scene.matches import MatchBatch, RayMatches, is_among
 
 _LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
 _POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
@@ -57,20 +57,29 @@ def ask_pairs(
 
     Only pairs `among` some images are asked, by their index; None: all.
     """
-    chosen = _doubtful_pairs(directions, source.images.num_images)
+    asked = directions.pairs[_doubtful_pairs(directions, source.images.num_images)]
+    if source.fixed is not None:
+        asked = asked[~source.fixed[asked].all(axis=1)]
     if among is not None:
-        chosen &= np.isin(directions.pairs, among).all(axis=1)
-    if not chosen.any():
-        return concatenate_rotations([])
-    num_pairs, parts = len(directions.pairs), []
-    row_of = {tuple(directions.pairs[row].tolist()): row for row in np.flatnonzero(chosen).tolist()}
-    for batch in source.view.of_pairs(directions.pairs[chosen]):
-        rows = np.flatnonzero([tuple(pair) in row_of for pair in batch.pairs.tolist()])
-        rays = _thin(source.images, batch, rows)
+        asked = asked[np.isin(asked, among).all(axis=1)]
+    given = directions if len(directions.pairs) > MANY_PAIRS else None
+    return _ask(source, asked, threads, len(directions.pairs), given)
+
+
+def _ask(
+    source: MatchSource, asked: IntArray, threads: int, num_pairs: int, given: PairDirections | None = None
+) -> RelativeRotations:
+    """Return the relative rotations of the asked pairs (k, 2); the matches of others are not looked at.
+
+    What pairs say alone, or else the `given` directions, is tried first.
+    """
+    parts = []
+    for batch in source.view.of_pairs(asked):
+        rays = _thin(source.images, batch, np.flatnonzero(is_among(batch.pairs, asked)))
         likely = _poses_alone(source.alone, rays.pairs)
-        if likely is None and num_pairs > MANY_PAIRS:
-            asked = [row_of[i, j] for i, j in rays.pairs.tolist()]
-            likely = _poses_as_given(source.images, directions, np.array(asked, dtype=np.int64))
+        if likely is None and given is not None:
+            rows = np.flatnonzero(is_among(given.pairs, rays.pairs))  # both ascend
+            likely = _poses_as_given(source.images, given, rows)
         parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
     return concatenate_rotations(parts)
 
@@ -100,13 +109,7 @@ def _poses_alone(alone: RelativeRotations | None, pairs: IntArray) -> LikelyPose
 
 def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
     """Return the relative rotations that the matches of some pairs (k, 2) have by themselves."""
-    wanted, parts = set(map(tuple, pairs.tolist())), []
-    for batch in source.view.of_pairs(pairs):
-        rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
-        rays = _thin(source.images, batch, rows)
-        likely = _poses_alone(source.alone, rays.pairs)
-        parts.append(estimate_relative_rotations(rays, threads, num_pairs=len(wanted), likely=likely))
-    return concatenate_rotations(parts)
+    return _ask(source, pairs, threads, len(np.unique(pairs, axis=0)))
 
 
 def doubt_cameras(

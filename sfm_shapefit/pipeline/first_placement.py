@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.adjustment.bundle_adjustment import LensesAtFirst, adjust_thinly
+from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
@@ -42,7 +42,8 @@ def adjust_first_placement(
     options: PlacingOptions,
     clock: Clock,
     *,
-    lenses: LensesAtFirst = "free",
+    lenses_wanted: bool = False,
+    rotations_known: bool = False,
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
@@ -51,7 +52,7 @@ def adjust_first_placement(
         source: at the averaged rotations.
         options: of the run.
         clock: of the run.
-        lenses: as in `adjust_thinly`.
+        lenses_wanted, rotations_known: as in `adjust_thinly`.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
@@ -74,7 +75,11 @@ def adjust_first_placement(
     posed = posed_part(stand.place())
     links = partial(stand.read_links, posed, clock.advance)
     freedom = stand.freedom.of(posed.frames, posed.lenses)
-    adjusted = adjust_thinly(posed.images, links, options.structure, freedom, lenses=lenses)
+    adjusted = adjust_thinly(
+        *(posed.images, links, options.structure, freedom),
+        lenses_wanted=lenses_wanted,
+        rotations_known=rotations_known,
+    )
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
     is_posed = np.isin(np.arange(images.num_images), posed.rows)
@@ -88,14 +93,17 @@ def start_from_first(
     options: PlacingOptions,
     clock: Clock,
     *,
-    lenses: LensesAtFirst = "free",
+    lenses_wanted: bool = False,
+    rotations_known: bool = False,
 ) -> tuple[Given, MatchSource, FirstPlacement]:
     """Return what is known of images, and their matches, with the rotations and lenses of a first placement.
 
     Args and errors as of `adjust_first_placement`.
     """
     with clock("first placement"):
-        first = adjust_first_placement(given, source, options, clock, lenses=lenses)
+        first = adjust_first_placement(
+            *(given, source, options, clock), lenses_wanted=lenses_wanted, rotations_known=rotations_known
+        )
     images, adjusted = source.images, first.adjusted
     intrinsics = given.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
     images = images.with_lenses_of(adjusted.images, adjusted.is_tried)

@@ -11,7 +11,6 @@ from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.options import KnownDistance, Scale
-from sfm_shapefit.scene.freedom import RigFreedom
 from sfm_shapefit.scene.given import NOTHING_KNOWN, Known
 from sfm_shapefit.scene.images import Images
 
@@ -56,7 +55,3 @@ class Given(NamedTuple):
         """Return what is known of a further rigid piece: nothing of positions."""
         free = self.rigid._replace(fixed=np.zeros_like(self.rigid.fixed), groups=None, fixed_group=None)
         return self._replace(rigid=free, scale="unit", distances=(), known=NOTHING_KNOWN)
-
-    def frees_rigs(self, asked: RigFreedom) -> bool:
-        """Return whether the adjustments change where sensors stand in their rigs, if there are any."""
-        return asked == "free" and self.rigid.groups is not None

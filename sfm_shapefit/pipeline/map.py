@@ -120,7 +120,7 @@ def measure_run(run: MapRun) -> MeasuredPairs:
     if run.options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
         if known.differ_in_rays(run.images):
-            run = run._replace(images=known, lenses_found=True)
+            run = run._replace(images=known)
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)

@@ -80,8 +80,6 @@ class MapRun(NamedTuple):
     known: Known
     without: PairNames
     """Pairs that are taken for unmatched."""
-    lenses_found: bool = False
-    """Whether first placements have found the lenses in doubt."""
     scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
     """Scores of pairs with a relative rotation: by triangles, and the matched share of their overlap."""
 

@@ -49,13 +49,14 @@ def settle_rough(
     with clock("relative rotations"):
         relative, believed = measure_near(source, sigma_rad, clock)
     corrected = _averaged(source, relative, believed, clock)
-    given, corrected, first = start_from_first(given, corrected, options, clock, lenses="tried")
+    start = partial(start_from_first, options=options, clock=clock, rotations_known=True)
+    given, corrected, first = start(given, corrected, lenses_wanted=True)
     if corrected.images.differ_in_rays(rough):
         source = source.at(rough.with_lenses(corrected.images.lenses))
         with clock("relative rotations"):
             relative = _measure(source, clock)
         corrected = _averaged(source, relative, np.ones(len(relative.pairs), dtype=np.bool_), clock)
-        given, corrected, first = start_from_first(given, corrected, options, clock, lenses="near")
+        given, corrected, first = start(given, corrected)
     source = corrected
     found = settle(given, source, options, clock, first)
     told = _tell_changes(found, rough, given.images)

@@ -69,7 +69,7 @@ class Stand(NamedTuple):
     ) -> "Stand":
         """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
         gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
-        lenses, moves = given.intrinsics, given.frees_rigs(options.freedom.rigs)
+        lenses, moves = given.intrinsics, options.freedom.rigs == "free" and given.rigid.groups is not None
         freedom = Freedom(focal=lenses.focal, distortion=lenses.distortion, has_sensors=moves)
         return cls(given, source, directions, placement, gauge, freedom, lenses)
 

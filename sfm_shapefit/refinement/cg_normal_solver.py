@@ -40,9 +40,10 @@ class IterativeNormal:
 
     def solve(self, rhs: FloatArray, /) -> FloatArray:
         """Return the step of the locations, (n, d), to a tenth of the residual."""
-        assert self._preconditioner is not None
+        factor, count = self._preconditioner, len(rhs)
+        assert factor is not None
         return conjugate_gradients(
-            self._apply, self._preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS, coupled=True
+            self._apply, factor, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS, coupled_nodes=count
         ).x
 
     def _apply(self, x: FloatArray) -> FloatArray:

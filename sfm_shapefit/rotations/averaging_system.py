@@ -74,7 +74,7 @@ class AveragingSystem:
         def apply(x: FloatArray) -> FloatArray:
             return operator(np.ascontiguousarray(x)) + ridge * x
 
-        return self._iterate(apply, weights, right, tol, coupled=False)
+        return self._iterate(apply, weights, right, tol, coupled_nodes=None)
 
     def solve_blocks(self, blocks: FloatArray, right: FloatArray, tol: float) -> FloatArray:
         """Return the solution (n, 3) for blocks (k, 3, 3)."""
@@ -82,7 +82,7 @@ class AveragingSystem:
             self._refactor(blocks)
             return self._factors[3].solve(right)
         means = mean_eigenvalues(blocks)
-        return self._iterate(self.block_operator(blocks), means, right, tol, coupled=True)
+        return self._iterate(self.block_operator(blocks), means, right, tol, coupled_nodes=len(right))
 
     def block_operator(self, blocks: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """Return what multiplies (n, 3) with the matrix of blocks."""
@@ -136,7 +136,7 @@ class AveragingSystem:
         right: FloatArray,
         tol: float,
         *,
-        coupled: bool,
+        coupled_nodes: int | None,
     ) -> FloatArray:
         """Solve by conjugate gradients, with a preconditioner for the Laplacian of scalar weights."""
         if self.is_expander:
@@ -148,7 +148,12 @@ class AveragingSystem:
             else:
                 self._preconditioner = approximate_cholesky(self.graph, weights, _SEED)
         solution = conjugate_gradients(
-            apply, self._preconditioner, right, tol=tol, max_iterations=_MAX_STEPS, coupled=coupled
+            apply,
+            self._preconditioner,
+            right,
+            tol=tol,
+            max_iterations=_MAX_STEPS,
+            coupled_nodes=coupled_nodes,
         )
         if solution.iterations > _STALE_STEPS:
             self._preconditioner = None

@@ -41,7 +41,6 @@ nothing of x; it would only shift the objective by a multiple of s. Such pairs t
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +56,6 @@ from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradien
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.dense import blas_of, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
-from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
@@ -378,9 +376,9 @@ def _violation(repair: _Repair, c: FloatArray, x: FloatArray) -> tuple[float, Fl
 def _restore(repair: _Repair, violation: FloatArray, tol: float) -> float:
     """Move y by S D h so that `violation` shrinks to `tol` times itself; return max_e ||y_e|| / w_e."""
     product, precondition, tol = repair.product, repair.precondition, min(tol, 0.5)
-    coupled = True if repair.groups is None else repair.groups.num_groups
+    count = len(violation) if repair.groups is None else repair.groups.num_groups
     found = conjugate_gradients(
-        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled=coupled
+        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled_nodes=count
     )
     h = found.x if repair.groups is None else repair.groups.expand(found.x)
     return float(_move(repair.metric, h))
@@ -527,9 +525,12 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduct
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
     n, d, v = graph.num_nodes, graph.dimension, graph.directions
-    order = cache(lambda: best_order(adjacency(n, graph.edges)))
-    is_dense = reduction is None and prefers_dense_factor(graph, lambda: order().flops * d**3)
-    if reduction is None and not is_dense and order().flops * d**3 > _UNIQUENESS_FLOPS:
+
+    def flops() -> float:
+        return graph.elimination_tree().flops * d**3
+
+    is_dense = reduction is None and prefers_dense_factor(graph, flops)
+    if reduction is None and not is_dense and flops() > _UNIQUENESS_FLOPS:
         return None
     longest = int(np.argmax(along(differences(t, graph.edges), v)))
     blocks = np.empty((graph.num_edges, d, d))
@@ -537,7 +538,7 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray, reduction: Reduct
     if is_dense:
         return _is_regular_dense(graph, blocks)
     if reduction is None:
-        plan = plan_factorization(adjacency(n, graph.edges), graph.edges, order())
+        plan = plan_factorization(adjacency(n, graph.edges), graph.edges, graph.elimination_tree())
         reduction = Reduction(allocate_factor(plan, d))
     try:
         reduction.refactor(blocks)

@@ -18,7 +18,6 @@ from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
@@ -164,8 +163,7 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     if flops() < np.inf:
         predicted = f"{flops() / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops() <= _LARGEST_NEWTON_FLOPS:
-        sparse = partial(solve_newton_sparse, plan=predict().tree)
-        return Choice("newton", sparse, "asked for" if asked else predicted)
+        return Choice("newton", solve_newton_sparse, "asked for" if asked else predicted)
     return Choice("admm", partial(_split, resources, predict()), f"{predicted}: splitting is faster")
 
 
@@ -244,4 +242,4 @@ def plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
     if predict_factor(measured.graph).tree is None:
         return None
     neighbors = adjacency(measured.graph.num_nodes, edges)
-    return plan_factorization(neighbors, edges, best_order(neighbors))
+    return plan_factorization(neighbors, edges, measured.graph.elimination_tree())

@@ -35,7 +35,7 @@ from sfm_shapefit.synthetic.models import (
     write_models,
 )
 from sfm_shapefit.synthetic.options import WorkspaceOptions
-from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
+from sfm_shapefit.synthetic.rendering import RenderedScene, encode_images, project_distorted, surface_points
 from sfm_shapefit.synthetic.workspace import compact_database
 
 _LARGEST_ERROR_PX = 4.0  # pixels; COLMAP's own limit for inliers, a right match is off by no more
@@ -80,8 +80,8 @@ def write_rendered_workspace(
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
         (workspace / "images").mkdir()
-        for k in range(scene.num_images):
-            (workspace / "images" / image_name(k)).write_bytes(encode_image(scene, k))
+        for k, image in enumerate(encode_images(scene)):
+            (workspace / "images" / image_name(k)).write_bytes(image)
         judged = None
         if options.database:
             _match_images(scene, workspace, relative_poses=options.relative_poses)
@@ -102,8 +102,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     """
     images = read_model(_parts(scene, None).model(scene.rotations)).images
     with closing(open_database(database, images.names)) as matches:
-        in_one = Reading(batch=int(matches.num_matches.sum()))
-        view = matches.at(images, reading=in_one)
+        view = matches.at(images, reading=Reading(batch=int(matches.num_matches.sum())))
         keypoints = [view.keypoints(k) for k in range(scene.num_images)]
         joined = next(view.batches(min_matches), _NO_MATCHES)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]

@@ -19,6 +19,7 @@ Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from
 so that the first pixel's center is (0.5, 0.5).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,15 +37,10 @@ from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 _SAMPLES = 2  # samples of a pixel along either side; smooths edges
 _RAY_SLACK = 1e-6  # share of a ray; far below the spacing of rays, far above rounding
 _NEAREST_DEPTH_M = 0.05  # meters; a triangle that comes nearer is drawn without bounds
-# These are the colors at the horizon and above: too smooth for features.
-_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))
+_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))  # at the horizon and above; too smooth for features
 _OF_POINTS_ONLY = (
-    "num_points",
-    "pixel_noise_px",
-    "wrong_match_fraction",
-    "corrupted_pair_fraction",
-    "max_pairs_per_image",
-    "max_matches_per_pair",
+    *("num_points", "pixel_noise_px", "wrong_match_fraction", "corrupted_pair_fraction"),
+    *("max_pairs_per_image", "max_matches_per_pair"),
 )
 
 
@@ -95,26 +91,26 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
     return scene
 
 
-def draw_image(scene: RenderedScene, image: int) -> ByteArray:
+def draw_image(scene: RenderedScene, image: int, canvas: "Canvas | None" = None) -> ByteArray:
     """Return one photograph, (height, width, 3) red, green, blue: a function of options and index alone."""
     rng = np.random.default_rng([scene.options.seed, 2, image])
     height, width = scene.options.image_height, scene.options.image_width
-    y, x = (np.indices((_SAMPLES * height, _SAMPLES * width)).reshape(2, -1) + 0.5) / _SAMPLES
-    rays = _undistort(scene, np.stack([x, y], axis=1)).reshape(_SAMPLES * height, _SAMPLES * width, 2)
-    samples = _shade(scene, image, rays)
+    samples = _shade(scene, image, canvas or Canvas.of(scene))
     pixels = samples.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
     pixels *= 1.0 + scene.render.exposure_spread * rng.standard_normal()
     pixels += scene.render.gray_noise * rng.standard_normal(pixels.shape)
     return np.asarray(np.clip(np.rint(pixels), 0.0, 255.0), dtype=np.uint8)
 
 
-def encode_image(scene: RenderedScene, image: int) -> bytes:
-    """Return one photograph as the content of a JPEG file."""
-    bgr = np.ascontiguousarray(draw_image(scene, image)[:, :, ::-1])
-    done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, scene.render.jpeg_quality])
-    if not done:
-        raise InputError(f"OpenCV cannot encode image {image} as JPEG; install it with JPEG support")
-    return data.tobytes()
+def encode_images(scene: RenderedScene) -> Iterator[bytes]:
+    """Yield all photographs, each as the content of a JPEG file."""
+    canvas = Canvas.of(scene)
+    for image in range(len(scene.centers)):
+        bgr = np.ascontiguousarray(draw_image(scene, image, canvas)[:, :, ::-1])
+        done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, scene.render.jpeg_quality])
+        if not done:
+            raise InputError(f"OpenCV cannot encode image {image} as JPEG; install it with JPEG support")
+        yield data.tobytes()
 
 
 def surface_points(scene: RenderedScene, image: int, xy: FloatArray) -> FloatArray:
@@ -132,7 +128,7 @@ def project_distorted(scene: RenderedScene, image: int, points: FloatArray) -> F
     """Return the (k, 2) pixels of points (k, 3) in front of a camera, hidden or not."""
     in_camera = (points - scene.centers[image]) @ scene.rotations[image].T
     zero = np.zeros(3)
-    xy, _ = cv2.projectPoints(in_camera, zero, zero, scene.calibration, scene.distortion)
+    xy = cv2.projectPoints(in_camera, zero, zero, scene.calibration, scene.distortion)[0]
     return np.asarray(xy, dtype=np.float64).reshape(-1, 2)
 
 
@@ -141,8 +137,8 @@ def project_distorted(scene: RenderedScene, image: int, points: FloatArray) -> F
 
 def _refuse_folding(scene: RenderedScene) -> None:
     """Raise InputError unless the distorted radius grows with the true one out to the image's corners."""
-    half = np.array([scene.options.image_width, scene.options.image_height]) / 2.0
-    corner = float(np.hypot(*half)) / scene.options.focal_length_px
+    size = scene.options.image_width, scene.options.image_height
+    corner = 0.5 * float(np.hypot(*size)) / scene.options.focal_length_px
     radius = np.linspace(0.0, 2.0 * corner, 400)
     k1, k2 = scene.render.radial_k1, scene.render.radial_k2
     distorted = radius * (1.0 + k1 * radius**2 + k2 * radius**4)
@@ -239,15 +235,30 @@ def _nearest_triangles(
 # --- colors -----------------------------------------------------------------------------------------------
 
 
-def _shade(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np.float32]:
+class Canvas(NamedTuple):
+    """What all photographs of a scene share: rays of the samples, and the pictures of `_mipmaps`."""
+
+    rays: FloatArray
+    pyramid: ByteArray
+    levels: IntArray
+
+    @classmethod
+    def of(cls, scene: RenderedScene) -> "Canvas":
+        """Return the canvas of a scene."""
+        size = _SAMPLES * scene.options.image_height, _SAMPLES * scene.options.image_width
+        y, x = (np.indices(size).reshape(2, -1) + 0.5) / _SAMPLES
+        rays = _undistort(scene, np.stack([x, y], axis=1)).reshape(*size, 2)
+        return cls(rays, *_mipmaps(scene.surfaces.textures))
+
+
+def _shade(scene: RenderedScene, image: int, canvas: Canvas) -> npt.NDArray[np.float32]:
     """Return the colors (rows, columns, 3) of the samples of an image, 0 to 255."""
+    rays, pyramid, levels = canvas
     triangles = _facing_triangles(scene, image)
     nearest, _ = _nearest_triangles(rays, triangles.inverse, _bounds(triangles.corners, rays))
-    pyramid, levels = _mipmaps(scene.surfaces.textures)
     up = rays @ scene.rotations[image][:2, 2] + scene.rotations[image][2, 2]
     height = np.clip(up / np.sqrt(1.0 + np.sum(rays**2, axis=2)), 0.0, 1.0)[:, :, None]
-    sky = _SKY[0] + height * np.subtract(_SKY[1], _SKY[0])
-    colors: npt.NDArray[np.float32] = sky.astype(np.float32)
+    colors: npt.NDArray[np.float32] = (_SKY[0] + height * np.subtract(_SKY[1], _SKY[0])).astype(np.float32)
     # Texture coordinates over inverse depth are linear in the ray: rows (u / z, v / z, 1 / z).
     rows = triangles.rows
     texels = np.concatenate([scene.surfaces.texels[rows], np.ones((len(rows), 3, 1))], axis=2)

@@ -37,8 +37,7 @@ def _clouds(height_px: int, width_px: int, tint: np.ndarray, rng: np.random.Gene
     """Return a picture of smooth noise at four scales around a color."""
     field = np.zeros((height_px, width_px))
     for cell_px, gray in ((128, 18.0), (32, 14.0), (8, 10.0), (3, 8.0)):
-        shape = (height_px // cell_px + 2, width_px // cell_px + 2)
-        coarse = gray * rng.standard_normal(shape)
+        coarse = gray * rng.standard_normal((height_px // cell_px + 2, width_px // cell_px + 2))
         field += cv2.resize(coarse, (width_px, height_px), interpolation=cv2.INTER_CUBIC)
     return np.asarray(np.clip(field[:, :, None] + tint, 0.0, 255.0), dtype=np.uint8)
 

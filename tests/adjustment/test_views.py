@@ -1,6 +1,7 @@
 """A reconstruction as an adjustment problem and back: every lens, rigs, fixed frames, tracks."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -10,7 +11,8 @@ import sfm_shapefit
 from sfm_shapefit import InputError
 from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
-from sfm_shapefit.adjustment.freedom import GivenPoses
+from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.points import points_of
@@ -215,23 +217,14 @@ def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])
-def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
+def test_thin_adjustment_straightens_coarse_poses(source):
     truth = pycolmap.Reconstruction(BUNDLED / "courtyard" / "truth")
-    fixed = sorted(truth.reg_frame_ids())[:1]
-    start = pycolmap.Reconstruction(truth)
-    coarse = disturbed(truth, size=0.02)
-    for frame_id in sorted(truth.reg_frame_ids()):
-        if frame_id not in fixed:
-            start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
-    tracks = truth if source == "tracks" else matches_of(truth)
-    is_fixed = np.isin(posed_images(start).frames.ids, fixed)
-    found = adjusted_thinly(start, tracks, fixed=is_fixed).reconstruction
+    start = disturbed(truth, size=0.02)
+    found = adjusted_thinly(start, truth if source == "tracks" else matches_of(truth)).reconstruction
     assert found.num_points3D() == 0
     true, before, after = centers_of(truth), centers_of(start), centers_of(found)
     errors = [np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean() for x in (before, after)]
     assert errors[1] < 0.2 * errors[0]
-    poses = [m.frame(fixed[0]).rig_from_world.matrix() for m in (found, truth)]
-    np.testing.assert_array_equal(*poses)
 
 
 def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch):
@@ -245,6 +238,24 @@ def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch
     truth = scene()
     adjusted_thinly(disturbed(truth), matches_of(truth))
     assert dampings == [1e-4, 1e-8]
+
+
+def test_lenses_that_were_found_before_are_held_in_the_first_solve(monkeypatch):
+    frees = []
+
+    def noting(problem, options, **others):
+        frees.append(others["free_focal_lengths"])
+        return adjust(problem, options, **others)
+
+    monkeypatch.setattr(adjustment_run, "adjust", noting)
+    truth = scene("RADIAL")
+    images, links = posed_images(disturbed(truth)), links_of(truth, truth)
+    (given,) = images.lenses
+    found, free = replace(given, parameters=(401.0, *given.parameters[1:])), Freedom(focal=np.ones(1, bool))
+    for one, is_free in ((given, True), (found, False)):
+        adjust_thinly(images.with_lenses([one]), lambda: links, StructureOptions(), free, lenses_wanted=True)
+        assert frees[:2] == [is_free, True]
+        frees.clear()
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])

@@ -94,7 +94,7 @@ def test_an_image_with_a_name_that_is_too_long_has_no_picture(tmp_path):
     assert "lacks 8 of 8 images" in said
 
 
-@pytest.mark.parametrize("command", [["inspect", "--json"], ["inspect"], ["check", "--no-second-opinion"]])
+@pytest.mark.parametrize("command", [["inspect", "--json"], ["check", "--no-second-opinion"]])
 def test_a_full_device_a_closed_stdout_and_a_reader_that_has_left_end_quietly(command):
     words = [*COMMAND, command[0], str(RING / "sparse/0"), *command[1:]]
     how = {"cwd": ROOT, "env": ENVIRONMENT, "stderr": subprocess.PIPE, "text": True}

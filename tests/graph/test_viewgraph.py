@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.base import errors
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.graph import viewgraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.laplacian.ordering import best_order
 
 X, Y, Z = np.eye(3)
 seeds = st.integers(0, 2**32 - 1)
@@ -179,6 +181,15 @@ def brute_force_components(graph: ViewGraph) -> list[int]:
 def test_components_agree_with_label_propagation(seed, n, m):
     graph = random_graph(seed, n, m)
     assert graph.components().tolist() == brute_force_components(graph)
+
+
+def test_the_order_of_elimination_is_looked_for_once(monkeypatch):
+    calls = []
+    monkeypatch.setattr(viewgraph, "best_order", lambda graph: calls.append(graph) or best_order(graph))
+    graph = random_graph(0)
+    assert graph.elimination_tree() is graph.elimination_tree()
+    assert len(graph.elimination_tree().parent) == graph.num_nodes
+    assert len(calls) == 1
 
 
 def test_a_graph_without_edges_has_only_lone_cameras():

@@ -394,20 +394,8 @@ def test_beside_metis_minimum_degree_is_tried_only_where_it_can_win(name, asked,
     )
     metis = elimination_tree(graph, ordering.metis_order(graph)).flops
     assert (metis < ordering._BAND_FLOPS * len(edges)) == asked
-    ordering._trees.clear()
     ordering.best_order(graph)
     assert bool(calls) == asked
-
-
-def test_the_tree_of_a_pattern_is_found_once_and_only_the_last_ones_are_kept(monkeypatch):
-    calls = []
-    monkeypatch.setattr(ordering, "metis_order", lambda g: calls.append(g) or np.arange(g.num_nodes))
-    ordering._trees.clear()
-    for count in (5, 6, 5, 7, 8, 9, 5):
-        ring = adjacency(count, np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1))
-        assert len(ordering.best_order(ring).parent) == count
-    assert [g.num_nodes for g in calls] == [5, 6, 7, 8, 9, 5]
-    ordering._trees.clear()  # they are not METIS's
 
 
 def test_dissection_halves_a_grid_and_orders_a_graph_with_repeated_edges_as_well():
@@ -499,7 +487,7 @@ def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
         factorize(plan, np.ones(len(edges)), np.float32),
         rhs,
         tol=1e-12,
-        coupled=True,
+        coupled_nodes=len(rhs),
     )
     assert result.converged
     assert result.iterations < 60  # 30-40 at any size

@@ -1,5 +1,7 @@
 """Images as arrays: parts of parts, poses put in and read out, what follows from frames and sensors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -132,6 +134,15 @@ def test_images_stand_where_frames_and_sensors_put_them(images):
             assert images.rotations[k].tobytes() == frames.rotations[frame].tobytes()
             assert not images.is_posed[k] or not images.offsets[k].any()
     assert images.has_rigs == (np.bincount(images.frame_of).max() > 1)
+
+
+@given(images=scenes(), data=st.data())
+def test_images_differ_in_rays_where_any_of_their_lenses_does(images, data):
+    k = data.draw(st.integers(0, len(images.lenses) - 1))
+    lenses, (focal_px, *center) = list(images.lenses), images.lenses[k].parameters
+    for factor, differs in ((1.0001, False), (1.2, True)):
+        lenses[k] = replace(lenses[k], parameters=(factor * focal_px, *center))
+        assert images.differ_in_rays(images.with_lenses(lenses)) is differs
 
 
 def test_arrays_are_read_only():

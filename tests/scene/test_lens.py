@@ -38,6 +38,7 @@ def test_distortion_is_undone_as_by_pycolmap_and_where_the_picture_is_folded_the
         ("SIMPLE_RADIAL", 910.0, 0.0, False),  # 0.4 % of the angle at the edge, which is 34 deg
         ("SIMPLE_RADIAL", 960.0, 0.0, True),
         ("SIMPLE_RADIAL", 900.0, 0.1, True),
+        ("SIMPLE_RADIAL", 900.0, -0.3, True),  # the corner has no ray
         ("SIMPLE_RADIAL_FISHEYE", 901.0, 0.0, True),  # it cannot be adjusted
     ],
 )

@@ -53,7 +53,7 @@ def unit_bound(graph, t, dual):
         approximate_cholesky(adjacency(n, edges), np.ones(len(edges)), 1),
         adjoint(y, edges, n) - multiplier * c,
         tol=1e-12,
-        coupled=True,
+        coupled_nodes=n,
     ).x
     y = y - across(differences(h, edges), v)
     return multiplier / max(1.0, np.max(np.linalg.norm(y, axis=1) / graph.weights))

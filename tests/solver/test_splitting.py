@@ -262,6 +262,9 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
     np.testing.assert_allclose(sums, expected_sums, rtol=1e-12, atol=1e-11)
     np.testing.assert_allclose(passes.pull(ours, t, rho[order]), expected_pull, atol=1e-11)
     np.testing.assert_allclose(passes.imbalance(x[order], ours, t, rho[order]), residuals, rtol=1e-12)
+    lengths = np.maximum(along(differences(t, graph.edges), graph.directions), least)
+    errors = np.linalg.norm(differences(t, graph.edges) - lengths[:, None] * graph.directions, axis=1)
+    np.testing.assert_allclose(passes.residuals(t), errors[order], atol=1e-12)
 
 
 def test_new_penalties_keep_the_split_point_and_the_dual():

@@ -18,8 +18,7 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
     placed = np.zeros(graph.num_nodes, dtype=np.bool_)
     if pieces:
         placed[pieces[0].nodes] = True
-    degree = graph.degrees()
-    component = graph.components()
+    degree, component = graph.degrees(), graph.components()
     main = component[pieces[0].nodes[0]] if pieces else -1
     neighbor = np.empty(graph.num_nodes, dtype=np.int64)  # the only one, where there is one
     neighbor[graph.edges.T] = graph.edges[:, ::-1].T

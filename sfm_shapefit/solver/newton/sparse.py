@@ -17,8 +17,7 @@ from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, NewtonProgress, Problem, Work
 from sfm_shapefit.solver.options import OnIteration
@@ -35,7 +34,7 @@ def solve_newton_sparse(
     on_iteration: OnIteration | None = None,
     *,
     start: tuple[FloatArray, FloatArray] | None = None,
-    plan: SymbolicFactor | EliminationTree | None = None,
+    plan: SymbolicFactor | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks.
 
@@ -49,12 +48,11 @@ def solve_newton_sparse(
         on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
-        plan: plan of the factorization of the graph's Laplacian, or its order of elimination, if there
-            already.
+        plan: of the factorization of the graph's Laplacian, if there already.
     """
-    if not isinstance(plan, SymbolicFactor):
+    if plan is None:
         neighbors = adjacency(graph.num_nodes, graph.edges)
-        plan = plan_factorization(neighbors, graph.edges, plan or best_order(neighbors))
+        plan = plan_factorization(neighbors, graph.edges, graph.elimination_tree())
     reduction = Reduction(allocate_factor(plan, graph.dimension))
     return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
 

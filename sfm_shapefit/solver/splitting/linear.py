@@ -21,7 +21,7 @@ from sfm_shapefit.laplacian.approximate import (
 )
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
-from sfm_shapefit.laplacian.ordering import best_order, widest_level
+from sfm_shapefit.laplacian.ordering import widest_level
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorization
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
@@ -129,7 +129,7 @@ def predict_factor(graph: ViewGraph) -> Prediction:
         rough_flops = 4.0 * (0.75 * widest_level(neighbors)) ** 3  # as on boxes of 1e4 and 1e5 cameras
         if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
             return Prediction(None)
-    return Prediction(best_order(neighbors))
+    return Prediction(graph.elimination_tree())
 
 
 def laplacian_factor(

@@ -135,6 +135,6 @@ def _balance(graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: 
     y = allowed(dual)
     total = adjoint(y, edges, n)
     h = conjugate_gradients(
-        product, precondition, total, tol=_CG_TOL, max_iterations=_CG_STEPS, coupled=True
+        product, precondition, total, tol=_CG_TOL, max_iterations=_CG_STEPS, coupled_nodes=len(total)
     ).x
     return np.asarray(y - allowed(differences(h, edges)))
