@@ -77,28 +77,23 @@ class Run(Generic[S]):
             rest = time.perf_counter() - self.started - sum(known.values())
             stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
-        pictures = row("warning", self._missing_pictures(found.image_names))
-        print_answer(told._replace(rows=[*told.rows, pictures]), self._describe_time())
+        names, missing = found.image_names, self._missing_pictures(found.image_names)
+        lacks = (
+            f"{self.flags.images} lacks {missing} of {counted(len(names), 'image')}: is it the right folder?"
+        )
+        rows = [*told.rows, row("warning", lacks if missing else "")]
+        print_answer(told._replace(rows=rows), self._describe_time())
         opened = f"; open {first_of([*map(shlex.quote, pages)])}" if self.flags.report else ""
-        step = self._with_folder(told.step.command, out / told.folders[0])
+        images = self.flags.images if missing < len(names) else ""
+        step = _with_folders(told.step.command, out / told.folders[0], images or "IMAGES")
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
-    def _missing_pictures(self, names: Sequence[str]) -> str:
-        """Warn if pictures were asked for, and the folder lacks images."""
-        if not self.flags.images:
-            return ""
+    def _missing_pictures(self, names: Sequence[str]) -> int:
+        """Return how many images the folder lacks, if one is given."""
         from sfm_shapefit.base.paths import file_of
 
         folder = Path(self.flags.images)
-        missing = [name for name in names if not file_of(folder, name)]
-        if not missing:
-            return ""
-        return f"{folder} lacks {len(missing)} of {counted(len(names), 'image')}: is it the right folder?"
-
-    def _with_folder(self, command: str, out: Path) -> str:
-        """Return a command with the folders of the result, and of the images if told, filled in."""
-        command = command.replace(" IMAGES ", f" {shlex.quote(str(self.flags.images or 'IMAGES'))} ")
-        return re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
+        return sum(not file_of(folder, name) for name in names) if self.flags.images else 0
 
     def _describe_time(self) -> str:
         """Say how long the command took, and how much of it went into compiling."""
@@ -107,6 +102,12 @@ class Run(Generic[S]):
         if compiling >= _NOTICED_S:
             total += f", of which {compiling:.0f} s compiling kernels, once"
         return total
+
+
+def _with_folders(command: str, out: Path, images: str) -> str:
+    """Return a command with the folders of the result and of the images filled in."""
+    command = command.replace(" IMAGES ", f" {shlex.quote(images)} ")
+    return re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
 
 
 def refuse_swapped(source: Path, target: Path, order: str) -> None:

@@ -47,7 +47,7 @@ def locate_command(
 ) -> None:
     """Find positions and points from the rotations of MODEL and its matches; write the model to OUT.
 
-    Positions in MODEL are not used; it may also be a transforms.json or a TUM trajectory.
+    Positions in MODEL give scale and origin only; it may also be a transforms.json or a TUM trajectory.
     """
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")

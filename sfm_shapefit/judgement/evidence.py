@@ -24,6 +24,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
+ALIKE = 0.1  # share of the spread of cameras; models farther apart in the median are of different shape
 _LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
 _EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
 _LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is asked
@@ -146,6 +147,11 @@ class SecondOpinion(NamedTuple):
     """Pairs of these that support the other."""
     ambiguous: IntArray
     """Rows of cameras that stand where they do in the other model, which doubts them; none is `confirmed`."""
+
+    @property
+    def has_nothing_in_common(self) -> bool:
+        """Whether the two have different shapes, and no pair says which is right."""
+        return self.usual > ALIKE and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -150,6 +150,8 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
         reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
     if len(named.keys() - confirmed) > _MOST_NAMED * count:
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
+    if second is not None and second.has_nothing_in_common:
+        suspicions.append("the model that map makes of the same database has another shape")
     if lenses:
         suspicions.append(f"images contradict {counted(len(lenses), 'focal length')}")
     cameras = tuple(images.names[camera] for camera in dict.fromkeys([*named, *doubted]))

@@ -140,7 +140,7 @@ def check_source(
         if fits is not None and other is not None:
             evidence = replace(evidence, second=_compare(matches, fits, structure, other))
     cameras = _judge_cameras(model, quality, pairs, evidence)
-    verdict = _grade(model, cameras, fits, evidence)
+    verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
     facts |= {"timings_s": clock.seconds, "evidence": told, "warnings": told.statements}
@@ -245,17 +245,23 @@ def _grade(
     cameras: list[CameraRow],
     fits: PairFits | None,
     evidence: ModelEvidence,
+    num_missing: int,
 ) -> ModelVerdict:
-    """Return the verdict on a model; a weak camera that stands where another model has it is right."""
+    """Return the verdict on a model; a weak camera that stands where another model has it is right.
+
+    Its database lacks `num_missing` images.
+    """
     against = weigh_evidence(evidence, model.images)
     confirmed = [] if evidence.second is None else evidence.second.confirmed.tolist()
     right = {model.images.names[k] for k in confirmed}
     weak = (row.name for row in cameras if row.placed and row.reason and row.name not in right)
     named = tuple(dict.fromkeys([*against.cameras, *weak]))
-    if bad := (*_reasons_against(model.images, fits),) or against.reasons:
+    if bad := (*_reasons_against(model.images, fits),) or against.reasons or (*_strange_pairs(fits),):
         return ModelVerdict(grade=Grade.DO_NOT_USE, cameras=named, reasons=bad)
     pointless = model.reconstruction.num_points3D() == 0
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
+    if num_missing:
+        reasons = (*reasons, f"the database lacks {counted(num_missing, 'image')}: is it that of the model?")
     reasons = (*reasons, *against.suspicions)
     return ModelVerdict(grade=Grade.LOOK if named or reasons else Grade.GOOD, cameras=named, reasons=reasons)
 
@@ -264,10 +270,15 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
     """Yield why a model should not be used, a clause each."""
     if np.ptp(images.centers, axis=0).max() <= _ROUNDING * np.abs(images.centers).max():
         yield "all its cameras stand at the same place; place them with sfm-shapefit locate"
-    elif fits is None or not np.isfinite(fits.residuals_deg).any():
-        against = 0 if fits is None else int(fits.contradicts.sum())
-        wrong = f"{counted(against, 'pair')} contradict its rotations and none agrees: is this its database?"
-        yield wrong if against else "no two of its images have matches that say how they stand to each other"
+    elif fits is None or not (fits.contradicts.any() or np.isfinite(fits.residuals_deg).any()):
+        yield "no two of its images have matches that say how they stand to each other"
+
+
+def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
+    """Yield that no pair agrees; the points of a model tie its cameras whatever its database is."""
+    if fits is not None and not fits.agrees.any():
+        against = counted(int(fits.contradicts.sum()), "pair")
+        yield f"{against} contradict it and none agrees: is this its database?"
 
 
 def _tell(

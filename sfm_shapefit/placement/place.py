@@ -273,7 +273,7 @@ def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_came
     if not pieces or np.sum(pieces[0].nodes < num_cameras) < min(SMALLEST_PIECE, num_cameras):
         raise UnsolvableError(
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
-            "match more pairs, above all pairs that close triangles"
+            "match more pairs, above all pairs that close triangles, if these are the right matches"
         )
 
 

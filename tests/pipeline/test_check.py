@@ -8,6 +8,8 @@ import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
@@ -15,7 +17,7 @@ from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.facts.test_schema import problems
 from tests.program import run, run_refused
-from tests.scenes import COURTYARD, PHOTOGRAPHED, RING, fingerprint
+from tests.scenes import BUNDLED, COURTYARD, PHOTOGRAPHED, RING, fingerprint
 from tests.structures import pictures_of
 
 
@@ -160,6 +162,30 @@ def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
     strangers = spoiled(tmp_path / "strangers", names="other-{}".format)
     database = ("--database", RING / "database.db")
     assert "has 0 of the model's 8 images" in run_refused("check", strangers, *database)
+
+
+@pytest.mark.parametrize(
+    ("model", "database", "words"),
+    [
+        ("photographed/truth", "ring8", "contradict it and none agrees: is this its database?"),
+        ("courtyard/truth", "photographed", "the database lacks 9 images: is it that of the model?"),
+    ],
+)
+def test_a_model_beside_another_scenes_database_is_doubted(model, database, words):
+    """Names are common, and so are some pairs by chance; a model's own points tie its cameras too."""
+    told = check(BUNDLED / model, BUNDLED / database / "database.db", second_opinion=False).verdict
+    assert told.grade != "good"
+    assert words in told.statement
+
+
+def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
+    """What nothing but the model's own points and a third of the pairs speak for."""
+    none, usual = np.zeros(0, dtype=np.int64), {"num_common": 8, "num_for": 0, "num_against": 0}
+    rows = {"wrong": none, "undecided": none, "confirmed": none, "ambiguous": none}
+    images = read_model(RING / "sparse/0").images
+    for share, suspected in ((0.05, 0), (0.4, 1)):
+        evidence = ModelEvidence(second=SecondOpinion(usual=share, **usual, **rows))
+        assert len(weigh_evidence(evidence, images).suspicions) == suspected
 
 
 def test_a_model_without_points_is_told_once_and_judged_by_its_pairs(tmp_path):
