@@ -6,9 +6,9 @@ agreement    the share of the camera's pairs that agree with the solution (`refi
              without a pair has the median one.
 usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere,
              having its part of them says nothing against a camera.
-hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 20 % of the median
+hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median
              distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
-             leave 20 % open.
+             leave 10 % open.
 
 So 1 means that a camera's pairs agree as is usual in the scene and nothing is loose. This is what directions
 alone can say. Where there are matches, `doubted` has more: cameras whose rotations are wrong in the same way
@@ -26,7 +26,7 @@ from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Loosene
 
 USUAL_SHARE = 0.75
 """Share of what is usual, or of all; a camera loses nothing of its trust with that much."""
-_HOLD_SHARE = 0.2  # standard deviation tau that halves trust, in spreads; a fifth of the scene is loose
+_HOLD_SHARE = 0.1  # standard deviation tau that halves trust, in spreads; a tenth of the scene is loose
 LOW_TRUST = 0.75
 """Trust below which reasons are given; usual cameras have more."""
 SOMEWHAT_LOOSE = "its pairs leave it somewhat loose"

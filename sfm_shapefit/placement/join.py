@@ -481,5 +481,5 @@ def _reason_of_few(join: PieceJoin, *, has_rival: bool) -> str:
         )
     return (
         f"{agreeing or 'none'} of {counted(total, 'pair')} of images between them agree on one join, and it "
-        f"needs {FEWEST_PAIRS}: match more of their images with one another, unless they show different scenes"
+        f"needs {FEWEST_PAIRS}: match more of their images, unless they show different scenes"
     )

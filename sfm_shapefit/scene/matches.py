@@ -305,9 +305,7 @@ class View:
         self.give_back()  # rays too, by which those without one are told
 
     def of_pairs(self, wanted: IntArray) -> Iterator[MatchBatch]:
-        """Yield the matches of wanted pairs (m, 2), and of others where all are kept with their rays."""
-        if 1 in self._kept:
-            return iter(self._kept[1])
+        """Yield the matches of wanted pairs (m, 2), whatever the order of their images."""
         return self._batches(np.flatnonzero(is_among(self.pairs, wanted)), 1)
 
     def between(self, labels: IntArray) -> Iterator[MatchBatch]:

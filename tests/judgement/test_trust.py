@@ -70,7 +70,7 @@ def test_the_cameras_of_a_group_are_judged_by_all_its_pairs_and_one_without_any_
 def test_trust_is_half_where_pairs_leave_a_fifth_of_the_scene_open():
     t, edges, _ = clean(20, 6)
     spread = float(np.median(np.linalg.norm(t - np.median(t, axis=0), axis=1)))
-    found = judged(t, edges, np.ones(len(edges), dtype=bool), 0.2 * spread)
+    found = judged(t, edges, np.ones(len(edges), dtype=bool), 0.1 * spread)
     np.testing.assert_allclose(found.trust, 0.5, atol=0.01)
     assert all(found.reasons)
 

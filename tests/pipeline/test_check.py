@@ -168,7 +168,7 @@ def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
     ("model", "database", "words"),
     [
         ("photographed/truth", "ring8", "contradict it and none agrees: is this its database?"),
-        ("courtyard/truth", "photographed", "the database lacks 9 images: is it that of the model?"),
+        ("courtyard/truth", "photographed", "contradict it and none agrees: is this its database?"),
     ],
 )
 def test_a_model_beside_another_scenes_database_is_doubted(model, database, words):
@@ -176,6 +176,12 @@ def test_a_model_beside_another_scenes_database_is_doubted(model, database, word
     told = check(BUNDLED / model, BUNDLED / database / "database.db", second_opinion=False).verdict
     assert told.grade != "good"
     assert words in told.statement
+
+
+def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
+    strange = spoiled(tmp_path / "strange", names=lambda name: "other.jpg" if name == "0003.jpg" else name)
+    told = check(strange, RING / "database.db", second_opinion=False).verdict
+    assert told.statement == "look: the database lacks 1 image: is it that of the model?"
 
 
 def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
