@@ -85,9 +85,9 @@ def test_the_readme_is_short_leads_with_light_pictures_and_has_the_commands_that
     text = TEXTS[README]
     assert len(text.split()) <= 700
     pictures = re.findall(r"^!\[[^]]+\]\(([^)]+)\)", text, flags=re.MULTILINE)
-    assert len(pictures) == 1
+    assert len(pictures) == 2
     assert text.split("\n\n")[2].startswith("![")
-    assert sum((ROOT / picture).stat().st_size for picture in pictures) < 300_000
+    assert sum((ROOT / picture).stat().st_size for picture in pictures) < 350_000
     assert len({command.split()[0] for command in commands_of(README)}) == 5
 
 
