@@ -234,6 +234,23 @@ def test_points_that_no_pair_used_betray_a_join_that_all_other_pairs_want():
     assert join.rivals.tolist() == [1, 2, 3, 4, 5]
 
 
+def test_points_betray_two_false_joins_by_the_one_pair_that_is_right():
+    """Most pairs agree on the one, the next most on the other; the right pair is asked by itself."""
+    third = Similarity(
+        scale=1.0,
+        rotation=Rotation.from_euler("xyz", [0.3, 1.0, -0.5]).as_matrix(),
+        translation=np.array([-2.0, 1.5, 3.0]),
+    )
+    drawn = Drawn(20)
+    drawn.see_some(0, 1, 1)
+    drawn.see_some(0, 1, 6, moved=ELSEWHERE)
+    drawn.see_some(0, 1, 2, moved=third)
+    drawn.show()
+    join = drawn.join()[1]
+    assert "1 of 9 pairs of images between them agree" in join.reason
+    assert join.rivals.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
 def test_points_that_shrink_to_a_spot_coincide_with_one_alone():
     points = np.random.default_rng(17).random((200, 3))
     spot = points[:1] + 1e-6 * points
