@@ -187,7 +187,7 @@ class GroupedCommand(TyperCommand):
         return extra
 
     def _refuse_unknown(self, ctx: Any, args: Sequence[str], known: set[str]) -> None:
-        """Refuse flags that are keys of --config; others are the parser's business."""
+        """Refuse flags that are keys of --config, or another command's; others are the parser's business."""
         settings = getattr(self.callback, "settings", None)
         groups = () if settings is None else setting_groups(settings)
         key_names.clear()
@@ -195,8 +195,12 @@ class GroupedCommand(TyperCommand):
         for word in itertools.takewhile(lambda word: word != "--", args):
             flag = word.partition("=")[0]
             name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
-            if flag.startswith("--") and flag not in known and name in key_names:
+            if not flag.startswith("--") or flag in known:
+                continue
+            if name in key_names:
                 ctx.fail(f"{flag} is a key of --config: {name} = ...")
+            if others := _commands_with(name):
+                ctx.fail(f"{flag} is an option of {others}")
 
 
 def _bare(name: str) -> str:
@@ -350,13 +354,18 @@ def _read_toml(path: Path, settings: type[Settings]) -> dict[str, Any]:
 
 def _describe_unknown(name: str, known: Sequence[str]) -> str:
     """Say what a key is that this command does not know: a flag, another command's, or a typo."""
-    from sfm_shapefit.facts.options import InspectOptions, JoinOptions, LocateOptions, MapOptions
-
     if name in {"database", "priors", "executor", *homes_of(OutputFlags)}:
         return f"is no key of a file; give it as a flag: {_flag_of(name)}"
+    others = _commands_with(name)
+    return f"is an option of {others}" if others else f"is no option; {hint(name, known)}"
+
+
+def _commands_with(name: str) -> str:
+    """Name the commands that have an option."""
+    from sfm_shapefit.facts.options import InspectOptions, JoinOptions, LocateOptions, MapOptions
+
     kinds = {"locate": LocateOptions, "map": MapOptions, "join": JoinOptions, "inspect": InspectOptions}
-    others = [command for command, kind in kinds.items() if name in homes_of(kind)]
-    return f"is an option of {' and '.join(others)}" if others else f"is no option; {hint(name, known)}"
+    return " and ".join(command for command, kind in kinds.items() if name in homes_of(kind))
 
 
 def one_path(positional: Path | None, flag: Path | None, name: str) -> Path:

@@ -425,6 +425,15 @@ def test_a_key_that_the_command_does_not_know_is_explained(line, told, tmp_path)
     assert told in " ".join(said.replace("│", " ").split())
 
 
+@pytest.mark.parametrize(
+    ("command", "source", "flag", "owner"),
+    [("locate", RING_MODEL, "--gravity", "map"), ("map", RING / "database.db", "--fix", "locate")],
+)
+def test_a_flag_of_another_command_is_told_whose_it_is(command, source, flag, owner, tmp_path):
+    said = run(command, source, tmp_path / "out", flag, "database", code=2).output
+    assert f"{flag} is an option of {owner}" in " ".join(said.replace("│", " ").split())
+
+
 def test_evaluate_refuses_models_without_common_cameras(tmp_path):
     other = pycolmap.Reconstruction(RING_MODEL)
     for image_id in list(other.images):
