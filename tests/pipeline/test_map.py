@@ -216,8 +216,8 @@ def test_an_interrupt_in_any_stage_leaves_nothing_and_whoever_watches_may_cancel
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--rotations", "held"], "No such option: --rotations"),
-        (["--fix", "solved"], "No such option: --fix"),
+        (["--rotations", "held"], "--rotations is an option of locate"),
+        (["--fix", "solved"], "--fix is an option of locate"),
         (["--sequence", "none"], "--sequence is a key of --config: sequence = ..."),
         (["--no-refine"], "--no-refine is a key of --config: refine = ..."),
         (["--rigs", "free", "--adjust", "none"], "--rigs free needs an adjustment"),
