@@ -77,7 +77,8 @@ class Run(Generic[S]):
             rest = time.perf_counter() - self.started - sum(known.values())
             stages = ", ".join(f"{stage} {s:.2f}" for stage, s in (known | {"start and write": rest}).items())
             print_table(str(source), [*told.details, row("seconds", stages)], told.elsewhere)
-        names, missing = found.image_names, self._missing_pictures(found.image_names)
+        names = found.image_names
+        missing = self._missing_pictures(names)
         lacks = (
             f"{self.flags.images} lacks {missing} of {counted(len(names), 'image')}: is it the right folder?"
         )

@@ -21,7 +21,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch, RayMatches, is_among
+from sfm_shapefit.scene.matches import RayMatches, is_among
 
 _LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
 _POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
@@ -75,7 +75,7 @@ def _ask(
     """
     parts = []
     for batch in source.view.of_pairs(asked):
-        rays = _thin(source.images, batch, np.flatnonzero(is_among(batch.pairs, asked)))
+        rays = _thin(source.images, batch)
         likely = _poses_alone(source.alone, rays.pairs)
         if likely is None and given is not None:
             rows = np.flatnonzero(is_among(given.pairs, rays.pairs))  # both ascend
@@ -195,9 +195,9 @@ def _weighed(directions: PairDirections, num_images: int) -> BoolArray:
     return _strongest(directions, num_images)
 
 
-def _thin(images: Images, batch: MatchBatch, rows: IntArray) -> RayMatches:
-    """Return some pairs with few of their matches, taken evenly, their rays in camera axes."""
-    thin = batch.rays_of(rows).thinned(_MOST_MATCHES)
+def _thin(images: Images, batch: RayMatches) -> RayMatches:
+    """Return pairs with few of their matches, taken evenly, their rays in camera axes."""
+    thin = batch.thinned(_MOST_MATCHES)
     turns = np.repeat(images.rotations[thin.pairs], np.diff(thin.offsets), axis=0)
     rays_i, rays_j = (
         np.einsum("kab,kb->ka", turns[:, side], own) for side, own in enumerate((thin.rays_i, thin.rays_j))
