@@ -275,8 +275,8 @@ def _reasons_against(images: Images, fits: PairFits | None) -> Iterator[str]:
 
 
 def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
-    """Yield that no pair agrees; the points of a model tie its cameras whatever its database is."""
-    if fits is not None and not fits.agrees.any():
+    """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
+    if fits is not None and fits.contradicts.any() and not fits.agrees.any():
         against = counted(int(fits.contradicts.sum()), "pair")
         yield f"{against} contradict it and none agrees: is this its database?"
 

@@ -1,6 +1,7 @@
 """`check MODEL`: the verdict on any COLMAP model as it stands, which is left as it is."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -8,9 +9,10 @@ import pytest
 
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.points import points_of
-from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
+from sfm_shapefit.pipeline import checked
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.report.drawing import PairClass
@@ -176,6 +178,17 @@ def test_a_model_beside_another_scenes_database_is_doubted(model, database, word
     told = check(BUNDLED / model, BUNDLED / database / "database.db", second_opinion=False).verdict
     assert told.grade != "good"
     assert words in told.statement
+
+
+def test_pairs_that_leave_everything_open_do_not_contradict_a_model(monkeypatch):
+    def fit_undecided(*args):
+        fits = fit_pairs(*args)
+        return replace(fits, agrees=np.zeros_like(fits.agrees), contradicts=np.zeros_like(fits.agrees))
+
+    monkeypatch.setattr(checked, "fit_pairs", fit_undecided)
+    monkeypatch.setattr(checked, "gather_evidence", lambda *_: ModelEvidence())
+    told = check(RING / "sparse/0", RING / "database.db", second_opinion=False).verdict
+    assert told.grade == "good"
 
 
 def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
