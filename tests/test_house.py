@@ -57,18 +57,15 @@ CHANGES = {
             "adjustment/estimate.py",
             "adjustment/free_sensors.py",
             "adjustment/freedom.py",
-            "adjustment/gauge.py",
             "adjustment/layout.py",
             "adjustment/problem.py",
             "adjustment/run.py",
             "adjustment/views.py",
             "facts/rigs.py",
-            "pipeline/settle.py",
-            "pipeline/stand.py",
         },
     ),
 }
-STILL_MORE = {"something else that adjustments may free": 11}
+STILL_MORE = {"something else that adjustments may free": 8}
 """Files of the changes that touch more than they may; the list may only become shorter."""
 
 

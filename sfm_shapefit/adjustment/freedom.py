@@ -22,6 +22,7 @@ from sfm_shapefit.adjustment.problem import (
     isotropic_information,
 )
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.lens import Lens
@@ -64,6 +65,11 @@ class Freedom:
     """Lenses whose distortion moves, (l,) or one for all; they are in doubt."""
     has_sensors: bool = False
     """Whether sensors move in their rigs, all but the references."""
+
+    @classmethod
+    def asked(cls, options: FreedomOptions, lenses: tuple[BoolArray, BoolArray], *, rigs: bool) -> "Freedom":
+        """Return what is asked for: focal lengths and distortion of `lenses`, sensors if there are rigs."""
+        return cls(focal=lenses[0], distortion=lenses[1], has_sensors=rigs and options.rigs == "free")
 
     @property
     def holds_rotations(self) -> bool:

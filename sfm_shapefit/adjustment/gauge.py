@@ -147,7 +147,7 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
     """Return the values after a similarity of the world; fixed frames stay, rotations if not `turned`."""
     size = np.cbrt(np.linalg.det(motion[:3, :3]))
     moves = ~problem.is_fixed()
-    centers, rotations = values.centers.copy(), values.rotations
+    centers, rotations, sensors = values.centers.copy(), values.rotations, values.sensor_translations
     centers[moves] = _moved(values.centers[moves], motion)
     if turned:
         rotations = rotations.copy()
@@ -157,14 +157,8 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
         rotations=rotations,
         centers=centers,
         points=_moved(values.points, motion),
-        sensor_translations=_resized(problem, values, size),
+        sensor_translations=sensors if problem.rig is None else problem.rig.resized(sensors, size),
     )
-
-
-def _resized(problem: AdjustmentProblem, values: Values, size: float) -> FloatArray:
-    """Return the translations of all sensors (c, 3), of free ones longer by a factor."""
-    is_free = problem.free_sensors() >= 0
-    return np.where(is_free[:, None], size * values.sensor_translations, values.sensor_translations)
 
 
 def restore_baselines(problem: AdjustmentProblem, values: Values) -> Values:
@@ -173,12 +167,8 @@ def restore_baselines(problem: AdjustmentProblem, values: Values) -> Values:
     The longest alone had kept its length. All of them together are known better than any one.
     """
     assert problem.rig is not None
-    _, chosen = np.unique(problem.rig.free_sensors(), return_index=True)
-    own = chosen[problem.rig.free_sensors()[chosen] >= 0]
-    sizes = [
-        np.linalg.norm(t[own], axis=1).mean() for t in (problem.rig.translations, values.sensor_translations)
-    ]
-    size, fixed = float(sizes[0] / sizes[1]), problem.is_fixed()
+    before, now = map(problem.rig.mean_baseline, (problem.rig.translations, values.sensor_translations))
+    size, fixed = before / now, problem.is_fixed()
     origin = values.centers[fixed if fixed.any() else slice(None)].mean(axis=0)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = size * np.eye(3), (1.0 - size) * origin

@@ -54,6 +54,15 @@ class Rig:
             return self.free_sensor_of_camera
         return np.full(len(self.frame_of_camera), -1)
 
+    def resized(self, translations: FloatArray, size: float) -> FloatArray:
+        """Return translations (c, 3) of all sensors, those of free ones longer by a factor."""
+        return np.where(self.free_sensors()[:, None] >= 0, size * translations, translations)
+
+    def mean_baseline(self, translations: FloatArray) -> float:
+        """Return the free sensors' mean distance from the origins of their rigs, by translations (c, 3)."""
+        numbers, chosen = np.unique(self.free_sensors(), return_index=True)
+        return float(np.linalg.norm(translations[chosen[numbers >= 0]], axis=1).mean())
+
     def sensor_centers(self) -> FloatArray:
         """Return where each camera stands in its rig, (c, 3)."""
         centers: FloatArray = -np.einsum("cba,cb->ca", self.rotations, self.translations)

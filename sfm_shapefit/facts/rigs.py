@@ -5,7 +5,10 @@ from typing import Annotated
 
 import numpy as np
 
+from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.images import Images, Sensors
@@ -30,14 +33,26 @@ class RefinedSensor(Record):
         )
 
 
-def refined_rigs(given: Images, found: Images, sigmas: FloatArray) -> tuple[RefinedSensor, ...]:
-    """Return a row for each sensor that was refined.
+def refined_rigs(
+    given: Images, found: Images, freedom: Freedom, adjusted: Sequence[Estimate]
+) -> tuple[RefinedSensor, ...]:
+    """Return a row for each sensor that was refined, as sure as the last adjustment of it is.
 
     Args:
         given, found: the same images with their sensors before and after.
-        sigmas: (l, 2) standard deviations of place and rotation in rad; NaN for those that have no row.
+        freedom: what was to move.
+        adjusted: what adjustments made of some of the images, one after the other.
+
+    Raises:
+        InputError: if sensors were to move, but none did.
     """
     rows, before, after = [], given.sensors, found.sensors
+    sigmas = np.full((len(given.lenses), 2), np.nan)
+    for done in adjusted:
+        own = given.lenses_of(done.images)
+        sigmas[own] = np.where(np.isnan(done.sensor_sigmas), sigmas[own], done.sensor_sigmas)
+    if freedom.has_sensors and np.isnan(sigmas).all():
+        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
     for k in np.flatnonzero(np.isfinite(sigmas[:, 0])).tolist():
         turn = before.rotations[k].T @ after.rotations[k]
         rows.append(

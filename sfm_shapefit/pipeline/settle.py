@@ -18,9 +18,8 @@ from functools import partial
 
 import numpy as np
 
-from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.errors import InputError, UnsolvableError
+from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, median_spread
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.facts.intrinsics import intrinsics_warnings
@@ -170,7 +169,8 @@ def finish_piece(
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
         intrinsics = intrinsics.after(seeded.adjusted, before.lenses_of(seeded.adjusted.images))
-    sensors = _refined_sensors(stand, first, seeded.adjusted)
+    adjusted = (None if first is None else first.adjusted, stand.adjustment, seeded.adjusted)
+    rigs = refined_rigs(given.images, seeded.images, stand.freedom, [done for done in adjusted if done])
     gauge = tell_scale(seeded.gauge, judged.scale_sigma)
     images, source = seeded.images, stand.source
     kept &= images.is_posed[judged.cameras]
@@ -207,7 +207,7 @@ def finish_piece(
         prior_fit=_compare_with_priors(stand, judged, images, gauge),
         evidence=evidence,
         intrinsics=intrinsics,
-        rigs=refined_rigs(given.images, images, sensors),
+        rigs=rigs,
         control_points=brought.control_points,
         suspicions=stand.failures,
     )
@@ -309,25 +309,6 @@ def _place_all(stand: Stand, images: Images) -> Images:
     there = np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
     motion = fit_similarity(before[there], now[there])
     return images.posed(images.frames.rotations, np.where(np.isfinite(now), now, motion.apply(before)))
-
-
-def _refined_sensors(stand: Stand, first: FirstPlacement | None, adjusted: Estimate | None) -> FloatArray:
-    """Return how well sensors are known that moved in their rigs, by the last adjustment of each.
-
-    Standard deviations (l, 2) of place and rotation in rad; NaN for sensors that did not move.
-
-    Raises:
-        InputError: if they were to move, but nothing was adjusted.
-    """
-    images = stand.given.images
-    sigmas = np.full((len(images.lenses), 2), np.nan)
-    for done in (None if first is None else first.adjusted, stand.adjustment, adjusted):
-        if done is not None:
-            rows = images.lenses_of(done.images)
-            sigmas[rows] = np.where(np.isnan(done.sensor_sigmas), sigmas[rows], done.sensor_sigmas)
-    if stand.freedom.has_sensors and np.isnan(sigmas).all():
-        raise InputError("there is nothing to adjust, so that rigs cannot be refined; leave out rigs=free")
-    return sigmas
 
 
 def _compare_with_priors(stand: Stand, judged: Judged, images: Images, gauge: Gauge) -> PriorFit | None:

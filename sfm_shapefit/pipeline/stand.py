@@ -69,8 +69,8 @@ class Stand(NamedTuple):
     ) -> "Stand":
         """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
         gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
-        lenses, moves = given.intrinsics, options.freedom.rigs == "free" and given.rigid.groups is not None
-        freedom = Freedom(focal=lenses.focal, distortion=lenses.distortion, has_sensors=moves)
+        lenses, has_rigs = given.intrinsics, given.rigid.groups is not None
+        freedom = Freedom.asked(options.freedom, (lenses.focal, lenses.distortion), rigs=has_rigs)
         return cls(given, source, directions, placement, gauge, freedom, lenses)
 
     def failed(self, how: str) -> "Stand":

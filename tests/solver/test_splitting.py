@@ -9,10 +9,11 @@ import pytest
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.laplacian.approximate import conjugate_gradients
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import engine, linear
+from sfm_shapefit.solver.splitting import engine, linear, lud, split_then_newton
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import (
     ALONG,
@@ -205,14 +206,31 @@ def test_lud_has_the_optimum_of_a_conic_reference_and_its_bound_closes(d):
         assert 0.0 <= solve_lud(graph, iterations).dual_bound <= value * (1.0 + 1e-7)
 
 
+def test_the_bound_of_lud_is_found_in_few_steps_whatever_the_weights(monkeypatch):
+    """What restores the balance of the dual has no weights: nor has what conditions it, unlike the run."""
+    graph, _ = small_problem(23, 3, n=16)
+    weights, steps = 10.0 ** np.random.default_rng(23).uniform(-2.0, 2.0, graph.num_edges), []
+
+    def counted(*words, **settings):
+        found = conjugate_gradients(*words, **settings)
+        steps.append(found.iterations)
+        return found
+
+    monkeypatch.setattr(lud, "conjugate_gradients", counted)
+    result = solve_lud(ViewGraph(16, graph.edges, graph.directions, weights), 1000, tol=1e-12)
+    assert result.objective * (1.0 - 1e-6) <= result.dual_bound <= result.objective
+    assert result.equality_residual < 1e-12
+    assert max(steps) <= 20  # 33 by the penalties that the run ended with
+
+
 def test_lud_stands_on_a_chain_where_the_optimum_of_shapefit_collapses():
     edges, t = seq(300, 36, 1)
     graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
-    lud = solve_lud(graph, 50, certified=False)
+    stretched = solve_lud(graph, 50, certified=False)
     collapsed, _, _ = solve_conic(graph, 1e-6, 200)
     assert solve_admm(graph, 1e-6, 500).stop in (Stop.STALLED, Stop.MAX_ITERATIONS)
     # Seeds 1 to 6: LUD 0.02 to 0.03, the optimum of ShapeFit 0.3 to 1.4 (sqrt(2) is no relation at all).
-    assert np.linalg.norm(shape(lud.locations) - shape(t)) < 0.06
+    assert np.linalg.norm(shape(stretched.locations) - shape(t)) < 0.06
     assert np.linalg.norm(shape(collapsed) - shape(t)) > 0.3
 
 
@@ -356,8 +374,27 @@ def test_acceleration_begins_where_the_fitting_edges_stay(accelerate, inside, be
     passes = SimpleNamespace(data=SimpleNamespace(bounds=(0, 100)))
     asked = SimpleNamespace(tuning=SimpleNamespace(accelerate=accelerate), passes=passes)
     state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(100), sums=sums, interior=before)
-    assert (Iteration._accelerator(asked, state) is not None) == accelerated
+    state.anderson = Iteration._accelerator(asked, state)
+    assert (state.anderson is not None) == accelerated
     assert state.interior == inside / 100
+    if accelerated:  # at the next renewal the map is another one, of which the history knows nothing
+        state.anderson._count = 3
+        assert Iteration._accelerator(asked, state) is state.anderson
+        assert state.anderson._count == -1
+
+
+def test_acceleration_is_given_up_far_above_the_first_objective_only():
+    asked = SimpleNamespace(objective=lambda state: state.sums[OBJECTIVE])
+
+    def is_astray(k, objective, anderson):
+        state = SimpleNamespace(sums=[objective], anderson=anderson)
+        return Iteration._is_astray(asked, state, k)
+
+    assert not is_astray(1, 0.5, "history")
+    assert not is_astray(2, 4.9, "history")
+    assert is_astray(3, 5.1, "history")
+    assert is_astray(3, np.nan, "history")
+    assert not is_astray(3, 5.1, None)
 
 
 @pytest.mark.parametrize(("change", "restarts"), [(10.0, 0), (1e9, 1)])
@@ -394,6 +431,27 @@ def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
     assert engine._steps_left(state) == pytest.approx(left, rel=1e-9)
 
 
+@pytest.mark.parametrize(("cheap_flops", "starts"), [(0.0, 1), (np.inf, 2)])
+def test_newton_begins_where_splitting_ended_and_anew_where_that_costs_nothing(
+    monkeypatch, cheap_flops, starts
+):
+    graph, _ = small_problem(7, 3)
+    factor, seen = laplacian_factor(graph), []
+    first = solve_hybrid(graph, 1e-9, 1)
+    monkeypatch.setattr(split_then_newton, "_CHEAP_FLOPS", cheap_flops)
+
+    def useless(graph, *_, start, **_kept):
+        seen.append(start)
+        return np.zeros((graph.num_nodes, 3)), np.zeros((graph.num_edges, 3)), 5
+
+    monkeypatch.setattr(split_then_newton, "solve_newton_sparse", useless)
+    found = split_then_newton._newton(graph, Resources(factor=factor), first, 0.0, None)
+    assert seen[0] == (first.locations, first.certificate.dual)
+    assert seen[1:] == [None] * (starts - 1)
+    assert found.factorizations == 5 * starts
+    assert found.locations is first.locations
+
+
 @pytest.mark.parametrize("family", [synthetic.box_graph_problem, synthetic.expander_graph_problem])
 def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
     problem = family(6000, 20.0, sigma=0.01, q=0.1, seed=1)
@@ -402,4 +460,4 @@ def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
     np.testing.assert_array_equal(one.locations, two.locations)
     np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)
     luds = (solve_lud(graph, 10, certified=False, resources=Resources(threads)) for threads in (1, 2))
-    np.testing.assert_array_equal(*(lud.locations for lud in luds))
+    np.testing.assert_array_equal(*(found.locations for found in luds))
