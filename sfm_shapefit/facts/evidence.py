@@ -7,7 +7,8 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
-from sfm_shapefit.judgement.evidence import ALIKE, ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
+from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
@@ -140,7 +141,7 @@ class ToldOpinion(Record):
             parts.append(f"{where}, but matches speak as much for another rotation")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
-        if not parts and self.usual > ALIKE:
+        if not parts and self.usual > FEW:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"
         return f"{told} ({usual})"

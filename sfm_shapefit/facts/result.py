@@ -49,7 +49,6 @@ from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
 from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
-    MOST_APART,
     ModelVerdict,
     Shares,
     judge_graph,
@@ -57,6 +56,7 @@ from sfm_shapefit.judgement.grade import (
     weigh_evidence,
 )
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.straight import find_line, sigma_along
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
@@ -293,7 +293,7 @@ class LocateResult(_Placed):
         """Yield that many position priors contradict the cameras: a few are wrong, many may be right."""
         if self.prior_fit is not None:
             wrong, count = len(self.prior_fit.wrong), int(np.isfinite(self.prior_fit.off).sum())
-            if wrong > max(1, MOST_APART * count):
+            if wrong > max(1, FEW * count):
                 yield f"{wrong} of {counted(count, 'position prior')} contradict where cameras stand"
 
     @property

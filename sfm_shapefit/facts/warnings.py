@@ -6,8 +6,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, UNCERTAIN_SHARE, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.placement.prior_fit import PriorFit
@@ -86,7 +87,7 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        share, see = f"{UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
+        share, see = f"{RARE:.0%}", "see sigma and trust in cameras.csv"
         if len(uncertain) == 1:
             yield f"{worst} is uncertain by more than {share} of the extent; {see}"
         else:

@@ -16,6 +16,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
+from sfm_shapefit.judgement.limits import FEW, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
@@ -24,11 +25,7 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
-ALIKE = 0.1  # share of the spread of cameras; models farther apart in the median are of different shape
-_LEVELS, _FAR_DEG = 6.0, (1.0, 2.0)  # levels, and degrees at least and at most; sound models: .01 to .13 deg
-_EXACT_DEG = 1.0  # degrees, sigma of a direction; one that is known worse contradicts nothing
-_LARGE_SHARE, _SHARE_OF_USUAL = 1 / 3, 2.0  # pairs and usual shares; a camera that more contradict is asked
-_OWN_SIGMAS = 3.0  # standard deviations of the pair's own direction; far points make it inexact
+_FAR_DEG = (KNOWN_DEG, OUTNUMBERED * KNOWN_DEG)  # degrees, least and most limit; sound models: .01 to .13
 
 
 class Contradicted(NamedTuple):
@@ -75,7 +72,7 @@ class PairFits:
         shares = against / np.maximum(total, 1)
         asked = total > 0
         usual = float(np.median(shares[asked])) if asked.any() else 0.0
-        many = asked & (shares > max(_LARGE_SHARE, _SHARE_OF_USUAL * usual))
+        many = asked & (shares > max(MANY, OUTNUMBERED * usual))
         rows = np.flatnonzero(many[images.frame_of] & np.isfinite(self.centers).all(axis=1))
         counts = zip(rows.tolist(), total[images.frame_of[rows]].tolist(), strict=True)
         return tuple(Contradicted(k, all_, int(against[images.frame_of[k]])) for k, all_ in counts)
@@ -112,10 +109,10 @@ def fit_pairs(centers: FloatArray, directions: PairDirections) -> PairFits:
     residuals = np.full(len(pairs), np.nan)
     residuals[usable] = angle_between_deg(directions.directions[usable], baselines[usable])
     sigmas = directions.sigma_deg()
-    exact = usable & (sigmas <= _EXACT_DEG)
+    exact = usable & (sigmas <= KNOWN_DEG)
     best = exact if exact.any() else usable
     level = SIGMA_PER_MEDIAN * float(np.median(residuals[best])) if usable.any() else np.nan
-    limit = np.maximum(np.clip(_LEVELS * level, *_FAR_DEG), _OWN_SIGMAS * sigmas)
+    limit = np.maximum(np.clip(SURE_SIGMAS * level, *_FAR_DEG), SIGMAS * sigmas)
     against = np.zeros(len(pairs), dtype=np.bool_)
     against[directions.contradicting()] = True
     return PairFits(
@@ -151,7 +148,7 @@ class SecondOpinion(NamedTuple):
     @property
     def has_nothing_in_common(self) -> bool:
         """Whether the two have different shapes, and no pair says which is right."""
-        return self.usual > ALIKE and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
+        return self.usual > FEW and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -44,22 +44,14 @@ from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
+from sfm_shapefit.judgement.limits import FEW, HALF, MANY, RARE
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
-UNCERTAIN_SHARE = 0.05
-"""Share of the extent of all; a larger standard deviation of a camera counts as large."""
 MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
-# Share of the images that are placed, of the cameras that agreeing pairs hold, of the observations that do
-# not contradict; with less of any, the model is not to be used.
-_LEAST = 0.5
-FEW_PLACED = 0.95  # share of images in the output; below, the model is to be looked at
-MOST_APART = 0.1
-"""Share of cameras in groups that stand apart; above, the model is not to be used, and where as many priors
-contradict it, it is to be looked at."""
-_MOST_NAMED = 1 / 3  # share of cameras that evidence names; above, the model is not to be used
+FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 _INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
 
@@ -143,12 +135,12 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     reasons: list[str] = []
     if apart:
         clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
-        (reasons if len(set(apart) - confirmed) > MOST_APART * count else suspicions).append(clause)
+        (reasons if len(set(apart) - confirmed) > FEW * count else suspicions).append(clause)
     if len(loose) < len(evidence.untied):
         suspicions.append("nothing checks how groups of cameras stand to one another")
-    if evidence.num_held is not None and evidence.num_held < _LEAST * count:
+    if evidence.num_held is not None and evidence.num_held < HALF * count:
         reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
-    if len(named.keys() - confirmed) > _MOST_NAMED * count:
+    if len(named.keys() - confirmed) > MANY * count:
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
     if second is not None and second.has_nothing_in_common:
         suspicions.append("the model that map makes of the same database has another shape")
@@ -211,9 +203,9 @@ def in_another_model(here: float) -> str:
 
 def _reasons_against(shares: Shares) -> Iterator[str]:
     """Yield why a model should not be used; a share that is not known is no reason."""
-    if shares.contradicting >= 1.0 - _LEAST:
+    if shares.contradicting >= HALF:
         yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
-    if shares.placed < _LEAST:
+    if shares.placed < HALF:
         yield f"only {shares.placed:.0%} of the images are placed"
 
 
@@ -221,7 +213,7 @@ def uncertain_cameras(placement: Judged) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(largest_sigmas(placement) > UNCERTAIN_SHARE * _extent(placement.locations))
+    return np.flatnonzero(largest_sigmas(placement) > RARE * _extent(placement.locations))
 
 
 def largest_sigmas(placement: Judged) -> FloatArray:

@@ -25,7 +25,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.judgement.limits import FEWEST_POINTS
+from sfm_shapefit.judgement.limits import FEWEST_POINTS, SIGMAS
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import LARGEST_SIGMA
@@ -42,7 +42,7 @@ _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (19
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _ANGULAR = ("EQUIRECTANGULAR", "FOV")  # lenses beside the fisheyes whose pictures grow with the angle
-_NOISY, _LEAST_NOISY_PX = 3.0, 1.0  # usual noises and pixels; an image that is above both fits nowhere
+_LEAST_NOISY_PX = 1.0  # pixels; an image of more, and of three usual noises, fits nowhere
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
 
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
@@ -71,7 +71,7 @@ class LeftOut:
     def of_little_noise(self, usual: BoolArray) -> "LeftOut":
         """Return the same without the sigmas of images whose noise is far above that of `usual` ones (i,)."""
         noise_px = self.noise_px[usual & np.isfinite(self.noise_px)]
-        most_px = _NOISY * float(np.median(noise_px)) if len(noise_px) else np.inf
+        most_px = SIGMAS * float(np.median(noise_px)) if len(noise_px) else np.inf
         noisy = ~usual & ~(self.noise_px <= max(most_px, _LEAST_NOISY_PX))
         return replace(self, sigmas=np.where(noisy, np.nan, self.sigmas))
 

@@ -1,7 +1,29 @@
-"""Limits that several tests of evidence share."""
+"""Limits that several tests of evidence share, and what follows from them.
+
+A statement of chance stands behind each: what sound pairs, points and cameras hardly ever do by themselves.
+"""
 
 OUTNUMBERED = 2.0
-"""Pairs, or points, for one of two explanations over those for the other: twice as many are believed."""
+"""Ratio of pairs, points, residuals or shares for one of two explanations to those for the other; one that
+has twice as many is believed."""
+HALF = 1.0 / OUTNUMBERED
+"""Share of those for the other explanation that one needs at least to be its rival."""
+MANY = 1 / 3
+"""Share of pairs of a camera, or of cameras; where more speak against, the rest does not outnumber them."""
+FEW = 0.1
+"""Share of cameras, of pairs, or of the spread of the scene; less is local and leaves the whole as it is."""
+RARE = 0.05
+"""Share of what is sound that is off by chance; and of the extent, by which a sound camera is off at most."""
+SIGMAS = 3.0
+"""Standard deviations; what is farther off is no noise."""
+SURE_SIGMAS = OUTNUMBERED * SIGMAS
+"""Levels of a median of unlike pairs or cameras; their own noise is up to twice what is usual."""
+KNOWN_DEG = 1.0
+"""Degrees, standard deviation of the direction and of the turn of a pair by itself; few know theirs worse."""
+ALIKE_DEG = SIGMAS * KNOWN_DEG
+"""Degrees between turns, or to a place, of pairs that say the same."""
+NEAR_DEG = HALF * KNOWN_DEG
+"""Degrees; what is nearer is no other place, and no other turn."""
 FEWEST_ALIKE = 3
 """Pairs that say the same; two say the same of something by chance."""
 FEWEST_POINTS = 15

@@ -19,15 +19,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
-from sfm_shapefit.judgement.limits import FEWEST_ALIKE
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, HALF, NEAR_DEG, SIGMAS
 
-_LEVELS, _NEAR_DEG = (
-    3.0,
-    (0.5, 3.0),
-)  # levels of error, and degrees at least; more than at most, and none is asked
 _LEAST_SINE = 0.1  # sine of the angle between two rays that define a place; flatter ones cut anywhere
-_LEAST_SHARE = 0.5  # pairs for the other place over those for this one alone; fewer are a few wrong pairs
-_MOST_SHARED = 0.5  # share of the agreeing pairs that pass at the other place too; more, and it is loose
 _MOST_RAYS = 30  # rejected rays of a camera that define places, evenly taken; all of them count
 
 
@@ -61,8 +55,8 @@ def find_other_places(
     known = np.asarray(np.isfinite(centers).all(axis=1))
     inside = known[pairs].all(axis=1)
     pairs, directions, agrees = pairs[inside], directions[inside], agrees[inside]
-    near_deg = max(_LEVELS * level_deg, _NEAR_DEG[0])
-    if not (near_deg <= _NEAR_DEG[1] and len(pairs)):
+    near_deg = max(SIGMAS * level_deg, NEAR_DEG)
+    if not (near_deg <= ALIKE_DEG and len(pairs)):
         return ()
     ends, rows = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(ends, kind="stable")
@@ -75,8 +69,8 @@ def find_other_places(
         there, place = wrong.best_place(near_deg)
         both = right.pass_at(place[None], near_deg)[0]
         agreeing, shared = len(both), int(both.sum())
-        is_other = there >= max(FEWEST_ALIKE, _LEAST_SHARE * (agreeing - shared))
-        is_other &= shared <= _MOST_SHARED * agreeing
+        is_other = there >= max(FEWEST_ALIKE, HALF * (agreeing - shared))
+        is_other &= shared <= HALF * agreeing
         if is_other:
             here = pairs[own[agrees[own]][~both]]
             found.append(OtherPlace(int(camera), len(here), there, place - centers[camera], here))

@@ -25,13 +25,10 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import MOST_COMPARED, OUTNUMBERED
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
-_SMALLEST_GROUP = 2  # cameras; a single one is no group, and has tests of its own
 _FEWEST_CONTRADICTING = 5  # pairs across a cut, and pairs on one turn; fewer are chance
-_LEAST_ON_ONE_TURN = 0.1  # share of the contradictions with a rotation that agree on one turn; see the header
-_ALIKE_DEG = 3.0  # degrees between turns that agree; a single pair knows its rotation to about one
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
 
 
@@ -79,8 +76,8 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
     main = int(np.argmax(sizes))
     cuts = []
     for body in np.argsort(-sizes, kind="stable").tolist():
-        if body == main or sizes[body] < _SMALLEST_GROUP:
-            continue
+        if body == main or sizes[body] == 1:
+            continue  # a single camera is no group, and has tests of its own
         inside = bodies == body
         across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
         if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > OUTNUMBERED * len(across[0]):
@@ -108,8 +105,8 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         num_turned, turn_deg = _most_alike(turns)
         share = num_turned / max(len(rows), 1)
         num = len(cut.contradicting)
-        is_turned = num_turned >= _FEWEST_CONTRADICTING and share > _LEAST_ON_ONE_TURN
-        if (is_turned and turn_deg > _ALIKE_DEG) or not cut.is_tied:
+        is_turned = num_turned >= _FEWEST_CONTRADICTING and share > FEW
+        if (is_turned and turn_deg > ALIKE_DEG) or not cut.is_tied:
             seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
     return tuple(seams)
 
@@ -153,6 +150,6 @@ def _most_alike(turns: FloatArray) -> tuple[int, float]:
     if not len(turns):
         return 0, float("nan")
     between = np.swapaxes(turns, 1, 2)[:, None] @ turns[None]
-    counts = np.sum(rotation_angles_deg(between) <= _ALIKE_DEG, axis=1)
+    counts = np.sum(rotation_angles_deg(between) <= ALIKE_DEG, axis=1)
     best = int(np.argmax(counts))
     return int(counts[best]), float(rotation_angles_deg(turns[best : best + 1])[0])

@@ -19,15 +19,12 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, median_spread, rotation_angles_deg
 from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
-from sfm_shapefit.judgement.limits import FEWEST_ALIKE, OUTNUMBERED
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE, NEAR_DEG, OUTNUMBERED, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.scene.images import Images
 
-_FEWEST_COMMON = 4  # cameras of both; of three, one that is off takes the similarity along
 _CAP = 0.03  # spreads; farther off, a camera is lost, and half of them may be
-_OF_USUAL = 6.0  # usual differences; more is elsewhere, if it is more than the next as well
 _ROUNDING, _ROUNDING_DEG = 1e-7, 1e-5  # spreads and degrees; usual differences of the same model are smaller
-_FAR, _TURNED_DEG = 0.01, 0.5  # spreads and degrees; what is nearer needs no judge
-_RATIO = 2.0  # residuals of the better one; a pair that misses the other by more speaks for it
+_FAR = 0.01  # spreads; what is nearer needs no judge
 _NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the rotations, as badly as can be
 
 
@@ -45,8 +42,8 @@ def compare_models(
     """
     row_of = {name: k for k, name in enumerate(others.names) if others.is_posed[k]}
     mine = np.array([k for k, name in enumerate(images.names) if name in row_of], dtype=np.int64)
-    if len(mine) < _FEWEST_COMMON:
-        return None
+    if len(mine) <= SMALLEST_SHAPE:
+        return None  # one of three that is off takes the similarity along
     theirs = np.array([row_of[images.names[k]] for k in mine.tolist()])
     spread = median_spread(images.centers[mine])
     if not spread > 0.0:
@@ -57,8 +54,8 @@ def compare_models(
     angles = rotation_angles_deg(np.swapaxes(turns, 1, 2) @ mean_rotation_l1(turns))
     usual = float(np.median(distances))
     turned = max(float(np.median(angles)), _ROUNDING_DEG)
-    unlike = distances > _OF_USUAL * max(usual, _ROUNDING), angles > _OF_USUAL * turned
-    elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > _TURNED_DEG))
+    unlike = distances > SURE_SIGMAS * max(usual, _ROUNDING), angles > SURE_SIGMAS * turned
+    elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > NEAR_DEG))
     residuals = _residuals(fits, mine), _residuals(other_fits, theirs)
     votes = _count_votes(*residuals, elsewhere)
     votes[votes.sum(axis=1) < FEWEST_ALIKE] = votes.sum(axis=0)
@@ -113,5 +110,5 @@ def _count_votes(here: _Residuals, there: _Residuals, elsewhere: BoolArray) -> I
     ends, mine, theirs = ends[across], here.degrees[a][across], there.degrees[b][across]
     away = np.where(elsewhere[ends[:, 0]], ends[:, 0], ends[:, 1])
     for side, (good, bad) in enumerate(((mine, theirs), (theirs, mine))):
-        votes[:, side] = np.bincount(away[bad > _RATIO * good], minlength=count)
+        votes[:, side] = np.bincount(away[bad > OUTNUMBERED * good], minlength=count)
     return votes

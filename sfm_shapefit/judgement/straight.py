@@ -3,9 +3,7 @@
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.judgement.limits import FEWEST_ALIKE
-
-_MOST_DEG, _SHARE = 1.0, 0.95  # degrees from the line, and share of directions within; a few may be wrong
+from sfm_shapefit.judgement.limits import FEWEST_ALIKE, KNOWN_DEG, RARE
 
 
 def find_line(directions: FloatArray) -> FloatArray | None:
@@ -18,9 +16,9 @@ def find_line(directions: FloatArray) -> FloatArray | None:
         along = directions @ line
         across = np.linalg.norm(directions - along[:, None] * line, axis=1)
         angles_deg = np.degrees(np.arctan2(across, np.abs(along)))
-        near = angles_deg <= np.quantile(angles_deg, _SHARE)
+        near = angles_deg <= np.quantile(angles_deg, 1.0 - RARE)
         line = np.linalg.svd(directions[near], full_matrices=False)[2][0]
-    return line if bool(angles_deg[near].max() <= _MOST_DEG) else None
+    return line if bool(angles_deg[near].max() <= KNOWN_DEG) else None
 
 
 def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:

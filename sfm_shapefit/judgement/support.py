@@ -9,15 +9,11 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.judgement.limits import CHECKED_BY, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, RARE, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.joining import sampson_px
-
-# Keypoints that can be checked, and share of them that sees points; less is chance. No right image of
-# data_synthetic and eleven real scenes has less than 0.26; a wrong one, with which all its pairs agreed, 0.
-_FEWEST_CHECKED, _LEAST_AGREEING = 30, 0.05
 
 
 def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
@@ -128,9 +124,9 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
         counts: of the images.
         images: some of them posed.
         fixed: (f,) frames that are not asked.
-    """
-    could = counts.checked >= _FEWEST_CHECKED
-    does = could & (counts.agreeing >= _LEAST_AGREEING * counts.checked)
+    """  # no right image of eleven real scenes has less than 0.26 of them; a wrong one 0
+    could = counts.checked >= OUTNUMBERED * FEWEST_POINTS
+    does = could & (counts.agreeing >= RARE * counts.checked)
     posed, lost, support = np.zeros((3, len(images.frames.ids)), dtype=np.bool_)
     posed[images.frame_of[images.is_posed]] = True
     lost[images.frame_of[could]], support[images.frame_of[does]] = True, True

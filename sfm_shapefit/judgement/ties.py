@@ -8,7 +8,8 @@ many as miss. Two groups are one if more crosses than seven unknowns explain,
     points   so many again, also without those of any one camera of either side
     pairs    that agree, three of them, and two without any one camera, half of those that contradict or more
 
-since a single camera that stands in two groups tells nothing of the scale of the one in the other.
+since a single camera that stands in two groups tells nothing of the scale of the one in the other. A point
+counts for nothing if only pairs carry it across most of whose matches there miss (`pipeline.evidence`).
 
 A group that remains by itself is held by few pairs and points, or by none: pairs that an adjustment believed
 may be rejected since. A pair that agrees says five things (its rotation, its direction), a point at least
@@ -92,21 +93,17 @@ def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
     return NodeLinks(np.arange(len(ends)), ends, np.arange(len(ends)) < len(agreeing))
 
 
-def find_groups(
-    count: int, rays: Rays, pairs: NodeLinks, known: IntArray
-) -> tuple[IntArray, tuple[Untied, ...]]:
-    """Return the group of each of so many nodes, (n,), and those that are not tied to the largest.
+def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray, tuple[Untied, ...]]:
+    """Return the group of each node, (n,), and those that are not tied to the largest.
 
     What is unchecked is one group with the largest all the same.
 
     Args:
-        count: number of nodes, n.
+        group: (n,) as `rigid_groups`.
         rays: to points.
         pairs: links by pairs.
-        known: (k, 2) nodes that are known to stand rightly to one another.
     """
-    rays = _of_three(rays)
-    group = _rigid_groups(count, rays, known)
+    rays, count = _of_three(rays), len(group)
     lowest = np.full(int(rays.points.max(initial=-1)) + 1, count)
     np.minimum.at(lowest, rays.points, group[rays.nodes])
     others = np.bincount(rays.points, group[rays.nodes] != lowest[rays.points])
@@ -129,9 +126,15 @@ def _of_three(rays: Rays) -> Rays:
     return rays._replace(fits=rays.fits & (np.bincount(rays.points, rays.fits) > 2)[rays.points])
 
 
-def _rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
-    """Return the group of each node (n,) by the points that two of them share, a share of all points."""
-    group = np.arange(count)
+def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
+    """Return the group of each node (n,) by the points that two of them share, a share of all points.
+
+    Args:
+        count: number of nodes, n.
+        rays: to points.
+        known: (k, 2) nodes that are known to stand rightly to one another.
+    """
+    rays, group = _of_three(rays), np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1
     strong = _tied(group, rows_taken(rays, rays.points % step == 0).links(), *_BY_POINTS)[0]
     strong = np.unique(np.sort(np.concatenate([strong, known]), axis=1), axis=0)

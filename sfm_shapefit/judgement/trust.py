@@ -22,12 +22,12 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
+from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.placement.conditioning import FEW_PAIRS, Conditioning, Looseness
 
 USUAL_SHARE = 0.75
 """Share of what is usual, or of all; a camera loses nothing of its trust with that much."""
-_HOLD_SHARE = 0.1  # standard deviation tau that halves trust, in spreads; a tenth of the scene is loose
-LOW_TRUST = 0.75
+LOW_TRUST = USUAL_SHARE
 """Trust below which reasons are given; usual cameras have more."""
 SOMEWHAT_LOOSE = "its pairs leave it somewhat loose"
 _CONTRADICTED = "more of its pairs contradict it than usual here: its rotation may be wrong"
@@ -100,7 +100,7 @@ def _shares(measured: MeasuredGraph, agrees: BoolArray) -> FloatArray:
 
 def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
     """Return tau^2 / (tau^2 + sigma^2) of each camera, 1 where sigma is not known."""
-    tau = _HOLD_SHARE * median_spread(centers)
+    tau = FEW * median_spread(centers)
     if not tau > 0.0:
         return np.where(np.isinf(largest_sigmas), 0.0, 1.0)
     return np.asarray(1.0 / (1.0 + (np.nan_to_num(largest_sigmas, nan=0.0, posinf=np.inf) / tau) ** 2))

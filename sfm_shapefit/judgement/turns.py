@@ -45,7 +45,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import MOST_COMPARED
+from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MOST_COMPARED, RARE
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
@@ -53,16 +53,16 @@ from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
 _INDEPENDENT_MATCHES = 20.0  # matches of a pair that count for its turn; their errors are in part the same
 _MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are no independent witnesses
 _FLOOR_RAD = np.radians(0.1)  # radians; added for the errors of the given rotations
-_LEAST_TURN_RAD = np.radians(1.0)  # radians; a turn below this and ...
+_LEAST_TURN_RAD = np.radians(KNOWN_DEG)  # radians; a turn below this and ...
 _AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
 _PREFERENCE = 0.5  # standard deviations; a pair that fits an explanation better by less prefers none
-_LARGEST_SIGMA_RAD = np.radians(3.0)  # radians; agreement says nothing where a turn could as well be larger
+_LARGEST_SIGMA_RAD = np.radians(ALIKE_DEG)  # radians; agreement says nothing where more is as likely
 _LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
-_UNEXPLAINED, _EXPLAINED = 0.7, 0.95  # ratio of robust weights; given rotations fit not at all, and fully
+_UNEXPLAINED, _EXPLAINED = 0.7, 1.0 - RARE  # ratios of weights; given rotations fit not at all, and fully
 _MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
-_DIRECTION_ALONE = 0.5  # support of a pair whose direction agrees; its own rotation does not
-RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
-"""Shares s: from the first a camera is right, below the second it is turned."""
+RIGHT_SHARE = 0.6
+"""Share s; from here on a camera is right, below half of it turned."""
+TURNED_SHARE = HALF * RIGHT_SHARE
 _MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
 _AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
 
@@ -172,7 +172,7 @@ def weigh_pairs(
     support = np.where(judged, np.nan_to_num(agreements) * explained, 0.0)
     asked = np.zeros(k, dtype=np.bool_)
     asked[row] = True
-    support = np.where(asked & ~(finite & small), _DIRECTION_ALONE * support, support)
+    support = np.where(asked & ~(finite & small), HALF * support, support)
     # A pair without a direction that could be compared speaks for the rotation all the same.
     support = np.where(~judged & finite & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
     weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)

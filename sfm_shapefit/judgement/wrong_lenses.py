@@ -16,16 +16,15 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
-from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import HALF, SIGMAS, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
 # which half of the images of a lens show that it is; see the header.
-_ONE, _HALF = (0.025, 10.0), (0.004, 3.0)
+_ONE, _HALF = (0.025, 10.0), (0.004, SIGMAS)
 # Standard deviations, and how many times those of any other image: so clear is a lens of one image too.
 _CLEAR = (4.0, 2.5)
-_RIVAL = 0.5  # share of the highest score; what is named as clearly is taken out at once, for time's sake
 
 
 class WrongLens(NamedTuple):
@@ -65,7 +64,7 @@ def question_lenses(
         left_out = found.of_little_noise(make)
         wrong = wrong_lenses(left_out, images)
         fresh = [item for item in wrong if believed[images.lens_of == item.lens].any()]
-        gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= _RIVAL * fresh[0].score])
+        gone = np.isin(images.lens_of, [item.lens for item in fresh if item.score >= HALF * fresh[0].score])
         if not fresh or 2 * np.sum(make & (~believed | gone)) >= np.sum(make):
             return left_out, wrong
         believed &= ~gone

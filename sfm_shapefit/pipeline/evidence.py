@@ -6,13 +6,15 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
+from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts, find_seams
-from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs
+from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
 from sfm_shapefit.judgement.witnesses import FITTING_PX, are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.matches import View
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
 
@@ -94,11 +96,16 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) ->
     """
     points, images, pictures = structure[:3]
     view = source.view
-    counts = [pictures.count(k) for k in range(images.num_images)] if doubted.any() else []
-    if not points.num_points or counts != view.num_keypoints.tolist():
+    if not (doubted.any() and _has_keypoints(view, structure)):
         return np.zeros_like(doubted)
     links = list(view.links(without=view.pairs[~doubted[view.pairs].any(axis=1)]))
     return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
+
+
+def _has_keypoints(view: View, structure: Structure) -> bool:
+    """Return whether there are points, of the keypoints that the matches have."""
+    counts = [structure.pictures.count(k) for k in range(structure.images.num_images)]
+    return structure.points.num_points > 0 and counts == view.num_keypoints.tolist()
 
 
 def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[IntArray, tuple[Untied, ...]]:
@@ -117,7 +124,9 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
         tied = frames[source.tied]
         known.append(tied[tied[:, 0] != tied[:, 1]])
     together = np.concatenate([np.zeros((0, 2), dtype=np.int64), *known])
-    tied, groups = find_groups(len(images.frames.ids), rays, pairs, together)
+    group = rigid_groups(len(images.frames.ids), rays, together)
+    lost = _are_lost(source.view, structure, fitting, group[frames])
+    tied, groups = find_groups(group, rays._replace(fits=fitting & ~lost[rays.points]), pairs)
     posed = np.unique(frames[images.is_posed])
     if 2 * np.bincount(tied[posed]).max(initial=0) < len(posed):
         held = fits.held(images)
@@ -126,6 +135,34 @@ def _tie(source: MatchSource, fits: PairFits, structure: Structure) -> tuple[Int
         return np.where(held, 0, 1 + frames), ()
     images_of = (np.flatnonzero(np.isin(frames, group.cameras)) for group in groups)
     return tied[frames], tuple(map(lambda group, rows: group._replace(cameras=rows), groups, images_of))
+
+
+def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray) -> BoolArray:
+    """Return which points (x,) only pairs carry between groups of images (i,) whose matches mostly miss.
+
+    Some matches of a pair that repeated structure has made may fit where it puts a group; others, of points
+    that either side knows, do not: they see two that do not coincide.
+    """
+    points, images = structure[:2]
+    across = images.is_posed[view.pairs].all(axis=1) & (group[view.pairs[:, 0]] != group[view.pairs[:, 1]])
+    lost, carried = np.zeros((2, points.num_points), dtype=np.bool_)
+    if not (across.any() and _has_keypoints(view, structure)):
+        return lost
+    begins = np.append(0, np.cumsum(view.num_keypoints))
+    point_of, fitting = np.full(begins[-1], -1), np.zeros(begins[-1], dtype=np.bool_)
+    seen = begins[points.images] + points.keypoints
+    point_of[seen], fitting[seen] = points.points_seen(), fits
+    for batch in view.links(without=view.pairs[~across]):
+        pair = np.repeat(np.arange(len(batch.pairs)), np.diff(batch.offsets))
+        keypoints = begins[batch.pairs[pair]] + batch.keypoints
+        ends = point_of[keypoints]
+        known, same = (ends >= 0).all(axis=1), ends[:, 0] == ends[:, 1]
+        fit, miss = same & fitting[keypoints].all(axis=1), known & ~same
+        num_fit, num_missing = (np.bincount(pair[rows], minlength=len(batch.pairs)) for rows in (fit, miss))
+        sound = (num_fit >= OUTNUMBERED * num_missing)[pair]
+        lost[ends[fit & ~sound, 0]] = True
+        carried[ends[fit & sound, 0]] = True
+    return lost & ~carried
 
 
 def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:

@@ -39,8 +39,8 @@ from sfm_shapefit.files.colmap.seed import build_seed
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
-from sfm_shapefit.judgement.grade import UNCERTAIN_SHARE
 from sfm_shapefit.judgement.judged import Judged, judge
+from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_cameras, turned_deg, with_uncertainty
@@ -298,7 +298,7 @@ def _tied_by_priors(stand: Stand, images: Images) -> IntArray | None:
     if stand.held is None:
         return None
     centers = images.centers[images.is_posed]
-    most = UNCERTAIN_SHARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
+    most = RARE * float(np.linalg.norm(np.ptp(centers, axis=0)))
     frames = stand.held.indices[stand.held.sigmas() <= most]
     return rigid_strip(images, np.isin(images.frame_of, frames) & images.is_posed)
 

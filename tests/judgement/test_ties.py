@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs
+from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs, rigid_groups
 
 HALF = 6
 N = 2 * HALF
@@ -31,7 +31,8 @@ def found(*crossing, agreeing=(), contradicting=(), known=(), inside=None, misse
     points = halves() if inside is None else inside
     rays = rays_of(*points, *crossing, misses=[len(points) + k for k in misses], **more)
     sides = (np.array(side, dtype=int).reshape(-1, 2) for side in (agreeing, contradicting))
-    return find_groups(N, rays, links_of_pairs(*sides), np.array(known, dtype=int).reshape(-1, 2))
+    group = rigid_groups(N, rays, np.array(known, dtype=int).reshape(-1, 2))
+    return find_groups(group, rays, links_of_pairs(*sides))
 
 
 FROM_BOTH = (0, 1, 7, 8)
@@ -127,5 +128,5 @@ def test_all_points_are_asked_between_groups_that_a_share_of_them_leaves_apart()
 def test_nothing_links_nothing():
     none = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0, dtype=bool))
     links = NodeLinks(np.zeros(0, dtype=int), np.zeros((0, 2), dtype=int), np.zeros(0, dtype=bool))
-    group, groups = find_groups(3, none, links, np.zeros((0, 2), dtype=int))
+    group, groups = find_groups(rigid_groups(3, none, np.zeros((0, 2), dtype=int)), none, links)
     assert (group.tolist(), groups) == ([0, 1, 2], ())

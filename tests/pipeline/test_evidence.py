@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,8 @@ from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.checked import check_source
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import inputs_from, open_source
+from sfm_shapefit.scene.matches import KeypointMatches
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.solver.options import SolverOptions
 from tests.scenes import COURTYARD, RING, copied, edit_database
 
@@ -133,6 +136,40 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
     assert wrong.verdict.grade is Grade.DO_NOT_USE
     right = sfm_shapefit.map_database(cut(tmp_path / "right", (4, 25), (5, 24)))
     assert right.verdict.grade is Grade.GOOD
+
+
+@pytest.mark.parametrize(("same", "apart", "is_lost"), [(20, 10, False), (20, 11, True), (20, 0, False)])
+def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_points(same, apart, is_lost):
+    """Two groups of two images; images 1 and 2 share points, and match some of their own."""
+    total = same + 2 * apart
+    seen = [(0, 1, 2)] * same + [(0, 1)] * apart + [(2, 3)] * apart
+    keypoint = np.array([*range(same + apart), *range(same, same + apart)])
+    points = Points(
+        xyz=np.zeros((total, 3)),
+        offsets=np.cumsum([0, *map(len, seen)]),
+        images=np.concatenate(seen),
+        keypoints=np.repeat(keypoint, [len(one) for one in seen]),
+        ids=np.arange(total),
+    )
+    own = np.tile(np.arange(same + apart)[:, None], 2)
+    matches = KeypointMatches(pairs=np.array([[1, 2]]), offsets=np.array([0, same + apart]), keypoints=own)
+    view = SimpleNamespace(
+        pairs=np.array([[0, 1], [1, 2]]),
+        num_keypoints=np.full(4, same + apart),
+        links=lambda **_: [matches],
+    )
+    images = SimpleNamespace(is_posed=np.ones(4, dtype=bool), num_images=4)
+    pictures = SimpleNamespace(count=lambda _: same + apart)
+    structure = evidence.Structure(points, images, pictures)
+    fits, group = np.ones(len(points.images), dtype=bool), np.array([0, 0, 1, 1])
+    lost = evidence._are_lost(view, structure, fits, group)
+    assert lost.tolist() == [is_lost] * same + [False] * 2 * apart
+    assert not evidence._are_lost(view, structure, fits, np.zeros(4, dtype=int)).any()
+    other = structure._replace(pictures=SimpleNamespace(count=lambda _: 1))  # keypoints of another file
+    assert not evidence._are_lost(view, other, fits, group).any()
+    again = replace(matches, keypoints=own[:same], offsets=np.array([0, same]))
+    view.links = lambda **_: [matches, again]  # a pair all of whose matches see the same
+    assert not evidence._are_lost(view, structure, fits, group).any()
 
 
 def test_halves_that_a_join_ties_are_not_doubted(tmp_path):
