@@ -120,13 +120,10 @@ def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:
 def _look_up(
     images: Images, pictures: Pictures, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
 ) -> tuple[Int32Array, npt.NDArray[np.floating], FloatArray]:
-    """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend.
-
-    Pixels are of 32 bits, as databases have them, unless these do not hold one.
-    """
+    """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
     cameras = np.searchsorted(views_of(images).images, of).astype(np.int32)
     on_plane = np.empty((len(of), 2))
-    seen: npt.NDArray[np.floating] = np.zeros((len(of), 2), dtype=np.float32)
+    seen: npt.NDArray[np.floating] = np.zeros((len(of), 2), dtype=np.float32)  # until 32 bits do not do
     ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
     for k, (begin, end) in enumerate(itertools.pairwise(ends)):
         own, lens = slice(begin, end), images.lenses[images.lens_of[k]]

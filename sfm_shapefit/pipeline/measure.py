@@ -162,14 +162,9 @@ class _Beside:
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None
         if self.errors is not None:
-            sampled = sample_direction_errors(
-                batch,
-                directions.directions,
-                directions.covariance,
-                SIGMA_PER_MEDIAN * directions.median_residual_px,
-                self._threshold_px,
-            )
-            self.errors.append(sampled[usable])
+            noise_px = SIGMA_PER_MEDIAN * directions.median_residual_px
+            given = batch, directions.directions, directions.covariance, noise_px, self._threshold_px
+            self.errors.append(sample_direction_errors(*given)[usable])
 
     def facts_per_match(self) -> float:
         """Return what `Evidence` says: a track of k keypoints, each in k - 1 pairs, gives 2 k - 3 facts."""
