@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.adjustment.views import CUBE, views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray
@@ -67,21 +68,16 @@ def collect_matches(
     for first in range(0, end, _MATCHES_A_SLICE):
         numbers = room[first : min(first + _MATCHES_A_SLICE, end)]
         numbers[:] = row_of[numbers] - 1
-    taken, keypoints = _images_of(np.flatnonzero(is_matched), begins)
+    del row_of
+    parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
+    taken, keypoints = (
+        np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts]),
+        np.concatenate(parts),
+    )
     cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
     return MatchedKeypoints(
-        cameras=cameras.astype(np.int32),
-        keypoints=keypoints,
-        pixels=pixels,
-        on_plane=on_plane,
-        matches=room[:end],
+        cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]
     )
-
-
-def _images_of(numbers: IntArray, begins: IntArray) -> tuple[Int32Array, Int32Array]:
-    """Return the image of each keypoint, and which of its keypoints it is; image i begins at begins[i]."""
-    images = np.searchsorted(begins, numbers, side="right") - 1
-    return images.astype(np.int32), (numbers - begins[images]).astype(np.int32)
 
 
 def collect_tracks(images: Images, pictures: Pictures, points: Points) -> ObservedTracks:
@@ -91,9 +87,9 @@ def collect_tracks(images: Images, pictures: Pictures, points: Points) -> Observ
     back = np.argsort(points.points_seen()[order], kind="stable")
     return ObservedTracks(
         offsets=points.offsets,
-        cameras=cameras[back],
+        cameras=cameras[back].astype(np.int64),
         keypoints=points.keypoints[order][back],
-        pixels=pixels[back],
+        pixels=pixels[back].astype(np.float64),
         on_plane=on_plane[back],
         ids=points.ids,
         may_split=False,
@@ -117,27 +113,31 @@ def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:
     lens, on_plane = images.lens_of[views_of(images).images][links.cameras], links.on_plane.copy()
     for k in np.flatnonzero(changed).tolist():
         rows = np.flatnonzero(lens == k)
-        on_plane[rows] = images.lenses[k].undistort(links.pixels[rows])
+        on_plane[rows] = images.lenses[k].undistort(links.pixels[rows].astype(np.float64))
     return replace(links, on_plane=on_plane)
 
 
 def _look_up(
     images: Images, pictures: Pictures, of: IntArray | Int32Array, keypoints: IntArray | Int32Array
-) -> tuple[IntArray, FloatArray, FloatArray]:
+) -> tuple[Int32Array, npt.NDArray[np.floating], FloatArray]:
     """Return camera, pixels (m, 2) and x/z, y/z (m, 2) of keypoints; the images that they are `of` ascend."""
-    cameras = np.searchsorted(views_of(images).images, of)
-    seen, on_plane = np.empty((len(of), 2)), np.empty((len(of), 2))
+    cameras = np.searchsorted(views_of(images).images, of).astype(np.int32)
+    on_plane = np.empty((len(of), 2))
+    seen: npt.NDArray[np.floating] = np.zeros((len(of), 2), dtype=np.float32)  # until 32 bits do not do
     ends = np.searchsorted(of, np.arange(images.num_images + 1)).tolist()
     for k, (begin, end) in enumerate(itertools.pairwise(ends)):
         own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
         pixels = pictures.pixels(k, keypoints[own])
         rays = pictures.rays(k, pixels)
         if lens.is_adjustable:
-            seen[own], on_plane[own] = pixels, rays[:, :2] / rays[:, 2:]
-            continue
-        view = np.argmax(rays @ CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
-        local = np.einsum("mab,mb->ma", CUBE[view], rays)
-        on_plane[own] = local[:, :2] / local[:, 2:]
-        seen[own] = lens.focal_px * on_plane[own]
-        cameras[own] += view
+            on_plane[own] = rays[:, :2] / rays[:, 2:]
+        else:
+            view = np.argmax(rays @ CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
+            local = np.einsum("mab,mb->ma", CUBE[view], rays)
+            on_plane[own] = local[:, :2] / local[:, 2:]
+            pixels = lens.focal_px * on_plane[own]
+            cameras[own] += view
+        if not np.array_equal(pixels.astype(seen.dtype), pixels, equal_nan=True):
+            seen = seen.astype(np.float64)
+        seen[own] = pixels
     return cameras, seen, on_plane

@@ -65,17 +65,9 @@ def sample_direction_errors(
 
 @kernel
 def _add_scores(
-    pairs: Any,
-    offsets: Any,
-    keypoints: Any,
-    rays_i: Any,
-    rays_j: Any,
-    pixel_angles: Any,
-    has_direction: Any,
-    directions: Any,
-    threshold_px: float,
-    scores: Any,
-) -> None:
+    pairs: Any, offsets: Any, keypoints: Any, rays_i: Any, rays_j: Any, pixel_angles: Any,
+    has_direction: Any, directions: Any, threshold_px: float, scores: Any,
+) -> None:  # fmt: skip
     """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
     a, b, normal = np.empty(3), np.empty(3), np.empty(3)
     across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)

@@ -111,19 +111,13 @@ def leave_one_out(
     counts, figures = np.zeros(n, dtype=np.int64), np.full((n, 4), np.nan)
     arrays = *(frozen(np.ascontiguousarray(array)) for array in given), counts, figures
 
-    def run(begin: int, end: int) -> None:
-        fit_images(begin, end, *arrays)
-
-    if asked is not None:
-        for k in np.flatnonzero(asked).tolist():
-            run(k, k + 1)
-    elif threads <= 1:
+    rows = np.arange(n) if asked is None else np.flatnonzero(asked)
+    if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
-        run(0, n)
+        fit_images(rows, *arrays)
     else:
-        cuts = [n * share // threads for share in range(threads + 1)]
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, cuts[:-1], cuts[1:]))
+            list(pool.map(lambda own: fit_images(own, *arrays), np.array_split(rows, threads)))
     return LeftOut(counts, *figures.T)
 
 
@@ -132,18 +126,22 @@ def _look(points: Points, images: Images, pictures: Pictures) -> tuple[Points, F
 
     Rays are of length 1 and in camera axes; a place (o, 2) is that in a picture of focal length 1.
     """
-    rays = np.zeros((len(points.images), 3))
+    rays, places = np.zeros((len(points.images), 3)), np.zeros((len(points.images), 2))
+    angular = _are_angular(images)
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
-        if len(rows):
-            rays[rows] = pictures.rays(k, pictures.pixels(k, points.keypoints[rows]))
+        if not len(rows):
+            continue
+        own = normalized(pictures.rays(k, pictures.pixels(k, points.keypoints[rows])))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stretch = 1.0 / own[:, 2]
+            if angular[k]:
+                across = np.hypot(own[:, 0], own[:, 1])
+                stretch = np.where(across > 0.0, np.arctan2(across, own[:, 2]) / across, 1.0)
+            rays[rows], places[rows] = own, own[:, :2] * stretch[:, None]
     has_ray = np.asarray(np.isfinite(rays).all(axis=1))
-    points, rays = points.taken(has_ray), normalized(rays[has_ray])
-    across = np.hypot(rays[:, 0], rays[:, 1])
-    angles = np.arctan2(across, rays[:, 2])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_tangent, by_angle = 1.0 / rays[:, 2], np.where(across > 0.0, angles / across, 1.0)
-        stretch = np.where(_are_angular(images)[points.images], by_angle, by_tangent)
-        return points, rays, rays[:, :2] * stretch[:, None]
+    if has_ray.all():
+        return points, rays, places
+    return points.taken(has_ray), rays[has_ray], places[has_ray]
 
 
 def _are_angular(images: Images) -> BoolArray:
@@ -154,23 +152,22 @@ def _are_angular(images: Images) -> BoolArray:
 
 @kernel
 def fit_images(
-    begin: int, end: int, xyz: Any, offsets: Any, image_of: Any, point_of: Any, rays: Any, on_plane: Any,
+    rows: Any, xyz: Any, offsets: Any, image_of: Any, point_of: Any, rays: Any, on_plane: Any,
     order: Any, begins: Any, rotations: Any, centers: Any, focal_px: Any, angular: Any, believed: Any,
     counts: Any, figures: Any,
 ) -> None:  # fmt: skip
-    """Fill counts and figures of the images begin..end-1 by the points as the others make them."""
+    """Fill counts and figures of some images by the points as the others make them."""
     held, seen = np.empty((_MOST_OBSERVATIONS, 3)), np.empty((_MOST_OBSERVATIONS, 2))
     spread, lines = np.empty((_MOST_OBSERVATIONS, 6)), np.empty((_MOST_OBSERVATIONS, 2, 8))
     squares, work = np.empty(_MOST_OBSERVATIONS), np.empty(_MOST_OBSERVATIONS)
     system, rotation, total, basis = np.empty((8, 8)), np.empty((3, 3)), np.empty(9), np.empty((2, 3))
-    for i in range(begin, end):
+    for i in rows:
         size = begins[i + 1] - begins[i]
         taken, count = min(size, _MOST_OBSERVATIONS), 0
         for k in range(taken):
             row = order[begins[i] + k * size // taken]
             x = point_of[row]
-            for c in range(9):
-                total[c] = 0.0
+            total[:] = 0.0
             for o in range(offsets[x], offsets[x + 1]):
                 other = image_of[o]
                 if other != i and believed[other]:
@@ -181,9 +178,7 @@ def fit_images(
                 seen[count, 0], seen[count, 1] = on_plane[row, 0], on_plane[row, 1]
                 count += 1
         counts[i] = count
-        for a in range(3):
-            for b in range(3):
-                rotation[a, b] = rotations[i, a, b]
+        rotation[:] = rotations[i]
         if count >= FEWEST_POINTS:
             _fit_image(
                 held, seen, spread, count, rotation, focal_px[i], angular[i], lines, squares, work, system,
@@ -267,9 +262,7 @@ def _fill_system(
     S is the unit matrix and the covariance of a point in the pixels. Points behind the image have no part;
     0 if they are half of all or more.
     """
-    for row in range(8):
-        for column in range(8):
-            system[row, column] = 0.0
+    system[:] = 0.0
     factor, ahead = np.exp(log_factor), 0
     for k in range(count):
         if _linearize(held[k], seen[k], rotation, t, factor, focal_px, angular, lines[ahead]):
@@ -337,16 +330,9 @@ def _whiten(spread: Any, rotation: Any, lines: Any) -> float:
     v1 = b[3] * r[0, 1] + b[4] * r[1, 1] + b[5] * r[2, 1]
     v2 = b[3] * r[0, 2] + b[4] * r[1, 2] + b[5] * r[2, 2]
     c = spread
-    q0, q1, q2 = (
-        c[0] * u0 + c[1] * u1 + c[2] * u2,
-        c[1] * u0 + c[3] * u1 + c[4] * u2,
-        c[2] * u0 + c[4] * u1 + c[5] * u2,
-    )
-    p0, p1, p2 = (
-        c[0] * v0 + c[1] * v1 + c[2] * v2,
-        c[1] * v0 + c[3] * v1 + c[4] * v2,
-        c[2] * v0 + c[4] * v1 + c[5] * v2,
-    )
+    q0, q1 = c[0] * u0 + c[1] * u1 + c[2] * u2, c[1] * u0 + c[3] * u1 + c[4] * u2
+    p0, p1 = c[0] * v0 + c[1] * v1 + c[2] * v2, c[1] * v0 + c[3] * v1 + c[4] * v2
+    q2, p2 = c[2] * u0 + c[4] * u1 + c[5] * u2, c[2] * v0 + c[4] * v1 + c[5] * v2
     s00, s01 = 1.0 + u0 * q0 + u1 * q1 + u2 * q2, v0 * q0 + v1 * q1 + v2 * q2
     s11 = 1.0 + v0 * p0 + v1 * p1 + v2 * p2
     first = np.sqrt(s00)

@@ -60,8 +60,12 @@ def find_other_places(
         return ()
     ends, rows = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(ends, kind="stable")
+    cameras, begins = np.unique(ends[order], return_index=True)
     found = []
-    for camera, own in zip(*_split(ends[order], rows[order]), strict=True):
+    for camera, own in zip(cameras.tolist(), np.split(rows[order], begins[1:]), strict=True):
+        num_right = int(agrees[own].sum())
+        if len(own) - num_right < max(FEWEST_ALIKE, HALF * (1.0 - HALF) * num_right):
+            continue  # even if all that are wrong met in one place
         signs = np.where(pairs[own, 0] == camera, 1.0, -1.0)[:, None]
         others = np.where(pairs[own, 0] == camera, pairs[own, 1], pairs[own, 0])
         sides = (agrees[own], ~agrees[own])
@@ -69,18 +73,11 @@ def find_other_places(
         there, place = wrong.best_place(near_deg)
         both = right.pass_at(place[None], near_deg)[0]
         agreeing, shared = len(both), int(both.sum())
-        is_other = there >= max(FEWEST_ALIKE, HALF * (agreeing - shared))
-        is_other &= shared <= HALF * agreeing
-        if is_other:
+        is_enough = there >= max(FEWEST_ALIKE, HALF * (agreeing - shared))
+        if is_enough and shared <= HALF * agreeing:
             here = pairs[own[agrees[own]][~both]]
-            found.append(OtherPlace(int(camera), len(here), there, place - centers[camera], here))
+            found.append(OtherPlace(camera, len(here), there, place - centers[camera], here))
     return tuple(found)
-
-
-def _split(labels: IntArray, rows: IntArray) -> tuple[IntArray, list[IntArray]]:
-    """Return the labels that there are, ascending, and the rows of each."""
-    names, begins = np.unique(labels, return_index=True)
-    return names, np.split(rows, begins[1:])
 
 
 class _Rays(NamedTuple):

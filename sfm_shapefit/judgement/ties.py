@@ -18,11 +18,12 @@ camera has them all, it is loose: nothing says how it stands.
 `scripts/results/verdict.md` has halves of scenes that few pairs tie.
 """
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray, distinct, rows_taken
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct, rows_taken, sum_by
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
@@ -31,6 +32,7 @@ from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBER
 _BY_POINTS = (FEWEST_POINTS, FEWEST_POINTS, 1.0 / OUTNUMBERED)
 _BY_PAIRS = (FEWEST_ALIKE, FEWEST_ALIKE - 1, OUTNUMBERED)
 _MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
+_LINKS_A_BLOCK = 500_000  # links that are counted at a time: 50 MB
 _UNKNOWNS = 7  # numbers; turn, shift and scale: fewer facts leave some of them open
 _PAIR_SAYS, _POINT_SAYS = 5, 2  # numbers; see the header
 
@@ -86,6 +88,12 @@ class Rays(NamedTuple):
             fits.append(self.fits[there] & self.fits[there + step])
         return NodeLinks(np.concatenate(ids), np.concatenate(ends), np.concatenate(fits))
 
+    def blocks(self) -> Iterator[NodeLinks]:
+        """Yield the links of some points at a time."""
+        rays = np.bincount(self.points)
+        block = (np.cumsum(rays * (rays - 1) // 2) // _LINKS_A_BLOCK)[self.points]
+        return (rows_taken(self, block == number).links() for number in np.unique(block).tolist())
+
 
 def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
     """Return the links by pairs (., 2) of nodes that agree, and that contradict."""
@@ -136,8 +144,10 @@ def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     """
     rays, group = _of_three(rays), np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1
-    strong = _tied(group, rows_taken(rays, rays.points % step == 0).links(), *_BY_POINTS)[0]
-    strong = np.unique(np.sort(np.concatenate([strong, known]), axis=1), axis=0)
+    names, fitting, missing = _count(group, rows_taken(rays, rays.points % step == 0).blocks())
+    names = names[(fitting >= FEWEST_POINTS) & (missing <= _BY_POINTS[2] * fitting)]
+    strong = np.concatenate([np.column_stack(np.divmod(names, count)), known])
+    strong = np.unique(np.sort(strong, axis=1), axis=0)
     if len(strong):
         piece = parallel_rigid_pieces(count, strong, 3)
         order = np.argsort(-piece, kind="stable")  # a node of several pieces is in the largest
@@ -184,7 +194,7 @@ def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
 
 def _tied(
     group: IntArray, links: NodeLinks, least: int, spare: int, most_missing: float
-) -> tuple[IntArray, IntArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return the pairs of groups (p, 2) that links tie, of the groups of nodes (n,), and how many fit (p,).
 
     Args:
@@ -194,24 +204,38 @@ def _tied(
         spare: of these, without those of any one node of a group of several; a point counts for each.
         most_missing: links that do not fit, for each that does.
     """
-    across = group[links.ends[:, 0]] != group[links.ends[:, 1]]
-    ids, ends, fits = links.ids[across], links.ends[across], links.fits[across]
-    swapped = group[ends[:, 0]] > group[ends[:, 1]]
-    ends[swapped] = ends[swapped, ::-1]
-    count, span, sizes = len(group), int(ids.max(initial=0)) + 1, np.bincount(group, minlength=len(group))
-    names, pair = np.unique(group[ends] @ np.array([count, 1]), return_inverse=True)
-    both = np.column_stack(np.divmod(names, count))
-    number, missing = (
-        np.bincount(distinct(pair[rows] * span + ids[rows]) // span, minlength=len(names))
-        for rows in (slice(None), ~fits)
-    )
-    enough = (number - missing >= least) & (missing <= most_missing * (number - missing))
+    names, fitting, missing = _count(group, [links])
+    enough = (fitting >= least) & (missing <= most_missing * fitting)
+    both, sizes = np.column_stack(np.divmod(names, len(group))), np.bincount(group, minlength=len(group))
+    across = rows_taken(links, links.fits & (group[links.ends[:, 0]] != group[links.ends[:, 1]]))
+    ends = np.take_along_axis(across.ends, np.argsort(group[across.ends], axis=1), axis=1)
     for side in range(2):
         if (several := sizes[both[:, side]] > 1).any():
-            seen = distinct((pair[fits] * count + ends[fits, side]) * span + ids[fits]) // span
+            pair = np.searchsorted(names, group[ends] @ np.array([len(group), 1]))
+            span = int(across.ids.max(initial=0)) + 1
+            seen = distinct((pair * len(group) + ends[:, side]) * span + across.ids) // span
             nodes, counts = np.unique(seen, return_counts=True)
             total, most = np.zeros((2, len(names)))
-            np.add.at(total, nodes // count, counts)
-            np.maximum.at(most, nodes // count, counts)
+            np.add.at(total, nodes // len(group), counts)
+            np.maximum.at(most, nodes // len(group), counts)
             enough &= ~several | (total - most >= spare)
-    return both[enough], (number - missing)[enough]
+    return both[enough], fitting[enough]
+
+
+def _count(group: IntArray, blocks: Iterable[NodeLinks]) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the pairs (p,) of groups that links cross, ascending, and how many fit and miss of each, (p,).
+
+    A pair of groups is one number. Links of a point are in one block; it misses where one of them does.
+    """
+    tables = [np.zeros((3, 0))]
+    for links in blocks:
+        ends, span = np.sort(group[links.ends], axis=1), int(links.ids.max(initial=0)) + 1
+        pair = np.where(ends[:, 0] != ends[:, 1], ends @ np.array([len(group), 1]), -1)
+        keys = distinct((pair * span + links.ids) * 2 + links.fits)
+        keys = keys[np.append(True, keys[1:] >> 1 != keys[:-1] >> 1)[: len(keys)] & (keys >= 0)]
+        names, row = np.unique(keys // (2 * span), return_inverse=True)
+        tables.append(np.stack([names, np.bincount(row, keys % 2), np.bincount(row, 1 - keys % 2)]))
+    table = np.concatenate(tables, axis=1)
+    names, row = np.unique(table[0].astype(np.int64), return_inverse=True)
+    counts = sum_by(row, table[1:].T, len(names))
+    return names, counts[:, 0], counts[:, 1]

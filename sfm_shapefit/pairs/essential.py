@@ -36,12 +36,12 @@ RelativeSource = Literal["matches", "stored"]
 _TRIAL_MATCHES = 60  # matches per trial; the essential matrix is a start, all matches refine it
 _LEAST_TRIALS = 10  # trials of a pair; matches in agreement need no more
 _MOST_TRIALS = 50  # trials of a pair; bounds the time where no pose fits
-MANY_PAIRS = 20_000
-"""Pairs of a database above which each has fewer trials.
+_MANY_PAIRS, _MANY_PAIRS_OF_AN_IMAGE = 20_000, 50
+"""Pairs of a database, and pairs of an image on average, above either of which each has fewer trials.
 
-Images then have many pairs each, and the averaging can do without the one right pair of 30 to 60 that is
-missed: scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's own confidence and multiplier
-(0.9999 and 3) try nearly every pair 50 times.
+Averaging can do without the one right pair of 30 to 60 that is missed then:
+scripts/results/notes.md#relative-rotations-of-pairs. Below, pycolmap's own confidence and multiplier (0.9999
+and 3) try nearly every pair 50 times.
 """
 _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
@@ -61,12 +61,17 @@ class LikelyPoses(NamedTuple):
     """(k,) mean robust weights; a pose near the likely one that reaches it needs no trial."""
 
 
+def have_many_pairs(num_images: int, num_pairs: int) -> bool:
+    """Return whether images have so many pairs that averaging can do without some of the right ones."""
+    return num_pairs > min(_MANY_PAIRS, 0.5 * _MANY_PAIRS_OF_AN_IMAGE * num_images)
+
+
 def estimate_relative_rotations(
     batch: RayMatches,
     threads: int = 1,
     advance: Callable[[int], None] | None = None,
     *,
-    num_pairs: int = 0,
+    are_many: bool = False,
     likely: LikelyPoses | None = None,
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that has one, in the order of pairs.
@@ -77,7 +82,7 @@ def estimate_relative_rotations(
         batch: rays in camera axes, that is, of a model whose rotations are the identity.
         threads: number of threads to share the pairs among; the answer does not depend on it.
         advance: called with the number of pairs that are done, each time some are.
-        num_pairs: pairs of the whole database; if many, each is tried less often.
+        are_many: whether images have so many pairs that each is tried less often; see `have_many_pairs`.
         likely: poses of the batch's pairs. Where the matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
@@ -86,7 +91,7 @@ def estimate_relative_rotations(
         # Where memory is short, Python waits for ever for a thread that could not begin.
         share_out = map if threads <= 1 else stack.enter_context(ThreadPoolExecutor(threads)).map
         parts = []
-        for part in share_out(partial(_estimate_slice, batch, num_pairs, likely), firsts):
+        for part in share_out(partial(_estimate_slice, batch, are_many, likely), firsts):
             parts.append(part)
             if advance is not None:
                 advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
@@ -162,7 +167,7 @@ def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotatio
 
 
 def _estimate_slice(
-    batch: RayMatches, num_pairs: int, likely: LikelyPoses | None, first: int
+    batch: RayMatches, are_many: bool, likely: LikelyPoses | None, first: int
 ) -> RelativeRotations:
     """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
     pairs = np.arange(first, min(first + _PAIRS_PER_SLICE, len(batch.pairs)))
@@ -176,7 +181,7 @@ def _estimate_slice(
         estimates, places = [near.subset(fits)], [likely_pairs[fits]]
         pairs = np.setdiff1d(pairs, likely_pairs[fits])
     matches = batch.rays_of(pairs)
-    has_pose, rotations, translations = _start_by_trials(matches, num_pairs)
+    has_pose, rotations, translations = _start_by_trials(matches, are_many)
     estimates.append(_refine(matches, rotations, translations).subset(has_pose))
     places.append(pairs[has_pose])
     return concatenate_rotations(estimates).subset(np.argsort(np.concatenate(places)))
@@ -197,7 +202,7 @@ def _refine(
     )
 
 
-def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, FloatArray, FloatArray]:
+def _start_by_trials(matches: RayMatches, are_many: bool) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return which pairs got a pose, (k,), their rotations (k, 3, 3) and unit translations (k, 3)."""
     k, tried = len(matches.pairs), matches.thinned(_TRIAL_MATCHES)
     rotations, translations = np.full((k, 3, 3), np.nan), np.full((k, 3), np.nan)
@@ -205,7 +210,7 @@ def _start_by_trials(matches: RayMatches, num_pairs: int) -> tuple[BoolArray, Fl
     pixels = [np.asarray(camera.img_from_cam(rays)) for rays in (tried.rays_i, tried.rays_j)]
     options = pycolmap.RANSACOptions()
     options.min_num_trials, options.max_num_trials, options.random_seed = _LEAST_TRIALS, _MOST_TRIALS, 0
-    if num_pairs > MANY_PAIRS:
+    if are_many:
         options.mergedict(_FEWER_TRIALS)
     for p in range(k):
         options.max_error = _INLIER_PX * float(matches.pixel_angles[p])

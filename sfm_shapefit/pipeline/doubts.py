@@ -12,10 +12,10 @@ from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.pairs.essential import (
-    MANY_PAIRS,
     LikelyPoses,
     concatenate_rotations,
     estimate_relative_rotations,
+    have_many_pairs,
 )
 from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -62,16 +62,16 @@ def ask_pairs(
         asked = asked[~source.fixed[asked].all(axis=1)]
     if among is not None:
         asked = asked[np.isin(asked, among).all(axis=1)]
-    given = directions if len(directions.pairs) > MANY_PAIRS else None
-    return _ask(source, asked, threads, len(directions.pairs), given)
+    are_many = have_many_pairs(source.images.num_images, len(directions.pairs))
+    return _ask(source, asked, threads, directions if are_many else None)
 
 
 def _ask(
-    source: MatchSource, asked: IntArray, threads: int, num_pairs: int, given: PairDirections | None = None
+    source: MatchSource, asked: IntArray, threads: int, given: PairDirections | None = None
 ) -> RelativeRotations:
     """Return the relative rotations of the asked pairs (k, 2); the matches of others are not looked at.
 
-    What pairs say alone, or else the `given` directions, is tried first.
+    What pairs say alone, or else the `given` directions, those of many pairs, is tried first.
     """
     parts = []
     for batch in source.view.of_pairs(asked):
@@ -80,7 +80,7 @@ def _ask(
         if likely is None and given is not None:
             rows = np.flatnonzero(is_among(given.pairs, rays.pairs))  # both ascend
             likely = _poses_as_given(source.images, given, rows)
-        parts.append(estimate_relative_rotations(rays, threads, num_pairs=num_pairs, likely=likely))
+        parts.append(estimate_relative_rotations(rays, threads, are_many=given is not None, likely=likely))
     return concatenate_rotations(parts)
 
 
@@ -109,7 +109,7 @@ def _poses_alone(alone: RelativeRotations | None, pairs: IntArray) -> LikelyPose
 
 def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
     """Return the relative rotations that the matches of some pairs (k, 2) have by themselves."""
-    return _ask(source, pairs, threads, len(np.unique(pairs, axis=0)))
+    return _ask(source, pairs, threads)
 
 
 def doubt_cameras(

@@ -162,20 +162,16 @@ class _Beside:
         if self._num_usable > _MAX_SAMPLED_PAIRS:
             self.errors = None
         if self.errors is not None:
-            sampled = sample_direction_errors(
-                batch,
-                directions.directions,
-                directions.covariance,
-                SIGMA_PER_MEDIAN * directions.median_residual_px,
-                self._threshold_px,
-            )
-            self.errors.append(sampled[usable])
+            noise_px = SIGMA_PER_MEDIAN * directions.median_residual_px
+            given = batch, directions.directions, directions.covariance, noise_px, self._threshold_px
+            self.errors.append(sample_direction_errors(*given)[usable])
 
     def facts_per_match(self) -> float:
         """Return what `Evidence` says: a track of k keypoints, each in k - 1 pairs, gives 2 k - 3 facts."""
-        counts = self._num_pairs_of[self._num_pairs_of > 0].astype(np.float64)
-        facts = np.sum((2.0 * counts - 1.0) / (counts + 1.0))
-        return min(1.0, float(facts / max(0.5 * np.sum(counts), 1.0)))
+        counts, numbers = np.unique(self._num_pairs_of[self._num_pairs_of > 0], return_counts=True)
+        counts = counts.astype(np.float64)
+        facts = numbers @ ((2.0 * counts - 1.0) / (counts + 1.0))
+        return min(1.0, float(facts / max(0.5 * (numbers @ counts), 1.0)))
 
 
 def view_graph(images: Images, directions: PairDirections) -> ViewGraph:

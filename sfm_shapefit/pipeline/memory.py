@@ -28,7 +28,7 @@ from sfm_shapefit.solver.solve import choose_method, plan_factor
 _MB = 1e6  # bytes; as users count them
 _STARTED_BYTES = 195e6  # bytes; the interpreter with all that `locate` imports
 _KERNELS_BYTES = 50e6  # bytes; compiled code, thread pools, pages of the database
-_READ_BYTES, _MODEL_BYTES, _COLOR_BYTES = 95.0, 55.0, 8.0
+_READ_BYTES, _MODEL_BYTES, _COLOR_BYTES = 75.0, 55.0, 8.0
 """Bytes of a keypoint of the input: while it is read, afterwards, and once only its point's color is left."""
 _SAMPLES = 96  # samples of each direction's error; two numbers each, see `judgement.correlated_errors`
 _BLOCK = 9  # entries of a block of the factor; three coordinates by three
@@ -211,7 +211,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     is_kept = economy.reading.keeps and work.num_matches <= KEPT_MATCHES
     kept = 80.0 * work.num_matches if is_kept else 0.0
     peaks["placing"] = throughout + kept + solving + samples + moved + factor + 0.5 * batch
-    tracks = 80.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
+    tracks = 44.0 * work.num_keypoints + MATCH_BYTES * work.num_matches + 0.5 * batch  # and the seed
     if work.num_matches > MOST_BESIDE_TRACKS:
         tracks -= in_memory
     seeded = throughout + kept + 300.0 * work.num_edges + tracks

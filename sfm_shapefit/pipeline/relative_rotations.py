@@ -16,11 +16,11 @@ from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
-    MANY_PAIRS,
     LikelyPoses,
     RelativeSource,
     concatenate_rotations,
     estimate_relative_rotations,
+    have_many_pairs,
     stored_relative_rotations,
 )
 from sfm_shapefit.pairs.estimate import estimate_directions
@@ -124,12 +124,13 @@ def measure_rotations(
         WorkerError: if a worker died and the executor does not replace it.
     """
     sharing = sharing or Sharing()
-    estimate = partial(estimate_relative_rotations, num_pairs=view.num_pairs)
-    if view.num_pairs > MANY_PAIRS:
+    are_many = have_many_pairs(view.images.num_images, view.num_pairs)
+    estimate = partial(estimate_relative_rotations, are_many=are_many)
+    if are_many:
         some = estimate_here(view, estimate, sharing, min_matches, without=_all_but_some(view))
         averaged = average_relative_rotations(view.images.num_images, some, sharing.threads)
         known = np.where(averaged.registered[:, None, None], averaged.rotations, np.nan)
-        estimate = partial(estimate_near, num_pairs=view.num_pairs, rotations=known)
+        estimate = partial(estimate_near, are_many=are_many, rotations=known)
     if sharing.executor is None:
         return estimate_here(view, estimate, sharing, min_matches)
     work = PairWork(estimate=estimate, min_matches=min_matches, matches_per_task=_MATCHES_PER_TASK)
@@ -141,7 +142,7 @@ def estimate_near(
     threads: int = 1,
     advance: Callable[[int], None] | None = None,
     *,
-    num_pairs: int,
+    are_many: bool,
     rotations: FloatArray,
 ) -> RelativeRotations:
     """Return the relative rotations of pairs, near those of rotations (n, 3, 3) where the matches fit there.
@@ -150,13 +151,9 @@ def estimate_near(
     """
     (i, j), known = batch.pairs.T, np.nan_to_num(rotations)
     turns = np.repeat(known[batch.pairs], np.diff(batch.offsets), axis=0)
-    rays = [np.einsum("mba,mb->ma", turns[:, k], own) for k, own in enumerate((batch.rays_i, batch.rays_j))]
+    u, v = (np.einsum("mba,mb->ma", turns[:, k], own) for k, own in enumerate((batch.rays_i, batch.rays_j)))
     in_world = RayMatches(
-        pairs=batch.pairs,
-        offsets=batch.offsets,
-        rays_i=rays[0],
-        rays_j=rays[1],
-        pixel_angles=batch.pixel_angles,
+        pairs=batch.pairs, offsets=batch.offsets, rays_i=u, rays_j=v, pixel_angles=batch.pixel_angles
     )
     baselines = estimate_directions(in_world, _NEAR, threads).directions
     likely = LikelyPoses(
@@ -164,7 +161,7 @@ def estimate_near(
         np.einsum("kab,kb->ka", rotations[j], baselines),
         np.full(len(batch.pairs), _LIKELY),
     )
-    return estimate_relative_rotations(batch, threads, advance, num_pairs=num_pairs, likely=likely)
+    return estimate_relative_rotations(batch, threads, advance, are_many=are_many, likely=likely)
 
 
 def _all_but_some(view: View) -> IntArray:

@@ -21,6 +21,7 @@ from sfm_shapefit.facts.warnings import rotation_suspicions, rotation_warnings
 from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
     estimate_relative_rotations,
+    have_many_pairs,
     refine_rough_rotations,
 )
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -123,7 +124,8 @@ def _measure(
 ) -> RelativeRotations:
     """Return the relative rotations of pairs, but for some of them; by trials, as `map` does, if None."""
     view = source.matches.at(source.images.apart(), source.inputs.left_out)
-    estimate = estimate or partial(estimate_relative_rotations, num_pairs=view.num_pairs)
+    are_many = have_many_pairs(view.images.num_images, view.num_pairs)
+    estimate = estimate or partial(estimate_relative_rotations, are_many=are_many)
     return estimate_here(view, estimate, Sharing(clock.threads, advance=clock.advance), without=without)
 
 

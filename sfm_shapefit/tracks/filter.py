@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.matches import batch_ranges
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
@@ -52,18 +53,18 @@ def keypoint_errors_px(
 
 def _are_wide(points: Points, centers: FloatArray, least_deg: float) -> BoolArray:
     """Return which points two of their observations see under an angle, or its supplement, of so much."""
-    rays = centers[points.images] - points.xyz[points.points_seen()]
-    with np.errstate(invalid="ignore"):
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    cosine, wide = np.cos(np.radians(least_deg)), np.zeros(points.num_points, dtype=np.bool_)
-    lengths = points.lengths()
-    for first in range(int(lengths.max(initial=1)) - 1):
-        left = np.flatnonzero(~wide & (lengths > first + 1))  # a few, after the first round
-        ends = points.offsets[left]
-        counts = lengths[left] - first - 1
-        others = np.repeat(ends + first + 1 - np.append(0, np.cumsum(counts))[:-1], counts) + np.arange(
-            counts.sum()
-        )
-        cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[ends + first], counts, axis=0), rays[others]))
-        wide[np.repeat(left, counts)[cosines <= cosine]] = True
+    wide, cosine = np.zeros(points.num_points, dtype=np.bool_), np.cos(np.radians(least_deg))
+    for begin, end in batch_ranges(points.lengths(), 100_000):  # so that few rays are held
+        offsets = points.offsets[begin : end + 1]
+        lengths, images = np.diff(offsets), points.images[offsets[0] : offsets[-1]]
+        rays = centers[images] - np.repeat(points.xyz[begin:end], lengths, axis=0)
+        with np.errstate(invalid="ignore"):
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        for first in range(int(lengths.max(initial=1)) - 1):
+            left = np.flatnonzero(~wide[begin:end] & (lengths > first + 1))  # a few, after the first round
+            own, counts = offsets[left] - offsets[0] + first, lengths[left] - first - 1
+            others = np.repeat(own + 1 - np.append(0, np.cumsum(counts))[:-1], counts)
+            ahead = rays[others + np.arange(len(others))]
+            cosines = np.abs(np.einsum("pa,pa->p", np.repeat(rays[own], counts, axis=0), ahead))
+            wide[begin + np.repeat(left, counts)[cosines <= cosine]] = True
     return wide

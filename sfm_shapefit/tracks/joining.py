@@ -10,9 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.arrays import AnyArray
 from sfm_shapefit.base.forests import root_of
 from sfm_shapefit.base.jit import inner_kernel, kernel
+
+
+@inner_kernel
+def write_ray(on_plane: Any, rotation: Any, ray: Any) -> None:
+    """Write the unit ray, in axes of the world, of a keypoint at x/z and y/z in axes of its camera."""
+    u, v = on_plane[0], on_plane[1]
+    size = np.sqrt(1.0 + u * u + v * v)
+    for a in range(3):
+        ray[a] = (u * rotation[0, a] + v * rotation[1, a] + rotation[2, a]) / size
 
 
 @inner_kernel
@@ -48,13 +57,13 @@ def _number_trees(parents: Any, order: Any, numbers: Any) -> int:
     return count
 
 
-def number_trees(parents: IntArray, order: IntArray) -> IntArray:
+def number_trees(parents: AnyArray, order: AnyArray) -> AnyArray:
     """Return the number of the tree of each node (k,), trees numbered by their first node in `order`.
 
     Args:
         parents: (k,) the forest; paths in it become shorter.
         order: (m,) nodes; those of other trees get -1.
     """
-    numbers = np.empty(len(parents), dtype=np.int64)
+    numbers: AnyArray = np.empty_like(parents)
     _number_trees(parents, order, numbers)
     return numbers

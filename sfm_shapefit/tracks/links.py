@@ -8,12 +8,11 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, Int32Array, IntArray, rows_of_parts
 from sfm_shapefit.base.forests import merge_sets
-from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.tracks.joining import number_trees, sampson_px
+from sfm_shapefit.tracks.joining import number_trees, sampson_px, write_ray
 
 # Between two slices Python can be interrupted: about 200 ms. For each all keypoints are counted.
-_MATCHES_A_SLICE, _KEYPOINTS_A_SLICE = 4_000_000, 100_000
+_MATCHES_A_SLICE = 4_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,8 +111,8 @@ class MatchedKeypoints:
     """(K,) ascending by image."""
     keypoints: Int32Array
     """(K,) which of the image's keypoints it is."""
-    pixels: FloatArray
-    """(K, 2) as the adjustment's lens takes them."""
+    pixels: npt.NDArray[np.floating]
+    """(K, 2) as the adjustment's lens takes them; of 32 bits where these hold them."""
     on_plane: FloatArray
     """(K, 2) see `ObservedTracks`."""
     matches: npt.NDArray[np.integer]
@@ -150,15 +149,15 @@ class MatchedKeypoints:
             poses: of the cameras.
             limit_px: largest Sampson error of a match that joins.
         """
-        parents = np.arange(len(self.cameras))
-        given = self._rays(poses), self.cameras, poses.centers, poses.focal_lengths_px, limit_px
+        parents = np.arange(len(self.cameras), dtype=np.int32)
+        given = self.on_plane, self.cameras, poses.rotations, poses.centers, poses.focal_lengths_px, limit_px
         for first in range(0, len(self.matches), _MATCHES_A_SLICE):
-            block = self.matches[first : first + _MATCHES_A_SLICE].astype(np.int64)
-            _join(block, *given, parents)
-        del given  # the rays
-        track = number_trees(parents, np.arange(len(parents)))
+            _join(self.matches[first : first + _MATCHES_A_SLICE], *given, parents)
+        track = number_trees(parents, np.arange(len(parents), dtype=np.int32))
+        del parents  # before what orders the keypoints, which is larger
         rows, lengths = np.argsort(track, kind="stable"), np.bincount(track)
-        rows, lengths = rows[lengths[track[rows]] > 1], lengths[lengths > 1]
+        del track
+        rows, lengths = rows[np.repeat(lengths > 1, lengths)], lengths[lengths > 1]
         return JoinedRows(np.append(0, np.cumsum(lengths)), rows)
 
     def observed(self, joined: JoinedRows) -> ObservedTracks:
@@ -168,28 +167,19 @@ class MatchedKeypoints:
             offsets=joined.offsets,
             cameras=self.cameras[rows].astype(np.int64),
             keypoints=self.keypoints[rows].astype(np.int64),
-            pixels=self.pixels[rows],
+            pixels=self.pixels[rows].astype(np.float64),
             on_plane=self.on_plane[rows],
             ids=np.arange(len(joined.offsets) - 1),
         )
 
-    def _rays(self, poses: CameraPoses) -> FloatArray:
-        """Return the unit rays (K, 3) in axes of the world."""
-        rays = np.empty((len(self.cameras), 3))
-        # The rotations of all at once would take five times what the rays do.
-        for first in range(0, len(rays), _KEYPOINTS_A_SLICE):
-            own = slice(first, first + _KEYPOINTS_A_SLICE)
-            ahead = np.concatenate([self.on_plane[own], np.ones((len(rays[own]), 1))], axis=1)
-            rays[own] = normalized(np.einsum("kba,kb->ka", poses.rotations[self.cameras[own]], ahead))
-        return rays
-
 
 @kernel
 def _join(
-    matches: Any, rays: Any, cameras: Any, centers: Any, focal_lengths_px: Any, limit_px: float, parents: Any
-) -> None:
+    matches: Any, on_plane: Any, cameras: Any, rotations: Any, centers: Any, focal_lengths_px: Any,
+    limit_px: float, parents: Any,
+) -> None:  # fmt: skip
     """Join the keypoints of the matches that agree with the poses."""
-    d = np.empty(3)
+    u, v, d = np.empty((3, 3))
     for m in range(len(matches)):
         k, other = matches[m, 0], matches[m, 1]
         i, j = cameras[k], cameras[other]
@@ -199,6 +189,8 @@ def _join(
             square += d[c] * d[c]
         for c in range(3):
             d[c] /= np.sqrt(square)
-        angle = 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])
-        if sampson_px(rays[k], rays[other], d, angle) <= limit_px:
+        # Rays are made as they are needed: to hold those of all keypoints would take the most memory.
+        write_ray(on_plane[k], rotations[i], u)
+        write_ray(on_plane[other], rotations[j], v)
+        if sampson_px(u, v, d, 2.0 / (focal_lengths_px[i] + focal_lengths_px[j])) <= limit_px:
             merge_sets(parents, k, other)

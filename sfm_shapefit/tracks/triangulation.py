@@ -23,6 +23,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.tracks.joining import write_ray
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 
 # Observations between which Python can be interrupted: about 0.1 s.
@@ -208,12 +209,9 @@ def _gather(
     """Write the observations of no point yet and their rays in axes of the world; return how many."""
     k = 0
     for row in range(first, last):
-        u, v = plane[row, 0], plane[row, 1]
-        if seen[row] != -1 or np.isnan(u + v):
+        if seen[row] != -1 or np.isnan(plane[row, 0] + plane[row, 1]):
             continue
-        rotation, size = rotations[cameras[row]], np.sqrt(1.0 + u * u + v * v)
-        for a in range(3):
-            rays[k, a] = (u * rotation[0, a] + v * rotation[1, a] + rotation[2, a]) / size
+        write_ray(plane[row], rotations[cameras[row]], rays[k])
         rows[k] = row
         k += 1
     return k

@@ -120,11 +120,11 @@ def test_a_large_set_is_judged_as_well_by_six_pairs_of_each_camera(monkeypatch, 
 def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch, angle_deg):
     tried, trials = [], relative_rotations._start_by_trials
 
-    def trying(matches, num_pairs):
+    def trying(matches, are_many):
         tried.extend(matches.pairs.tolist())
-        return trials(matches, num_pairs)
+        return trials(matches, are_many)
 
-    monkeypatch.setattr(doubts_stage, "MANY_PAIRS", 0)
+    monkeypatch.setattr(doubts_stage, "have_many_pairs", lambda *_: True)
     monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)
     chosen = (9, 10, 11, 12, 13)
     model, wrong = turned(COURTYARD, chosen, angle_deg)
@@ -137,9 +137,9 @@ def test_of_very_many_pairs_only_those_of_turned_cameras_need_trials(monkeypatch
 def test_what_pairs_said_alone_is_the_answer_again_without_trials(monkeypatch):
     tried, trials = [], relative_rotations._start_by_trials
 
-    def trying(matches, num_pairs):
+    def trying(matches, are_many):
         tried.extend(matches.pairs.tolist())
-        return trials(matches, num_pairs)
+        return trials(matches, are_many)
 
     model, _ = turned(COURTYARD, (7,), 5.0)
     images = read_model(model).images

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit.judgement import ties
 from sfm_shapefit.judgement.ties import NodeLinks, Rays, find_groups, links_of_pairs, rigid_groups
 
 HALF = 6
@@ -123,6 +124,15 @@ def test_a_chain_is_one_group_and_single_cameras_are_none():
 def test_all_points_are_asked_between_groups_that_a_share_of_them_leaves_apart():
     many = [seen for seen in halves() for _ in range(40)]
     assert len(set(found(*[FROM_BOTH] * 15, inside=many)[0])) == 1
+
+
+def test_points_are_counted_some_at_a_time_with_the_same_groups(monkeypatch):
+    crossing = [FROM_BOTH] * 16
+    at_once = found(*crossing, misses=range(7))[0]
+    monkeypatch.setattr(ties, "_LINKS_A_BLOCK", 10)
+    assert len(list(rays_of(*halves()).blocks())) > 100
+    assert np.array_equal(found(*crossing, misses=range(7))[0], at_once)
+    assert len(found(*crossing, misses=range(9))[1]) == 1
 
 
 def test_nothing_links_nothing():

@@ -14,6 +14,7 @@ from sfm_shapefit.pairs.essential import (
     LikelyPoses,
     concatenate_rotations,
     estimate_relative_rotations,
+    have_many_pairs,
     stored_relative_rotations,
 )
 from sfm_shapefit.scene.matches import MatchBatch, Reading
@@ -95,11 +96,24 @@ def test_each_of_many_pairs_is_tried_less_often_and_is_right_all_the_same():
     wrong = np.flatnonzero(rng.random(len(batch.rays_j)) < 0.3)  # 0.7^5: a trial in six is without
     batch.rays_j[wrong] = batch.rays_j[rng.permutation(wrong)]
     usual = estimate_relative_rotations(batch)
-    assert_same_bits(estimate_relative_rotations(batch, num_pairs=20_000), usual)
-    found = estimate_relative_rotations(batch, num_pairs=20_001)
+    found = estimate_relative_rotations(batch, are_many=True)
     right, before = (errors_deg(one, truth.rotations) < 5.0 for one in (found, usual))
     assert right.sum() > 0.97 * before.sum()
     assert (found.rotations != usual.rotations).any()  # else no trial was saved
+
+
+@pytest.mark.parametrize(
+    ("num_images", "num_pairs", "are_many"),
+    [
+        (10_000, 20_000, False),
+        (10_000, 20_001, True),
+        (363, 9_075, False),
+        (363, 9_076, True),
+        (51, 1_275, False),
+    ],
+)
+def test_pairs_are_many_in_all_or_by_fifty_an_image(num_images, num_pairs, are_many):
+    assert have_many_pairs(num_images, num_pairs) == are_many
 
 
 def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_changes_no_bit(monkeypatch):
@@ -113,9 +127,9 @@ def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_ch
     translations[2::3] = np.nan
     tried, trials = [], relative_rotations._start_by_trials
 
-    def trying(matches, num_pairs):
+    def trying(matches, are_many):
         tried.extend(matches.pairs.tolist())
-        return trials(matches, num_pairs)
+        return trials(matches, are_many)
 
     without = estimate_relative_rotations(batch)
     monkeypatch.setattr(relative_rotations, "_start_by_trials", trying)

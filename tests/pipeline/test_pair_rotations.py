@@ -56,14 +56,14 @@ def test_inlier_matches_are_enough_and_without_stored_poses_none_are_found(found
 def test_of_very_many_pairs_few_are_tried_for_and_the_others_sought_near_their_average(found, monkeypatch):
     tried, by_trials = [], door._start_by_trials
 
-    def count(matches, num_pairs):
+    def count(matches, are_many):
         tried.append(len(matches.pairs))
-        return by_trials(matches, num_pairs)
+        return by_trials(matches, are_many)
 
     monkeypatch.setattr(door, "_start_by_trials", count)
     sfm_shapefit.relative_rotations(DATABASE, threads=1)
     usual, tried[:] = sum(tried), []
-    monkeypatch.setattr(module, "MANY_PAIRS", 0)
+    monkeypatch.setattr(module, "have_many_pairs", lambda *_: True)
     near = sfm_shapefit.relative_rotations(DATABASE, threads=1)
     assert sum(tried) < 0.8 * usual
     np.testing.assert_array_equal(near.pairs, found.pairs)

@@ -26,13 +26,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import IntArray, UInt64Array
+from sfm_shapefit.base.arrays import IntArray, UInt32Array, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
@@ -201,9 +201,10 @@ class _BinaryFile:
         return name
 
     def finish(self) -> None:
-        """Refuse bytes after the last record."""
+        """Refuse bytes after the last record; the others are given up."""
         if self.offset != len(self.data):
             raise self.fault(f"{len(self.data) - self.offset} bytes follow the last record; write it again")
+        self.data = b""
 
 
 class _Images(NamedTuple):
@@ -295,8 +296,9 @@ def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
 
     ids = np.empty(count, dtype=np.uint64)
     num_elements = (int(starts[-1] - starts[0]) - count * _POINT3D_BYTES) // _TRACK_ELEMENT_BYTES
-    elements = np.empty((num_elements, 2), dtype=np.int64)
+    elements = np.empty((num_elements, 2), dtype=np.uint32)
     not_finite = int(_read_points(data, starts, ids, elements))
+    del data
     if not_finite >= 0:
         raise file.fault(f"3D point {ids[not_finite]} has coordinates that are not finite")
     ids.sort()
@@ -343,7 +345,7 @@ def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> 
 
 
 @kernel
-def _read_points(data: npt.NDArray[np.uint8], starts: IntArray, ids: UInt64Array, elements: IntArray) -> int:
+def _read_points(data: Any, starts: IntArray, ids: UInt64Array, elements: UInt32Array) -> int:
     """Fill in ids and track elements; return the first point whose xyz is not finite, or -1.
 
     A double is not finite when the 11 bits of its exponent are all ones.
@@ -358,8 +360,8 @@ def _read_points(data: npt.NDArray[np.uint8], starts: IntArray, ids: UInt64Array
                 not_finite = p
         for offset in range(starts[p] + 51, starts[p + 1], 8):
             bits = _read_u64(data, offset)
-            elements[element, 0] = np.int64(bits & np.uint64(0xFFFFFFFF))
-            elements[element, 1] = np.int64(bits >> np.uint64(32))
+            elements[element, 0] = np.uint32(bits & np.uint64(0xFFFFFFFF))
+            elements[element, 1] = np.uint32(bits >> np.uint64(32))
             element += 1
     return not_finite
 

@@ -1,5 +1,6 @@
 """The door between reconstructions and `Points`, and pixels and rays of the points2D that observe them."""
 
+import itertools
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -105,18 +106,18 @@ def add_points(reconstruction: pycolmap.Reconstruction, images: Images, points: 
         images: of it, which the points' observations index.
         points: with ids that it has not.
     """
-    image_ids, keypoints = images.ids[points.images].tolist(), points.keypoints.tolist()
-    begin = 0
     errors = np.full(points.num_points, -1.0) if points.errors_px is None else points.errors_px
-    given = zip(points.ids.tolist(), points.offsets[1:].tolist(), points.xyz, errors.tolist(), strict=True)
-    for point_id, end, xyz, error in given:
+    given = zip(
+        points.ids.tolist(), itertools.pairwise(points.offsets.tolist()), points.xyz, errors, strict=True
+    )
+    for point_id, (begin, end), xyz, error in given:
         track = pycolmap.Track()
-        for image_id, keypoint in zip(image_ids[begin:end], keypoints[begin:end], strict=True):
+        ids = images.ids[points.images[begin:end]].tolist()
+        for image_id, keypoint in zip(ids, points.keypoints[begin:end].tolist(), strict=True):
             track.add_element(image_id, keypoint)  # a TrackElement for each takes four times as long
         point = pycolmap.Point3D(xyz=xyz, track=track)
         point.error = error
         reconstruction.add_point3D_with_id(point_id, point)
-        begin = end
 
 
 def move_model(
