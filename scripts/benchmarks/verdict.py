@@ -7,8 +7,8 @@ made of the same database. A ring that looks alike from two sides has a block of
 where false pairs put it, or a third of it is folded over; points are triangulated again. And one image gets
 a wrong lens of its own, or a third of them one that they share, of which `locate` is not told: it may find
 it, and its model is right then. All are judged unspoiled, too. And `map` is given databases where a few
-pairs, drawn at random, are all that is left between two halves of the images: a wrong model is not to be
-called good, nor a right one doubted.
+pairs, drawn at random, are all that is left between two halves of the images, once with position priors of
+one: a wrong model is not to be called good, nor a right one doubted.
 """
 
 import argparse
@@ -54,6 +54,8 @@ ONE_LENS, SHARED_LENS = (0.67, 0.77, 0.91, 1.1, 1.3), (0.77, 1.1)
 """Factors on the focal length of one image, and of the lens of a third of them."""
 CUTS = ((2, range(8)), (3, range(8)), (5, range(4)))
 """Pairs that are left between the halves of a scene, and seeds of which."""
+PRIOR_SHARE = 0.02
+"""Standard deviation of position priors, over the extent."""
 MOST_OFF = 0.03
 """Share of the extent by which cameras are off at most in a model that is right."""
 MOST_OTHERS = 0.1
@@ -88,20 +90,35 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         found[f"cut {name}"] = (
             partial(judge_cuts, f"cut {name}", scene) if scene.model.is_dir() else NOT_FOUND
         )
-    return found
+    name = f"cut {CUT_REAL[-1]}, priors"  # of the scene that the loop ends with
+    by_priors = partial(judge_cuts, name, scene, cuts=CUTS[1:2], prior_share=PRIOR_SHARE)
+    return found | {name: by_priors if scene.model.is_dir() else NOT_FOUND}
 
 
-def judge_cuts(name: str, scene: Scene) -> list[Row]:
-    """Judge what `map` makes of a database with few pairs between the halves of its images, by name."""
+def judge_cuts(
+    name: str,
+    scene: Scene,
+    cuts: Sequence[tuple[int, Sequence[int]]] = CUTS,
+    prior_share: float | None = None,
+) -> list[Row]:
+    """Judge what `map` makes of a database with few pairs between the halves of its images, by name.
+
+    The first half has its true positions as priors, if it is told by what share of the extent they are off.
+    """
     truth, rows = pycolmap.Reconstruction(scene.model), []
     names = sorted(truth.image(k).name for k in truth.reg_image_ids())
-    for num, seeds in CUTS:
+    centers = np.array([truth.find_image_with_name(each).projection_center() for each in names])
+    sigma = 0.0 if prior_share is None else prior_share * np.linalg.norm(np.ptp(centers, axis=0))
+    lines = [" ".join(map(str, (k, *c, *[sigma] * 3))) for k, c in zip(names, centers, strict=True)]
+    for num, seeds in cuts:
         for seed in seeds:
             with TemporaryDirectory() as folder:
                 database = Path(folder) / "database.db"
                 shutil.copy(scene.database, database)
                 cut(database, set(names[: len(names) // 2]), num, seed)
-                found = sfm_shapefit.map_database(database)
+                priors = Path(folder) / "priors.txt"
+                priors.write_text("\n".join([*lines[: len(names) // 2], ""]))
+                found = sfm_shapefit.map_database(database, priors=None if prior_share is None else priors)
             compared = sfm_shapefit.evaluate(found.reconstruction, truth)
             off, is_whole = compared.position.max / compared.extent, len(compared.names) == len(names)
             state = "wrong" if off > MOST_OFF else "right" if is_whole else "a part"

@@ -154,14 +154,25 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
     point_of[seen], fitting[seen] = points.points_seen(), fits
     for batch in view.links(without=view.pairs[~across]):
         pair = np.repeat(np.arange(len(batch.pairs)), np.diff(batch.offsets))
-        keypoints = begins[batch.pairs[pair]] + batch.keypoints
+        seen_by, keypoints = batch.pairs[pair], begins[batch.pairs[pair]] + batch.keypoints
         ends = point_of[keypoints]
-        known, same = (ends >= 0).all(axis=1), ends[:, 0] == ends[:, 1]
-        fit, miss = same & fitting[keypoints].all(axis=1), known & ~same
-        num_fit, num_missing = (np.bincount(pair[rows], minlength=len(batch.pairs)) for rows in (fit, miss))
+        same = (ends[:, 0] == ends[:, 1]) & fitting[keypoints].all(axis=1)
+        apart = (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
+        rows = np.flatnonzero(apart)
+        for own in (0, 1):  # the point of either end, where the other has its keypoint
+            one = Points(
+                xyz=points.xyz[ends[rows, own]],
+                offsets=np.arange(len(rows) + 1),
+                images=seen_by[rows, 1 - own],
+                keypoints=batch.keypoints[rows, 1 - own],
+                ids=rows,
+            )
+            rows = rows[keypoint_errors_px(one, images, structure.pictures) <= FITTING_PX]
+        apart[rows] = False
+        num_fit, num_missing = (np.bincount(pair[x], minlength=len(batch.pairs)) for x in (same, apart))
         sound = (num_fit >= OUTNUMBERED * num_missing)[pair]
-        lost[ends[fit & ~sound, 0]] = True
-        carried[ends[fit & sound, 0]] = True
+        lost[ends[same & ~sound, 0]] = True
+        carried[ends[same & sound, 0]] = True
     return lost & ~carried
 
 

@@ -139,7 +139,9 @@ def test_halves_that_two_pairs_tie_are_doubted_where_what_tied_them_was_rejected
 
 
 @pytest.mark.parametrize(("same", "apart", "is_lost"), [(20, 10, False), (20, 11, True), (20, 0, False)])
-def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_points(same, apart, is_lost):
+def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_points(
+    monkeypatch, same, apart, is_lost
+):
     """Two groups of two images; images 1 and 2 share points, and match some of their own."""
     total = same + 2 * apart
     seen = [(0, 1, 2)] * same + [(0, 1)] * apart + [(2, 3)] * apart
@@ -161,12 +163,25 @@ def test_points_are_lost_that_only_a_pair_carries_whose_matches_mostly_see_two_p
     images = SimpleNamespace(is_posed=np.ones(4, dtype=bool), num_images=4)
     pictures = SimpleNamespace(count=lambda _: same + apart)
     structure = evidence.Structure(points, images, pictures)
+    errors_px = {
+        1: 0.0,
+        2: 5.0,
+    }  # of points of the second group seen by the first, and of the first by the second
+    monkeypatch.setattr(
+        evidence,
+        "keypoint_errors_px",
+        lambda seen, *_: np.array([errors_px[k] for k in seen.images.tolist()]),
+    )
     fits, group = np.ones(len(points.images), dtype=bool), np.array([0, 0, 1, 1])
     lost = evidence._are_lost(view, structure, fits, group)
     assert lost.tolist() == [is_lost] * same + [False] * 2 * apart
     assert not evidence._are_lost(view, structure, fits, np.zeros(4, dtype=int)).any()
     other = structure._replace(pictures=SimpleNamespace(count=lambda _: 1))  # keypoints of another file
     assert not evidence._are_lost(view, other, fits, group).any()
+    errors_px[2] = 3.0  # two points, but at the same place
+    assert not evidence._are_lost(view, structure, fits, group).any()
+    errors_px[1] = 5.0
+    assert evidence._are_lost(view, structure, fits, group).any() == is_lost
     again = replace(matches, keypoints=own[:same], offsets=np.array([0, same]))
     view.links = lambda **_: [matches, again]  # a pair all of whose matches see the same
     assert not evidence._are_lost(view, structure, fits, group).any()
