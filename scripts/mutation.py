@@ -52,7 +52,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "newton": (("solver/newton/*.py",), ("newton", "exact_certificate", "solver")),
     "splitting": (("solver/splitting/*.py",), ("splitting", "certificate", "exact_certificate")),
     "program": (("solver/program.py", "solver/options.py"), ("solver", "newton")),
-    "solve": (("solver/solve.py",), ("solver", "certificate", "splitting")),
+    "solve": (("solver/solve.py",), ("solver", "certificate", "splitting", "rigid_groups")),
     "angular": (("refinement/angular.py",), ("angular",)),
     "reduction": (("solver/reduction.py", "solver/tied.py"), ("rigid_groups",)),
 }
@@ -177,10 +177,19 @@ def files_of(group: str) -> list[str]:
 
 
 def sample(group: str, count: int, seed: int) -> list[Mutant]:
-    """Return one random mutant of each of `count` random places."""
+    """Return one random mutant of each of `count` random places, but for those that are no Python."""
     rng = random.Random(f"{seed} {group}")
     places = [place for path in files_of(group) for place in mutants_of(path)]
-    return [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
+    drawn = [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
+    return [mutant for mutant in drawn if _is_python(mutant.sources()[1])]
+
+
+def _is_python(source: str) -> bool:
+    """Return whether a source can be parsed: a `/` among parameters divides nothing."""
+    with contextlib.suppress(SyntaxError):
+        ast.parse(source)
+        return True
+    return False
 
 
 def substitute(path: str, source: str) -> None:

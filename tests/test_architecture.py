@@ -85,13 +85,22 @@ MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # whic
 
 
 @cache
+def tree_of(path: Path) -> ast.Module:
+    """A module, parsed once."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports_of(path: Path, *, at_run_time: bool = False) -> frozenset[str]:
     """Dotted names of all modules that a file imports, inside functions too."""
-    tree, found = ast.parse(path.read_text(encoding="utf-8")), set()
-    for node in ast.walk(tree):
-        if at_run_time and isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            node.body = [ast.Pass()]
-    for node in ast.walk(tree):
+    nodes, found = list(ast.walk(tree_of(path))), set()
+    checked = [
+        node for node in nodes if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    ]
+    unseen = {inner for node in checked if at_run_time for part in node.body for inner in ast.walk(part)}
+    for node in nodes:
+        if node in unseen:
+            continue
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -152,7 +161,7 @@ def test_only_kernels_and_commands_have_many_parameters():
     many = {}
     for path in MODULES:
         text = path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.FunctionDef) and room_of(path) != "cli":
                 count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
                 compiled = is_kernel(node) or f"intrinsic({node.name})" in text

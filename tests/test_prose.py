@@ -8,19 +8,13 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from tests.test_architecture import MODULES, PACKAGE
+from tests.test_architecture import MODULES, PACKAGE, tree_of
 
 # The identifier would be the subject of such a sentence; the shape of an array may stand before it.
 OPENING = re.compile(
     r"(\([^)]*\) )?(Of|Those|From so many|So many|By what|The latter)\b", flags=re.IGNORECASE
 )
 PHRASE = re.compile(r"\bwhat there is\b|\bthe latter\b|\btells?(?= *(?:[.,;:)]|$))", flags=re.IGNORECASE)
-
-
-@cache
-def tree_of(path: Path) -> ast.Module:
-    """A module, parsed once."""
-    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 @cache

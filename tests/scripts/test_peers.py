@@ -19,6 +19,7 @@ from paper.peers_on_scenes import BY_DEFAULT, POSITIONING, SAME_DIRECTIONS, Answ
 from sfm_shapefit import ViewGraph, certify
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
+from tests.scripts.test_benchmarks import call_here
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
 
@@ -155,7 +156,8 @@ def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_real_scene_is_measured_with_ours_and_with_pycolmap():
+def test_a_real_scene_is_measured_with_ours_and_with_pycolmap(monkeypatch):
+    monkeypatch.setattr(on_graphs, "call", call_here)
     folder = real_scene("Herz-Jesus-P8")
     scene = SCENES[folder.name]
     positioning = next(name for name in on_scenes.contenders() if name.startswith(POSITIONING))

@@ -1,6 +1,7 @@
 """ShapeFit solved and certified: exactness, optimality, and refusals."""
 
 import importlib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,8 +95,10 @@ def test_a_bound_whose_equality_does_not_hold_is_not_called_converged_and_certif
     ):
         with pytest.raises(InputError, match=message):
             certify(graph, locations, result.dual)
-    monkeypatch.setattr(solving, "_LARGEST_RESIDUAL", 0.0)
-    assert solve(problem(16, sigma=0.05)[0]).status is Status.INACCURATE
+    for residual, status in ((1e-10, Status.CONVERGED), (1e-8, Status.INACCURATE)):
+        unbalanced = replace(certify(graph, result.locations, result.dual), equality_residual=residual)
+        monkeypatch.setattr(solving, "certify", lambda *_, found=unbalanced, **__: found)
+        assert solve(graph).status is status
 
 
 @pytest.mark.parametrize("method", ["newton", "admm", "conic"])
@@ -119,8 +122,9 @@ def test_graphs_that_determine_nothing_are_refused_with_the_reason():
         (exact_graph(t[:5], [*all_pairs(4), (0, 4)]), "not parallel rigid"),
         (ViewGraph(3, [(0, 1), (1, 2), (2, 0)], same), "cancel"),
     ):
-        with pytest.raises(UnsolvableError, match=reason):
-            solve(graph)
+        for method in ("newton", "admm", "conic"):
+            with pytest.raises(UnsolvableError, match=reason):
+                solve(graph, solver=method)
 
 
 def box(n):

@@ -18,13 +18,13 @@ def test_the_example_passes_in_a_pipelines_own_tests(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     pytester.makeconftest(CONFTEST)
     pytester.makepyfile((ROOT / "examples/test_my_pipeline.py").read_text(encoding="utf-8"))
-    pytester.runpytest_subprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
+    pytester.runpytest_inprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
 
 
 def test_the_documented_fixtures_are_those_that_there_are(pytester, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     pytester.makeconftest(CONFTEST)
-    listed = pytester.runpytest_subprocess("--fixtures", "-q").stdout.str()
+    listed = pytester.runpytest_inprocess("--fixtures", "-q").stdout.str()
     page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
     for row in (line for line in fixtures.__doc__.splitlines() if line.startswith("| `")):
         assert row in page
