@@ -181,7 +181,7 @@ def finish_piece(
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
-        hand_back_memory()  # of what was judged; to write files takes their size
+        hand_back_memory()  # freed by the judgement; the files of a model take as much
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
     found = LocateResult(
         reconstruction=reconstruction,
