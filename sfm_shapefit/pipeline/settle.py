@@ -18,7 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray, hand_back_memory
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity, median_spread
 from sfm_shapefit.base.wording import counted, first_of
@@ -181,6 +181,7 @@ def finish_piece(
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
         reconstruction = build_seed(given.template, images, seeded.points, keypoints)
+        hand_back_memory()  # freed by the judgement; the files of a model take as much
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
     found = LocateResult(
         reconstruction=reconstruction,

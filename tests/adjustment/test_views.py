@@ -216,6 +216,20 @@ def test_the_tracks_of_matches_are_those_of_the_model_they_were_made_of():
     assert tracks(joined) == {track for track in tracks(own) if len(track) > 1}
 
 
+@pytest.mark.parametrize("exact", [False, True])
+def test_pixels_of_matches_are_held_in_32_bits_only_if_these_hold_all_of_them(exact):
+    model = scene()
+    for image in model.images.values():
+        for k, point in enumerate(image.points2D):
+            wanted = np.float32(point.xy) if exact or image.image_id > 2 or k else point.xy + 1e-9
+            image.points2D[k].xy = wanted.astype(np.float64)
+    found = matches_of(model)
+    assert found.pixels.dtype == (np.float32 if exact else np.float64)
+    own = [model.image(int(posed_images(model).ids[i])) for i in found.cameras]
+    at = [image.points2D[k].xy for image, k in zip(own, found.keypoints.tolist(), strict=True)]
+    np.testing.assert_array_equal(found.pixels, at)
+
+
 @pytest.mark.parametrize("source", ["matches", "tracks"])
 def test_thin_adjustment_straightens_coarse_poses(source):
     truth = pycolmap.Reconstruction(BUNDLED / "courtyard" / "truth")
