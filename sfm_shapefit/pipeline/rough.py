@@ -52,10 +52,6 @@ def settle_rough(
     start = partial(start_from_first, options=options, clock=clock, rotations_known=True)
     given, corrected, first = start(given, corrected, lenses_wanted=True)
     if corrected.images.differ_in_rays(rough):
-        source = source.at(rough.with_lenses(corrected.images.lenses))
-        with clock("relative rotations"):
-            relative = _measure(source, clock)
-        corrected = _averaged(source, relative, np.ones(len(relative.pairs), dtype=np.bool_), clock)
         given, corrected, first = start(given, corrected)
     source = corrected
     found = settle(given, source, options, clock, first)
