@@ -29,11 +29,9 @@ from sfm_shapefit.laplacian.operators import Workers
 # half longer (castle-P30, lego100).
 _ENOUGH = 1e-4
 _SINGULAR = 1e-9  # least pivot relative to its diagonal; a point of less stays where it is
-_FIRST_DAMPING, _LEAST_REFUSED, _GROWTH = (
-    1e-8,
-    1e-4,
-    100.0,
-)  # of a point; after a refused step at least and by
+# Damping of a point's block at first, and at least after a refused step; each of these raises it a
+# hundredfold, so that one or two of the eight steps are lost where a point is curved.
+_FIRST_DAMPING, _LEAST_REFUSED, _GROWTH = 1e-8, 1e-4, 100.0
 # Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
 # large. The error of either is rounding.
 _SMALL, _LARGE = 1e-3, 1e150
@@ -98,7 +96,7 @@ def _predict(equations: Any, damping: float, step: Any) -> float:
     step[2] = (l20 * g0 + l21 * y1 - g2) / d2
     step[1] = -y1 / d1 - l21 * step[2]
     step[0] = -g0 / d0 - l10 * step[1] - l20 * step[2]
-    return -0.5 * (g0 * step[0] + g1 * step[1] + g2 * step[2])
+    return float(-0.5 * (g0 * step[0] + g1 * step[1] + g2 * step[2]))
 
 
 @inner_kernel

@@ -40,9 +40,8 @@ _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in i
 _NEAR = 1e-2  # relative fall of the cost by a step; from less on the minimum is near, and the loss may bend
 # Share of a residual's weight that the loss keeps along it near the minimum; the system stays positive.
 _LEAST_CURVATURE = 0.3
-_FIRST_SETTLING = (
-    8  # steps of each point by itself before the first joint one; 20 spare no further joint step
-)
+# Steps of each point by itself before the first joint one; 20 spare no further one of castle-P30 or lego100.
+_FIRST_SETTLING = 8
 _STATIONARY = 1e-6  # gradient norm; at less, steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual in pixels; less is rounding
 _LEAST_LEFT = 0.25  # share of the squares that a point leaves of its errors; that of two observations
