@@ -4,7 +4,7 @@ Directions need rotations known to tenths of a degree; the relative rotations of
 ones say of a pair its matches are fitted without a trial, and what fits is believed. Pairs that fit nothing
 near it are false, unless most matches of a camera say so: that is turned, and its pairs are tried as `map`
 tries all of them. Averaged, the rotations are as good as those of `map`, and go on as they do. Where the
-first placement finds lenses through which pairs turn otherwise, all of them are tried through these.
+first placement finds other lenses, a second one starts where it has turned the images.
 """
 
 from collections.abc import Callable
