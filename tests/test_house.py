@@ -26,7 +26,7 @@ class Change(NamedTuple):
 CHANGES = {
     "a camera model that adjustments may change": Change(2, r"\b_PLACES\b", {"scene/lens.py"}),
     "an output format": Change(2, r"\btum_text\b|\"tum\"", {"files/tum.py", "pipeline/convert.py"}),
-    "a robust loss": Change(2, r"\bsum_losses\b", {"adjustment/residuals.py", "adjustment/solve.py"}),
+    "a robust loss": Change(2, r"\bsettle_points\b", {"adjustment/lone_points.py", "adjustment/solve.py"}),
     "a flag": Change(
         2, r"\"min_trust\", \"points\"|\bmin_trust: float = option", {"judgement/options.py", "cli/locate.py"}
     ),

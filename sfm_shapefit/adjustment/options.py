@@ -57,6 +57,11 @@ class AdjustmentOptions(Settings):
         "Levenberg-Marquardt damping of the first step, relative to the diagonal; near the minimum, less of "
         "it lets a long shape bend that single cameras hardly feel.",
     )
+    settles_points: bool = option(
+        False,
+        "Let points also step by themselves, before the first step and with each: a third of the iterations "
+        "near the minimum; far from it single points may end in another minimum of their own.",
+    )
     max_iterations: int = option(
         100, "Limit of linear systems solved; reaching it is reported, never silent."
     )

@@ -69,6 +69,27 @@ def differentiate(views: Any, camera: int, u: float, v: float) -> tuple[float, f
 
 
 @inner_kernel
+def differentiate_by_point(
+    views: Any, camera: int, u: float, v: float, inverse: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return the derivatives of the pixel by the point in axes of the camera: x by it, then y.
+
+    Args:
+        views, camera, u, v: as of `differentiate`.
+        inverse: of the point's depth.
+    """
+    x_by_u, x_by_v, y_by_u, y_by_v = differentiate(views, camera, u, v)
+    return (
+        x_by_u * inverse,
+        x_by_v * inverse,
+        -(x_by_u * u + x_by_v * v) * inverse,
+        y_by_u * inverse,
+        y_by_v * inverse,
+        -(y_by_u * u + y_by_v * v) * inverse,
+    )
+
+
+@inner_kernel
 def differentiate_by_lens(
     views: Any, camera: int, u: float, v: float, slots: Any, lens: int, by_values: Any, by_lens: Any
 ) -> None:
@@ -102,4 +123,14 @@ def turn_to_frame(views: Any, camera: int, x: float, y: float, z: float) -> tupl
         x * views[camera, s] + y * views[camera, s + 3] + z * views[camera, s + 6],
         x * views[camera, s + 1] + y * views[camera, s + 4] + z * views[camera, s + 7],
         x * views[camera, s + 2] + y * views[camera, s + 5] + z * views[camera, s + 8],
+    )
+
+
+@inner_kernel
+def turn_to_world(views: Any, camera: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a vector in axes of the camera in those of the world."""
+    return (
+        x * views[camera, 0] + y * views[camera, 3] + z * views[camera, 6],
+        x * views[camera, 1] + y * views[camera, 4] + z * views[camera, 7],
+        x * views[camera, 2] + y * views[camera, 5] + z * views[camera, 8],
     )

@@ -27,14 +27,14 @@ import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.projection import (
-    LENS,
     SHIFT,
-    differentiate,
     differentiate_by_lens,
+    differentiate_by_point,
     is_ahead,
     look,
     miss,
     turn_to_frame,
+    turn_to_world,
 )
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.jit import inner_kernel, kernel
@@ -42,10 +42,6 @@ from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.lens import NUM_VALUES
 
 CHUNKS = 4  # parts of the points; each has sums of all nodes of its own, so the bits depend on their number
-
-# Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
-# large. The error of either is rounding.
-_SMALL, _LARGE = 1e-3, 1e150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +117,7 @@ def linearize(
         sums = (nodes[k], gradients[k], links[k])
         return lambda: _linearize(begin, end, given, structure, sums, by_point_sums)
 
-    workers.run([job(k, *chunk) for k, chunk in enumerate(_chunks(layout))])
+    workers.run([job(k, *chunk) for k, chunk in enumerate(chunks_of(layout))])
     upper = nodes.sum(axis=0)
     return NormalEquations(
         nodes=upper + np.triu(upper, 1).transpose(0, 2, 1),
@@ -131,18 +127,6 @@ def linearize(
         point_gradients=point_gradients,
         entries=entries,
     )
-
-
-def sum_losses(layout: Layout, values: Values, loss_scale_px: float | None, workers: Workers) -> float:
-    """Return the cost of all observations, 1/2 sum rho(|r|^2), in px^2."""
-    given = kernel_inputs(layout, values, loss_scale_px)
-    sums = np.zeros(CHUNKS)
-
-    def job(k: int, begin: int, end: int) -> Callable[[], None]:
-        return lambda: _sum_losses(begin, end, given, sums[k : k + 1])
-
-    workers.run([job(k, *chunk) for k, chunk in enumerate(_chunks(layout))])
-    return float(sums.sum())
 
 
 def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
@@ -171,44 +155,11 @@ def kernel_inputs(layout: Layout, values: Values, loss_scale_px: float | None) -
     return layout.first_observation, layout.camera, layout.pixels, views, values.points, scale
 
 
-def _chunks(layout: Layout) -> list[tuple[int, int]]:
+def chunks_of(layout: Layout) -> list[tuple[int, int]]:
     """Cut the points into ranges of about equally many observations, some perhaps empty."""
     wanted = np.arange(1, CHUNKS) * (len(layout.camera) / CHUNKS)
     cuts = np.searchsorted(layout.first_observation, wanted).tolist()
     return list(zip([0, *cuts], [*cuts, layout.num_points], strict=True))
-
-
-@kernel
-def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
-    """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length.
-
-    The logarithms of the loss are that of a product, but for small residuals, whose series is exact.
-    """
-    first, cameras, pixels, views, points, scale = given
-    plain = scale == np.inf
-    inverse_scale = 0.0 if plain else 1.0 / scale
-    sum_of_small, product = 0.0, 1.0
-    for p in range(begin, end):
-        for k in range(first[p], first[p + 1]):
-            camera = cameras[k]
-            x, y, z = look(views, camera, points, p)
-            x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
-            square = views[camera, LENS] * views[camera, LENS]
-            if is_ahead(x, y, z):
-                inverse = 1.0 / z
-                miss_x, miss_y = miss(views, camera, x * inverse, y * inverse, pixels, k)
-                square = miss_x * miss_x + miss_y * miss_y
-            s = square * inverse_scale
-            if plain:
-                sum_of_small += square
-            elif s < _SMALL:
-                sum_of_small += s * (1.0 - s * (1 / 2 - s * (1 / 3 - s * (1 / 4 - s * (1 / 5 - s / 6)))))
-            else:
-                product *= 1.0 + s
-                if product > _LARGE:
-                    sum_of_small += np.log(product)
-                    product = 1.0
-    total[0] += 0.5 * sum_of_small if plain else 0.5 * scale * (sum_of_small + np.log(product))
 
 
 @kernel
@@ -252,17 +203,11 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             inverse = 1.0 / z
             u, v = x * inverse, y * inverse
             rx, ry = miss(views, camera, u, v, pixels, k)
-            x_by_u, x_by_v, y_by_u, y_by_v = differentiate(views, camera, u, v)
             w, m00, m01, m11 = _weigh(rx, ry, scale, least_curvature)
             # By the point in axes of the camera, then in those of the world.
-            a0, a1, a2 = x_by_u * inverse, x_by_v * inverse, -(x_by_u * u + x_by_v * v) * inverse
-            b0, b1, b2 = y_by_u * inverse, y_by_v * inverse, -(y_by_u * u + y_by_v * v) * inverse
-            p0 = a0 * views[camera, 0] + a1 * views[camera, 3] + a2 * views[camera, 6]
-            p1 = a0 * views[camera, 1] + a1 * views[camera, 4] + a2 * views[camera, 7]
-            p2 = a0 * views[camera, 2] + a1 * views[camera, 5] + a2 * views[camera, 8]
-            q0 = b0 * views[camera, 0] + b1 * views[camera, 3] + b2 * views[camera, 6]
-            q1 = b0 * views[camera, 1] + b1 * views[camera, 4] + b2 * views[camera, 7]
-            q2 = b0 * views[camera, 2] + b1 * views[camera, 5] + b2 * views[camera, 8]
+            a0, a1, a2, b0, b1, b2 = differentiate_by_point(views, camera, u, v, inverse)
+            p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
+            q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
             wx, wy = w * rx, w * ry
             t0, t1, t2 = p0 * wx + q0 * wy, p1 * wx + q1 * wy, p2 * wx + q2 * wy
             # J_p^T M, and with J_p the block of the point.

@@ -182,6 +182,7 @@ class AdjustmentRun:
         fall: float,
         scale: float | None = None,
         first_damping: float = _FIRST_DAMPING,
+        settles_points: bool = False,
     ) -> "Solved":
         """Return the run at the optimum of a problem.
 
@@ -189,7 +190,7 @@ class AdjustmentRun:
             problem: of the run's images.
             fall: relative fall of the cost to end at.
             scale: of the loss, in pixel thresholds; None: the one that the errors call for.
-            first_damping: see `AdjustmentOptions`.
+            first_damping, settles_points: see `AdjustmentOptions`.
         """
         scale = self.choose_scale(problem) if scale is None else scale
         run = replace(self, loss_scale_px=scale * self.options.max_reprojection_error_px)
@@ -198,6 +199,7 @@ class AdjustmentRun:
             run.options_at_optimum(),
             cost_tolerance=fall,
             first_damping=first_damping,
+            settles_points=settles_points,
             **self.freedom.overrides(),
         )
         run = replace(run, iterations=run.iterations + done.iterations, converged=done.converged)
@@ -428,7 +430,7 @@ def repeat_with_known_lenses(
 
 def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) -> Solved:
     """Return the run at the optimum of a problem; frames that gained nothing by moving are put back."""
-    after, last = run.solve(problem, fall)
+    after, last = run.solve(problem, fall, settles_points=True)
     if run.frees_more_than_poses:
         return after.judge_lenses(last)[0], last
     returned = frames_not_gained(problem, last, after.loss_scale_px)
@@ -441,14 +443,14 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
 
 def _solve_all(run: AdjustmentRun) -> Solved:
     """Return the run after a first solve by all points."""
-    return run.solve(run.problem_of_all()[2], FIRST_FALL)
+    return run.solve(run.problem_of_all()[2], FIRST_FALL, settles_points=True)
 
 
 def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
     """Return the run after two solves by all points, those that a model may have, and the last problem."""
     run, last = repeat_with_known_lenses(run, _solve_all, _solve_all)
     joined, found, problem = run.problem_of_all()
-    run, last = run.solve(problem, LAST_FALL)
+    run, last = run.solve(problem, LAST_FALL, settles_points=True)
     found = replace(found, points=last.points).of_length(run.checked_length)
     return run.judge_lenses(last)[0], views_of(run.images).seen_points(joined, found), last
 

@@ -4,7 +4,7 @@ Directions need rotations known to tenths of a degree; the relative rotations of
 ones say of a pair its matches are fitted without a trial, and what fits is believed. Pairs that fit nothing
 near it are false, unless most matches of a camera say so: that is turned, and its pairs are tried as `map`
 tries all of them. Averaged, the rotations are as good as those of `map`, and go on as they do. Where the
-first placement finds lenses through which pairs turn otherwise, all of them are tried through these.
+first placement finds other lenses, a second one starts where it has turned the images.
 """
 
 from collections.abc import Callable
@@ -53,10 +53,6 @@ def settle_rough(
     start = partial(start_from_first, options=options, clock=clock, rotations_known=True)
     given, corrected, first = start(given, corrected, lenses_wanted=True)
     if corrected.images.differ_in_rays(rough):
-        source = source.at(rough.with_lenses(corrected.images.lenses))
-        with clock("relative rotations"):
-            relative = _measure(source, clock)
-        corrected = _averaged(source, relative, np.ones(len(relative.pairs), dtype=np.bool_), clock)
         given, corrected, first = start(given, corrected)
     source = corrected
     found = settle(given, source, options, clock, first)

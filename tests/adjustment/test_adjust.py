@@ -24,11 +24,13 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
+from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.run import _without_lone_frames
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.adjustment.made import LENSES, disturb, look_at, observed, ring_problem
@@ -384,6 +386,37 @@ def test_a_long_row_is_straightened_with_little_damping_that_the_usual_holds_bac
     # A row of 100 bends with about 1e-8 of a camera's curvature: held back by one, free with the other.
     assert usual > 0.1 * error(start, minimum)
     assert little < 0.01 * error(start, minimum)
+
+
+def test_points_that_step_by_themselves_spare_joint_steps_where_cameras_are_near():
+    truth, _ = make_start()
+    near = adjust(truth, TIGHT, loss_scale_px=0.25).problem
+    off = disturb(near, np.random.default_rng(5), center=0.0, rotation_rad=0.0, point=0.05)
+    alone, joint = (
+        adjust(off, loss_scale_px=0.25, cost_tolerance=1e-5, settles_points=settles)
+        for settles in (True, False)
+    )
+    assert alone.iterations < 0.5 * joint.iterations
+    assert alone.cost <= joint.cost * (1.0 + 1e-4)
+
+
+def test_no_step_of_a_point_by_itself_raises_its_loss():
+    truth, _ = make_start()
+    off = disturb(truth, np.random.default_rng(6), center=0.05, rotation_rad=0.01, point=2.0)
+    layout, values = lay_out(off, AdjustmentOptions()), values_of(off)
+    workers = Workers(1)
+    costs = [settle_points(layout, values, 1.0, workers, steps)[1] for steps in range(12)]
+    points, _ = settle_points(layout, values, 1.0, workers, 12)
+    assert (np.diff(costs) <= 0.0).all()
+    assert costs[-1] < 0.9 * costs[0]
+    before, after = (
+        np.bincount(
+            off.points_seen,
+            np.log1p(np.nan_to_num(reprojection_errors_px(replace(off, points=at)), nan=500.0) ** 2),
+        )
+        for at in (off.points, points)
+    )
+    assert (after <= before * (1.0 + 1e-12)).all()
 
 
 def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():

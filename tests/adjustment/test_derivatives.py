@@ -13,8 +13,9 @@ from sfm_shapefit.adjustment import (
     isotropic_information,
 )
 from sfm_shapefit.adjustment.layout import SLOTS, lay_out
+from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.priors import sum_priors
-from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals, sum_losses
+from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals
 from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -122,7 +123,7 @@ def test_the_gradient_is_that_of_differences_of_the_cost(model, scale):
     layout, values = lay_out(problem, options), values_of(problem)
 
     def cost(at):
-        return sum_losses(layout, at, scale, ONE) + sum_priors(problem, at, options.noise_px)
+        return settle_points(layout, at, scale, ONE, 0)[1] + sum_priors(problem, at, options.noise_px)
 
     expected = differences(layout, values, cost)
     normal = linearize_all(problem, layout, values, options, ONE)
@@ -159,7 +160,9 @@ def test_a_point_behind_its_camera_adds_nothing_and_counts_as_a_focal_length():
     lost = np.isnan(residuals[:, 0])
     assert (lost == ((behind.cameras_seeing == 0) & (behind.points_seen == 0))).all()
     squares = np.where(lost, 500.0**2, np.sum(residuals**2, axis=1))
-    assert sum_losses(layout, values, 2.0, ONE) == pytest.approx(0.5 * 4.0 * np.log1p(squares / 4.0).sum())
+    assert settle_points(layout, values, 2.0, ONE, 0)[1] == pytest.approx(
+        0.5 * 4.0 * np.log1p(squares / 4.0).sum()
+    )
     without = linearize(lay_out(observed(behind, ~lost), ALL_FREE), values, 2.0, ONE)
     found = linearize(layout, values, 2.0, ONE)
     np.testing.assert_array_equal(found.points, without.points)
