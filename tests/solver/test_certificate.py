@@ -192,9 +192,15 @@ def random_metric(d):
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     y -= np.sum(y * v, axis=1, keepdims=True) * v
     w, stiffness = rng.uniform(0.5, 2.0, (2, 20))
+    stiffness = (np.round(16.0 * stiffness) / 16.0).astype(np.float32)
     norms = np.repeat([0.3, 0.995, 1.7, 5.0], 5) * w
     y *= (norms / np.linalg.norm(y, axis=1))[:, None]
-    normal = np.where(np.arange(20) % 2, np.sqrt(0.97) / norms, 0.0)
+    # Few digits, so that the kernels' products of two numbers of single precision are exact.
+    normal = np.where(np.arange(20) % 2, np.round(32.0 * np.sqrt(0.97) / norms) / 32.0, 0.0).astype(
+        np.float32
+    )
+    for array in (edges, v, w):
+        array.flags.writeable = False  # as those of a graph, for which the kernels are compiled
     metric = certificate._Metric(edges, v, w, stiffness, y, normal, tuple(range(d)))
     incidence = np.zeros((20, 9))
     incidence[np.arange(20), edges[:, 0]], incidence[np.arange(20), edges[:, 1]] = 1.0, -1.0
@@ -209,7 +215,7 @@ def test_clipping_shortens_the_dual_to_its_balls_and_names_their_normals(d):
     certificate._clip(metric)
     np.testing.assert_allclose(metric.y, clipped, rtol=1e-14)
     surface = np.sqrt(0.97) / np.linalg.norm(clipped, axis=1)
-    np.testing.assert_allclose(metric.normal, np.where(norms > 0.99 * metric.w, surface, 0.0), rtol=1e-14)
+    np.testing.assert_allclose(metric.normal, np.where(norms > 0.99 * metric.w, surface, 0.0), rtol=1e-7)
 
 
 @pytest.mark.parametrize("d", [2, 3, 5])
@@ -226,7 +232,7 @@ def test_a_step_moves_the_dual_by_the_metric_and_leaves_it_orthogonal(d):
 
     metric.y[:] += 1e-3 * v  # what rounding might have left along v goes, too
     y += 1e-3 * v
-    along_y = np.sum(moved * y, axis=1) * metric.normal**2
+    along_y = np.sum(moved * y, axis=1) * metric.normal.astype(float) ** 2
     expected = y - metric.stiffness[:, None] * (flat - along_y[:, None] * y)
     worst = certificate._move(metric, h)
     np.testing.assert_allclose(metric.y, expected - np.sum(expected * v, axis=1)[:, None] * v, atol=1e-13)
