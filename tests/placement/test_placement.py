@@ -27,7 +27,7 @@ def two_pieces():
     return t, edges, normalized(differences(t, edges))
 
 
-@pytest.mark.parametrize("d", [2, 3, 5])
+@pytest.mark.parametrize("d", [2, 3])
 def test_every_dimension_is_placed_and_judged(d):
     problem = random_graph_problem(24, 0.9, d=d, sigma=1e-3, q=0.1, seed=d)
     placement = place(problem.view_graph)

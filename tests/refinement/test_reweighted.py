@@ -25,7 +25,7 @@ def hopeless():
     return corrupted()
 
 
-@pytest.mark.parametrize(("d", "q"), [(2, 0.5), (3, 0.8), (5, 0.75)])
+@pytest.mark.parametrize(("d", "q"), [(2, 0.5), (3, 0.8)])
 def test_recovery_is_exact_where_the_usual_starts_collapse(d, q, monkeypatch):
     problem = corrupted(q, d)
     found = place(problem.view_graph)

@@ -158,7 +158,7 @@ def test_of_starts_that_are_alike_one_is_refined_where_a_factor_is_dear(monkeypa
     assert list(finished(expander, objective="lud").costs) == ["ShapeFit", "LUD"]
 
 
-@pytest.mark.parametrize("d", [2, 3, 5])
+@pytest.mark.parametrize("d", [2, 3])
 def test_noise_free_answers_are_exact_and_not_made_worse(d):
     problem = synthetic.random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
     graph = problem.view_graph
