@@ -15,7 +15,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
-from sfm_shapefit.files.colmap import sqlite_file
+from sfm_shapefit.files.colmap import check, sqlite_file
 from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.database import find_database, relative_poses
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
@@ -204,6 +204,32 @@ def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
         except InputError:
             refused += 1
     assert refused > 5  # most bytes of a model are digits of floats, where a change is a sound model
+
+
+def test_a_model_that_is_read_in_small_pieces_is_judged_like_one_that_is_read_at_once(folder, monkeypatch):
+    def verdict():
+        try:
+            seen = check_model_files(folder)
+        except InputError:
+            return "refused"
+        return [(key, *(column.tolist() for column in columns)) for key, columns in seen.items()]
+
+    file, verdicts = folder / "points3D.bin", []
+    data = file.read_bytes()
+    for pieces in (check._PIECE_BYTES, 40):  # smaller than a point, too
+        monkeypatch.setattr(check, "_PIECE_BYTES", pieces)
+        monkeypatch.setattr(check, "_IMAGES_AT_ONCE", min(pieces, 256))
+        rng, found = np.random.default_rng(1), [verdict()]
+        for _ in range(40):
+            changed = bytearray(data)
+            changed[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
+            file.write_bytes(changed)
+            found.append(verdict())
+        file.write_bytes(data)
+        verdicts.append(found)
+    assert verdicts[0] == verdicts[1]
+    assert 5 < verdicts[0].count("refused") < 40
+    assert verdicts[0][0] != "refused"
 
 
 @pytest.mark.parametrize("name", MODEL_FILES)

@@ -21,18 +21,19 @@ Source: https://colmap.github.io/format.html, "Sparse reconstruction".
 
 import itertools
 import math
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import IntArray, UInt32Array, UInt64Array
+from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
@@ -58,7 +59,11 @@ _FRAME = struct.Struct("<II7dI")
 _FRAME_DATA = struct.Struct("<iIQ")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
 _POINT3D_BYTES = 51  # bytes of a point; id 8, xyz 24, rgb 3, error 8, track length 8
-_TRACK_ELEMENT_BYTES = 8  # bytes of an observation; image 4, keypoint 4
+_ID_AND_XYZ = np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])
+_PIECE_BYTES = (
+    2**22
+)  # bytes of points3D.bin read at once, to which the memory of the check is about ten times
+_IMAGES_AT_ONCE = 256  # images whose points are looked up at once; those of all would take 200 MB of 10,000
 
 
 def check_model_files(folder: Path) -> Observed:
@@ -153,36 +158,43 @@ def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float
 
 
 class _BinaryFile:
-    """The bytes of a model file and a position in them; every read is checked against their end."""
+    """A model file that is read once, from its begin to its end; every read is checked against the end."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.offset = 0
         try:
-            self.data = path.read_bytes()
+            self._stream = path.open("rb")  # until its end or its first fault
+            self.left = os.fstat(self._stream.fileno()).st_size
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
     def fault(self, reason: str) -> InputError:
-        """Return the error that names this file."""
+        """Return the error that names this file, which is read no further."""
+        self._stream.close()
         return InputError(f"{self.path}: {reason}")
 
     def truncated(self, what: str) -> InputError:
         """Return the error that the file ends inside `what`."""
         return self.fault(f"the file ends inside {what}; it is truncated, copy or write it again")
 
+    def read(self, count: int, what: str) -> bytes:
+        """Read so many bytes."""
+        try:
+            data = self._stream.read(count)
+        except OSError as error:
+            raise self.fault(f"it cannot be read: {error.strerror}") from None
+        self.left -= count
+        if len(data) < count:
+            raise self.truncated(what)
+        return data
+
     def take(self, layout: struct.Struct, what: str) -> tuple[float, ...]:
         """Read one record of fixed length."""
-        end = self.offset + layout.size
-        if end > len(self.data):
-            raise self.truncated(what)
-        values = layout.unpack_from(self.data, self.offset)
-        self.offset = end
-        return values
+        return layout.unpack(self.read(layout.size, what))
 
     def require_room(self, count: int, smallest: int, what: str) -> None:
         """Refuse a count of records, each at least `smallest` bytes long, that cannot fit in the file."""
-        if count * smallest > len(self.data) - self.offset:
+        if count * smallest > self.left:
             raise self.truncated(f"its {count} {what}")
 
     def take_count(self, smallest: int, what: str) -> int:
@@ -193,18 +205,17 @@ class _BinaryFile:
 
     def take_name(self, what: str) -> bytes:
         """Read bytes up to the next NUL."""
-        end = self.data.find(b"\0", self.offset)
-        if end < 0:
-            raise self.truncated(what)
-        name = self.data[self.offset : end]
-        self.offset = end + 1
-        return name
+        name = bytearray()
+        while not name.endswith(b"\0"):
+            head, end, _ = self._stream.peek(1).partition(b"\0")
+            name += self.read(max(len(head + end), 1), what)
+        return bytes(name[:-1])
 
     def finish(self) -> None:
-        """Refuse bytes after the last record; the others are given up."""
-        if self.offset != len(self.data):
-            raise self.fault(f"{len(self.data) - self.offset} bytes follow the last record; write it again")
-        self.data = b""
+        """Refuse bytes after the last record."""
+        if self.left:
+            raise self.fault(f"{self.left} bytes follow the last record; write it again")
+        self._stream.close()
 
 
 class _Images(NamedTuple):
@@ -222,10 +233,14 @@ def _check_binary_model(folder: Path, *, with_rigs: bool) -> Observed:
     image_file = _BinaryFile(folder / "images.bin")
     images = _check_images(image_file, camera_ids)
     point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
-    observed = np.concatenate([point_ids[:0], *(points for _, points in images.observed.values())])
-    unknown = observed[~np.isin(observed, point_ids)]
-    if len(unknown):
-        raise image_file.fault(f"an image observes 3D point {unknown[0]}, which points3D.bin does not have")
+    seen = [points for _, points in images.observed.values()]
+    for first in range(0, len(seen), _IMAGES_AT_ONCE):
+        some = np.concatenate(seen[first : first + _IMAGES_AT_ONCE])
+        unknown = some[~np.isin(some, point_ids)]
+        if len(unknown):
+            raise image_file.fault(
+                f"an image observes 3D point {unknown[0]}, which points3D.bin does not have"
+            )
     if with_rigs:
         rigs = _check_rigs(_BinaryFile(folder / "rigs.bin"), camera_ids)
         frame_file = _BinaryFile(folder / "frames.bin")
@@ -257,7 +272,7 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
     """Walk images.bin; one step per image, its points at once."""
     header_of: dict[int, tuple[int, int]] = {}  # camera id, number of points
     names: set[bytes] = set()
-    observed: dict[int, tuple[IntArray, UInt64Array]] = {}
+    observed: dict[int, tuple[Int32Array, UInt64Array]] = {}
     for _ in range(file.take_count(_IMAGE.size + 1 + _U64.size, "images")):
         image_id, *pose, camera_id = file.take(_IMAGE, "an image")
         label = f"image {image_id}"
@@ -270,13 +285,12 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
         if image_id in header_of or name in names:
             raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
         count = file.take_count(_POINT2D.itemsize, f"points of {label}")
-        points = np.frombuffer(file.data, dtype=_POINT2D, count=count, offset=file.offset)
-        file.offset += count * _POINT2D.itemsize
+        points = np.frombuffer(file.read(count * _POINT2D.itemsize, label), dtype=_POINT2D)
         if not np.isfinite(points["xy"]).all():
             raise file.fault(f"{label} has a point whose coordinates are not finite")
         header_of[int(image_id)] = (int(camera_id), count)
         names.add(name)
-        keypoints = np.flatnonzero(points["point3d_id"] != _NO_POINT)
+        keypoints = np.flatnonzero(points["point3d_id"] != _NO_POINT).astype(np.int32)
         observed[int(image_id)] = keypoints, points["point3d_id"][keypoints]
     file.finish()
     table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
@@ -284,36 +298,40 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
 
 
 def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
-    """Walk points3D.bin in two compiled passes and return the point ids, ascending."""
+    """Walk points3D.bin, a piece at a time, and return the point ids, ascending."""
     count = file.take_count(_POINT3D_BYTES, "3D points")
-    data = np.frombuffer(file.data, dtype=np.uint8)
-    starts = np.empty(count + 1, dtype=np.int64)
-    complete = int(_walk_points(data, file.offset, starts))
-    if complete < count:
-        raise file.truncated(f"3D point {complete + 1} of {count}")
-    file.offset = int(starts[-1])
+    ids, done, data = np.empty(count, dtype=np.uint64), 0, b""
+    while done < count:
+        data += file.read(min(file.left, _PIECE_BYTES), "3D points")
+        piece = np.frombuffer(data, dtype=np.uint8)
+        starts = np.empty(min(count - done, len(data) // _POINT3D_BYTES) + 1, dtype=np.int64)
+        complete = int(_walk_points(piece, 0, starts))
+        if not file.left and done + complete < count:
+            raise file.truncated(f"3D point {done + complete + 1} of {count}")
+        begins, end, is_head = starts[:complete, None], starts[complete], np.zeros(len(piece), dtype=np.bool_)
+        is_head[begins + np.arange(_POINT3D_BYTES)] = True
+        heads = piece[begins + np.arange(_ID_AND_XYZ.itemsize)].view(_ID_AND_XYZ)[:, 0]
+        elements = piece[:end][~is_head[:end]].view("<u4").reshape(-1, 2)
+        is_finite = np.isfinite(heads["xyz"]).all(axis=1)
+        if not is_finite.all():
+            raise file.fault(f"3D point {heads['id'][~is_finite][0]} has coordinates that are not finite")
+        ids[done : done + complete] = heads["id"]
+        # Each element of a track refers to an image, and to a point of it.
+        position = np.searchsorted(images.ids, elements[:, 0])
+        is_known = np.append(images.ids, -1)[position] == elements[:, 0]
+        bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
+        if len(bad):
+            image_id, point = bad[0]
+            raise file.fault(
+                f"a track refers to point {point} of image {image_id}, which images.bin does not have"
+            )
+        data, done = data[end:], done + complete
+    file.left += len(data)
     file.finish()
-
-    ids = np.empty(count, dtype=np.uint64)
-    num_elements = (int(starts[-1] - starts[0]) - count * _POINT3D_BYTES) // _TRACK_ELEMENT_BYTES
-    elements = np.empty((num_elements, 2), dtype=np.uint32)
-    not_finite = int(_read_points(data, starts, ids, elements))
-    del data
-    if not_finite >= 0:
-        raise file.fault(f"3D point {ids[not_finite]} has coordinates that are not finite")
     ids.sort()
     repeated = ids[1:][ids[1:] == ids[:-1]]
     if len(repeated):
         raise file.fault(f"3D point {repeated[0]} stands twice")
-    # Each element of a track refers to an image, and to a point of it.
-    position = np.searchsorted(images.ids, elements[:, 0])
-    is_known = np.append(images.ids, -1)[position] == elements[:, 0]
-    bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
-    if len(bad):
-        image_id, point = bad[0]
-        raise file.fault(
-            f"a track refers to point {point} of image {image_id}, which images.bin does not have"
-        )
     return ids
 
 
@@ -342,28 +360,6 @@ def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> 
         offset += 8 * int(track_length)
     starts[count] = offset
     return count
-
-
-@kernel
-def _read_points(data: Any, starts: IntArray, ids: UInt64Array, elements: UInt32Array) -> int:
-    """Fill in ids and track elements; return the first point whose xyz is not finite, or -1.
-
-    A double is not finite when the 11 bits of its exponent are all ones.
-    """
-    not_finite = -1
-    element = 0
-    for p in range(len(ids)):
-        ids[p] = _read_u64(data, starts[p])
-        for k in range(3):
-            bits = _read_u64(data, starts[p] + 8 + 8 * k)
-            if (bits >> np.uint64(52)) & np.uint64(0x7FF) == np.uint64(0x7FF) and not_finite < 0:
-                not_finite = p
-        for offset in range(starts[p] + 51, starts[p + 1], 8):
-            bits = _read_u64(data, offset)
-            elements[element, 0] = np.uint32(bits & np.uint64(0xFFFFFFFF))
-            elements[element, 1] = np.uint32(bits >> np.uint64(32))
-            element += 1
-    return not_finite
 
 
 def _check_rigs(file: _BinaryFile, camera_ids: set[int]) -> dict[int, set[tuple[int, int]]]:

@@ -15,7 +15,7 @@ from sfm_shapefit.scene.points import Points
 Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image by its row; k = 0 or None if there are none."""
 
-Observed = Mapping[int, tuple[IntArray, UInt64Array]]
+Observed = Mapping[int, tuple[Int32Array, UInt64Array]]
 """By the id of an image: its points2D that observe a 3D point, ascending, and the ids of those points."""
 
 # For this camera, pixel coordinates and normalized coordinates are the same numbers.
