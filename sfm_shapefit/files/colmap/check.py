@@ -60,10 +60,8 @@ _FRAME_DATA = struct.Struct("<iIQ")
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
 _POINT3D_BYTES = 51  # bytes of a point; id 8, xyz 24, rgb 3, error 8, track length 8
 _ID_AND_XYZ = np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])
-_PIECE_BYTES = (
-    2**22
-)  # bytes of points3D.bin read at once, to which the memory of the check is about ten times
-_IMAGES_AT_ONCE = 256  # images whose points are looked up at once; those of all would take 200 MB of 10,000
+_PIECE_BYTES = 2**22  # bytes of points3D.bin read at once; checking them takes ten times as much memory
+_IMAGES_AT_ONCE = 256  # images whose points are looked up at once; all 10,000 would take 200 MB
 
 
 def check_model_files(folder: Path) -> Observed:
