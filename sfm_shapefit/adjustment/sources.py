@@ -70,10 +70,8 @@ def collect_matches(
         numbers[:] = row_of[numbers] - 1
     del row_of
     parts = [np.flatnonzero(part).astype(np.int32) for part in np.split(is_matched, begins[1:-1])]
-    taken, keypoints = (
-        np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts]),
-        np.concatenate(parts),
-    )
+    taken = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part) for part in parts])
+    keypoints = np.concatenate(parts)
     cameras, pixels, on_plane = _look_up(images, pictures, taken, keypoints)
     return MatchedKeypoints(
         cameras=cameras, keypoints=keypoints, pixels=pixels, on_plane=on_plane, matches=room[:end]

@@ -124,9 +124,9 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
         counts: of the images.
         images: some of them posed.
         fixed: (f,) frames that are not asked.
-    """  # no right image of eleven real scenes has less than 0.26 of them; a wrong one 0
+    """
     could = counts.checked >= OUTNUMBERED * FEWEST_POINTS
-    does = could & (counts.agreeing >= RARE * counts.checked)
+    does = could & (counts.agreeing >= RARE * counts.checked)  # right images have .26 or more, a wrong one 0
     posed, lost, support = np.zeros((3, len(images.frames.ids)), dtype=np.bool_)
     posed[images.frame_of[images.is_posed]] = True
     lost[images.frame_of[could]], support[images.frame_of[does]] = True, True

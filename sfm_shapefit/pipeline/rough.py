@@ -49,13 +49,14 @@ def settle_rough(
     rough, given = source.images, given._replace(pull_rad=np.inf)
     with clock("relative rotations"):
         relative, believed = measure_near(source, sigma_rad, clock)
-    corrected = _averaged(source, relative, believed, clock)
+    with clock("rotation averaging"):
+        averaged = average_near(rough, relative.subset(believed), clock.threads)
+    corrected = replace(source.at(averaged), alone=relative)
     start = partial(start_from_first, options=options, clock=clock, rotations_known=True)
     given, corrected, first = start(given, corrected, lenses_wanted=True)
     if corrected.images.differ_in_rays(rough):
         given, corrected, first = start(given, corrected)
-    source = corrected
-    found = settle(given, source, options, clock, first)
+    found = settle(given, corrected, options, clock, first)
     told = _tell_changes(found, rough, given.images)
     assert told.turned_deg is not None
     sigma_deg = float(np.degrees(sigma_rad))
@@ -63,15 +64,6 @@ def settle_rough(
     told = replace(told, suspicions=(*found.suspicions, *rotation_suspicions(told.turned_deg, sigma_deg)))
     further = tuple(_tell_changes(piece, rough, given.images) for piece in found.further)
     return replace(told, further=further, warnings=(*wrong, *found.warnings))
-
-
-def _averaged(
-    source: MatchSource, relative: RelativeRotations, believed: BoolArray, clock: Clock
-) -> MatchSource:
-    """Return a source whose rotations are averaged from those pairs that are believed."""
-    with clock("rotation averaging"):
-        images = average_near(source.images, relative.subset(believed), clock.threads)
-    return replace(source.at(images), alone=relative)
 
 
 def _tell_changes(found: LocateResult, rough: Images, given: Images) -> LocateResult:
