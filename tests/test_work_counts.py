@@ -81,7 +81,7 @@ COUNTS = {
     "map APART/database.db OUT": Counts(7, 2, 2, 1, 3),
     "place GRAPH OUT": Counts(0, 1, 1, 0, 0),
     "inspect COURTYARD/sparse/0": Counts(2, 0, 0, 1, 1),
-    "check COURTYARD/truth --report OUT": Counts(9, 1, 1, 2, 3),
+    "check COURTYARD/truth --report OUT": Counts(9, 1, 1, 1, 3),
     "check COURTYARD/truth --report OUT --no-second-opinion": Counts(2, 0, 0, 1, 1),
 }
 

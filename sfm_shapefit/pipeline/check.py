@@ -6,13 +6,16 @@ import numpy as np
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
+from sfm_shapefit.facts.options import MapOptions
+from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.checked import CheckResult, OtherModel, check_source
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
-from sfm_shapefit.pipeline.map import map_database
+from sfm_shapefit.pipeline.map import map_opened
 from sfm_shapefit.solver.options import SolverOptions
 
 
@@ -41,20 +44,20 @@ def check(
         posed = read_model(model)
         inputs = choose_inputs(model, database)
     other = None
-    if second_opinion and inputs.database is not None:
-        with clock("second opinion"):
-            other = _map_anew(inputs.database, posed, second_opinion, progress)
-    with open_source(posed, inputs) as matches:
-        return check_source(posed, matches, DirectionOptions(), clock, other)
+    with open_source(posed, inputs) as source:
+        if second_opinion and isinstance(source.matches, DatabaseMatches):
+            with clock("second opinion"):
+                other = _map_anew(source.matches.file, posed, second_opinion, clock.anew())
+        return check_source(posed, source, DirectionOptions(), clock, other)
 
 
 def _map_anew(
-    database: Path, posed: ColmapModel, found: bool | MapResult, progress: Progress | None
+    file: DatabaseFile, posed: ColmapModel, found: bool | MapResult, clock: Clock
 ) -> OtherModel | None:
     """Return the model of the database that has most images in common; None if nothing can be placed."""
     if not isinstance(found, MapResult):
         try:
-            found = map_database(database, progress=progress)
+            found = map_opened(file, MapOptions(), clock)
         except UnsolvableError:
             return None
     names = set(posed.images.names)

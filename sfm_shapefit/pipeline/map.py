@@ -64,12 +64,15 @@ def map_database(
     options = merge_options(options, MapOptions, overrides)
     clock = Clock.of(progress, options.placement.solver, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
-        return _map_opened(start_run(file, options, clock, priors))
+        return map_opened(file, options, clock, priors)
 
 
-def _map_opened(run: MapRun) -> MapResult:
-    """Do what `map_database` does, once the matches are open."""
-    options, path, clock = run.options, run.matches.file.path, run.clock
+def map_opened(
+    file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None = None
+) -> MapResult:
+    """Do what `map_database` does, with a database that is open."""
+    run = start_run(file, options, clock, priors)
+    path = file.path
     run, relative, videos, visits = measure_run(run)
     reasons = dict.fromkeys(range(int(run.frame_of_image.max()) + 1), _UNMATCHED)
     models = locate_components(run, relative, visits, reasons)
