@@ -117,7 +117,9 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     sensor_of_camera, scale_sensor = problem.free_sensors(), find_scale_sensor(problem)
     node_of_frame, node_of_lens, node_of_sensor, active, lens_slots = _nodes(problem, options, scale_sensor)
     order = np.argsort(problem.points_seen, kind="stable")
-    point, camera = problem.points_seen[order], problem.cameras_seeing[order]
+    point, camera, pixels = problem.points_seen, problem.cameras_seeing, problem.pixels
+    if (point[1:] < point[:-1]).any():  # else they are shared, since all of them are large
+        point, camera, pixels = point[order], camera[order], np.ascontiguousarray(pixels[order])
     frame_node = node_of_frame[frame_of_camera]
     lens_node = node_of_lens[problem.lens_of_camera]
     sensor_node = np.append(node_of_sensor, -1)[sensor_of_camera]
@@ -142,7 +144,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         observation=order,
         first_observation=np.searchsorted(point, np.arange(problem.num_points + 1)),
         camera=camera,
-        pixels=np.ascontiguousarray(problem.pixels[order]),
+        pixels=pixels,
         frame_entry=where[0],
         lens_entry=where[1],
         sensor_entry=where[2],

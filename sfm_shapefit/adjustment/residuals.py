@@ -62,7 +62,7 @@ class Values:
     """Translations (c, 3) of sensor_from_rig."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class NormalEquations:
     """The system before the points are eliminated, without damping; gradients, not right-hand sides."""
 
@@ -77,7 +77,7 @@ class NormalEquations:
     point_gradients: FloatArray
     """(k, 3)"""
     entries: FloatArray
-    """(E, 3, 6) W"""
+    """(E, 3, 6) W; none while it is given up for the memory of a factor."""
 
 
 def linearize(

@@ -391,13 +391,23 @@ def problem_of_fine_poses(run: AdjustmentRun) -> AdjustmentProblem | None:
     checked = found.of_length(run.checked_length)
     problem = run.thin_problem(joined, found, times=_FINE_TIMES) if len(checked.points) else None
     del joined, found  # whose arrays have all matches
-    return None if _are_coarse(checked, run.triangulate(_THIN_LIMIT, checked=True)[1]) else problem
+    return problem if _coarse_points(run, checked) is None else None
 
 
-def _are_coarse(fine: TriangulatedPoints, loose: TriangulatedPoints) -> bool:
-    """Return whether poses are coarse, by the points found at the threshold and at the wide limit."""
-    num_fine = np.sum(fine.points_seen >= 0)
-    return bool(num_fine < _FINE * np.sum(loose.points_seen >= 0) or num_fine == 0)
+def _coarse_points(
+    run: AdjustmentRun, fine: TriangulatedPoints
+) -> tuple[ObservedTracks, TriangulatedPoints] | None:
+    """Return the tracks and points at the wide limit; None if poses are fine, by those at the threshold.
+
+    They are not looked for where nine tenths of all matched keypoints see those at the threshold.
+    """
+    assert run.links is not None
+    num_fine = int(np.sum(fine.points_seen >= 0))
+    if 0 < num_fine >= _FINE * len(run.links.cameras):
+        return None
+    joined, loose = run.triangulate(_THIN_LIMIT, checked=True)
+    is_fine = 0 < num_fine >= _FINE * np.sum(loose.points_seen >= 0)
+    return None if is_fine else (joined, loose)
 
 
 def repeat_with_known_lenses(
@@ -458,12 +468,11 @@ def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, Adju
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:
     """Return what `solve_by_all_points` does, after few where poses are coarse; and the first mean error."""
     joined, found = run.triangulate(1.0, checked=True)
-    loosely, loose = run.triangulate(_THIN_LIMIT, checked=True)
-    refuse_without_points(len(loose.points))
+    coarse = _coarse_points(run, found)
     initial_error_px = mean_error_px(run.problem(joined, found))
-    if _are_coarse(found, loose):
-        run, _ = run.solve(run.thin_problem(loosely, loose), _THIN_FALL, _THIN_SCALE)
-    del joined, found, loosely, loose
+    if coarse is not None:
+        run, _ = run.solve(run.thin_problem(*coarse), _THIN_FALL, _THIN_SCALE)
+    del joined, found, coarse
     return *solve_by_all_points(run), initial_error_px
 
 

@@ -42,6 +42,7 @@ _NEAR = 1e-2  # relative fall of the cost by a step; from less on the minimum is
 _LEAST_CURVATURE = 0.3
 # Steps of each point by itself before the first joint one; 20 spare no further one of castle-P30 or lego100.
 _FIRST_SETTLING = 8
+_MANY_ENTRIES = 4_000_000  # entries, 0.6 GB; more are given up while the system is factored, and made anew
 _STATIONARY = 1e-6  # gradient norm; at less, steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual in pixels; less is rounding
 _LEAST_LEFT = 0.25  # share of the squares that a point leaves of its errors; that of two observations
@@ -268,7 +269,7 @@ class _Run:
         self.workers = Workers(options.threads)
         self.layout = lay_out(problem, options)
         hand_back_memory()  # what the layout was made of goes before the largest arrays come
-        self.factor: ReducedFactor = choose_factor(self.layout, options)
+        self.factor: ReducedFactor = choose_factor(self.layout, options, np.float32)
         self.values, cost = self.settle(values_of(problem), _FIRST_SETTLING * options.settles_points)
         self.damping, self.growth = options.first_damping, 2.0
         self.costs = [cost]
@@ -349,14 +350,23 @@ class _Run:
 
     def propose(self, normal: NormalEquations) -> tuple[Values, float] | None:
         """Return the values after a damped step and the decrease predicted; None if it has no solution."""
-        layout = self.layout
+        layout, is_large = self.layout, len(normal.entries) > _MANY_ENTRIES
         system = eliminate_points(layout, normal, self.damping, self.workers)
+        if is_large:
+            normal.entries = normal.entries[:0].copy()
         try:
             self.factor.refactor(system)
+            steps = self.factor.solve(system.right[:, :, None])[:, :, 0]
         except UnsolvableError:
+            steps = None
+        inverses = system.inverses
+        del system
+        if is_large:
+            self.factor.give_back()
+            normal.entries = self.linearize().entries
+        if steps is None:
             return None
-        steps = self.factor.solve(system.right[:, :, None])[:, :, 0]
-        point_steps = step_points(layout, normal, system.inverses, steps)
+        point_steps = step_points(layout, normal, inverses, steps)
         diagonal = np.einsum("naa->na", normal.nodes)
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))

@@ -74,15 +74,17 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
     bodies = _moved(find_bodies(count, pairs, weights), pairs, weights)
     sizes = np.bincount(bodies, minlength=count)
     main = int(np.argmax(sizes))
+    across = [side[bodies[side[:, 0]] != bodies[side[:, 1]]] for side in (agreeing, contradicting)]
+    num_agreeing, num_against = (np.bincount(bodies[side].ravel(), minlength=count) for side in across)
+    is_cut = (num_against >= _FEWEST_CONTRADICTING) & (num_against > OUTNUMBERED * num_agreeing)
     cuts = []
     for body in np.argsort(-sizes, kind="stable").tolist():
-        if body == main or sizes[body] == 1:
+        if not is_cut[body] or body == main or sizes[body] == 1:
             continue  # a single camera is no group, and has tests of its own
         inside = bodies == body
-        across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
-        if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > OUTNUMBERED * len(across[0]):
-            is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
-            cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], is_tied))
+        contradicted = across[1][inside[across[1]].any(axis=1)]
+        is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
+        cuts.append(Cut(np.flatnonzero(inside), int(num_agreeing[body]), contradicted, is_tied))
     return tuple(cuts)
 
 
@@ -127,8 +129,6 @@ def _moved(bodies: IntArray, pairs: IntArray, weights: FloatArray) -> IntArray:
         moved = False
         for camera in range(count):
             own = slice(begins[camera], begins[camera + 1])
-            if begins[camera] == begins[camera + 1]:
-                continue
             gains = np.bincount(bodies[others[own]], doubled[own], count)
             best = int(np.argmax(gains))
             if gains[best] > gains[bodies[camera]]:

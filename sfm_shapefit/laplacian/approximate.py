@@ -319,7 +319,7 @@ def conjugate_gradients(
     max_iterations: int = 500,
     coupled_nodes: int | None = None,
 ) -> GradientsResult:
-    """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
+    """Solve L x = rhs for a Laplacian L, or a regular matrix, by preconditioned conjugate gradients.
 
     Where rhs is out of L's reach by rounding, or L is singular beyond constants, steps in the end lead away:
     the iteration stops then, and the iterate of least residual is returned.
@@ -331,7 +331,7 @@ def conjugate_gradients(
         tol: stop when each residual is at most this, relative to its right-hand side.
         max_iterations: hard limit, reported in `converged`.
         coupled_nodes: rows, the first, that are nodes, which constants move, of one system whose unknown is
-            all of x; None: the columns are k separate systems, and each row is a node.
+            all of x, none if it is regular; None: the columns are k separate systems, and each row is a node.
     """
     coupled = coupled_nodes is not None
     count = len(rhs) if coupled_nodes is None else coupled_nodes
@@ -360,7 +360,9 @@ def conjugate_gradients(
 
 
 def _centered(x: FloatArray, count: int) -> FloatArray:
-    """Return x (n, k) with the mean of its first rows taken from these."""
+    """Return x (n, k) with the mean of its first rows, if any, taken from these."""
+    if count == 0:
+        return x
     return np.concatenate([x[:count] - x[:count].mean(axis=0), x[count:]])
 
 

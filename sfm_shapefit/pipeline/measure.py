@@ -70,6 +70,8 @@ class Wanted(NamedTuple):
     """Whether tracks are joined; by "auto" those of many cameras only where their pairs do not hold them."""
     checked: bool = False
     errors: bool = False
+    facts: bool = False
+    """Whether `Measured.facts_per_match` is told."""
 
 
 DIRECTIONS = Wanted()
@@ -120,7 +122,7 @@ def measure(
         tracks=beside.joiner,
         checks=wanted.checked and beside.joiner is not None and beside.joiner.holds_all,
         errors=beside.errors,
-        facts_per_match=beside.facts_per_match(),
+        facts_per_match=beside.facts_per_match() if wanted.facts else 1.0,
     )
 
 
@@ -140,7 +142,7 @@ class _Beside:
 
     def __init__(self, source: MatchSource, threshold_px: float, wanted: Wanted) -> None:
         view = source.view
-        self._threshold_px, self._num_usable = threshold_px, 0
+        self._threshold_px, self._num_usable, self._counts_pairs = threshold_px, 0, wanted.facts
         is_sampled = wanted.errors and view.num_pairs <= _MOST_PAIRS
         self.errors: list[FloatArray] | None = [] if is_sampled else None
         self._begins = np.append(0, np.cumsum(view.num_keypoints))
@@ -156,7 +158,7 @@ class _Beside:
             self.joiner.add(batch, directions)
         usable = directions.usable()
         self._num_usable += len(usable)
-        for row in usable.tolist():
+        for row in usable.tolist() if self._counts_pairs else ():
             own = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
             self._num_pairs_of[self._begins[batch.pairs[row]] + own] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:

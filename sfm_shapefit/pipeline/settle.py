@@ -93,7 +93,7 @@ def settle(
     """
     with clock("directions"):
         checked = first is None and given.rigid.groups is None  # rigid groups need few points
-        wanted = Wanted(wants_points(opened, options.nodes), checked, errors=opened.economy.samples)
+        wanted = Wanted(wants_points(opened, options.nodes), checked, opened.economy.samples, facts=True)
         measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions
     with clock("solve"):

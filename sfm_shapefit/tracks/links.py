@@ -79,15 +79,15 @@ class ObservedTracks:
 
     def subset(self, chosen: IntArray) -> "ObservedTracks":
         """Return the given tracks, in that order."""
-        return self._of_rows(self._by_rows().subset(chosen), self.ids[chosen])
+        every = JoinedRows(self.offsets, np.arange(len(self.cameras)))
+        return self._of_rows(every.subset(chosen), self.ids[chosen])
 
     def of_points(self, points_seen: IntArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
-        joined = self._by_rows().of_points(points_seen)
+        if np.array_equal(points_seen, np.repeat(np.arange(self.num_tracks), self.lengths())):
+            return replace(self, ids=np.arange(self.num_tracks))  # as of matches, and large
+        joined = JoinedRows(self.offsets, np.arange(len(self.cameras))).of_points(points_seen)
         return self._of_rows(joined, np.arange(len(joined.offsets) - 1))
-
-    def _by_rows(self) -> JoinedRows:
-        return JoinedRows(self.offsets, np.arange(len(self.cameras)))
 
     def _of_rows(self, joined: JoinedRows, ids: IntArray) -> "ObservedTracks":
         """Return tracks that consist of rows of the observations."""

@@ -20,16 +20,20 @@ from sfm_shapefit.adjustment import (
     adjust,
     frames_not_gained,
     isotropic_information,
+    reduced_factor,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment import solve as adjustment_solve
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.run import _without_lone_frames
+from sfm_shapefit.adjustment.solve import linearize_all as every
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
@@ -249,6 +253,35 @@ def test_dense_and_sparse_systems_give_the_same(hold, free):
     extent = np.ptp(dense.centers, axis=0).max()
     np.testing.assert_allclose(sparse.centers, dense.centers, atol=1e-9 * extent)
     np.testing.assert_allclose(sparse.points, dense.points, atol=1e-9 * extent)
+
+
+def test_a_factor_of_32_bits_that_leads_nowhere_gets_64(monkeypatch):
+    def noting(symbolic, block, dtype=np.float64, *, threads):
+        dtypes.append(dtype)
+        return allocate_factor(symbolic, block, dtype, threads=threads)
+
+    monkeypatch.setattr(reduced_factor, "allocate_factor", noting)
+    _, start = make_start()
+    centers = []
+    for most, wanted in ((40, [np.float32]), (1, [np.float32, np.float64])):
+        dtypes: list[type] = []
+        monkeypatch.setattr(reduced_factor, "_MOST_PRODUCTS", most)
+        centers.append(adjust(start, linear_solver="sparse", max_iterations=3).problem.centers)
+        assert dtypes == wanted
+    np.testing.assert_allclose(*centers, atol=1e-9 * np.ptp(centers[0]))
+
+
+@pytest.mark.parametrize("solver", ["dense", "sparse"])
+def test_entries_given_up_while_a_system_is_factored_change_nothing(monkeypatch, solver):
+    _, start = make_start()
+    kept = adjust(start, TIGHT, linear_solver=solver)
+    monkeypatch.setattr(adjustment_solve, "_MANY_ENTRIES", 0)
+    linearized = []
+    monkeypatch.setattr(adjustment_solve, "linearize_all", lambda *args: linearized.append(1) or every(*args))
+    given_up = adjust(start, TIGHT, linear_solver=solver)
+    assert len(linearized) > 1.5 * kept.iterations
+    np.testing.assert_array_equal(given_up.problem.centers, kept.problem.centers)
+    np.testing.assert_array_equal(given_up.problem.points, kept.problem.points)
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse"])

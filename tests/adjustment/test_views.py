@@ -254,6 +254,23 @@ def test_of_the_thin_solves_only_the_fine_one_starts_nearly_undamped(monkeypatch
     assert dampings == [1e-4, 1e-8]
 
 
+@pytest.mark.parametrize(("size", "limits"), [(0.0, [1.0]), (0.02, [1.0, 4.0])])
+def test_points_at_the_wide_limit_are_looked_for_only_where_poses_may_be_coarse(monkeypatch, size, limits):
+    found = []
+
+    def noting(run, widening, **others):
+        found.append(widening)
+        return triangulate(run, widening, **others)
+
+    triangulate = adjustment_run.AdjustmentRun.triangulate
+    monkeypatch.setattr(adjustment_run.AdjustmentRun, "triangulate", noting)
+    truth = scene()
+    images, links = posed_images(disturbed(truth, size=size)), links_of(truth, matches_of(truth))
+    run = adjustment_run.begin(images, links, StructureOptions(), Freedom(), GivenPoses())
+    assert (adjustment_run.problem_of_fine_poses(run) is None) == (size > 0.0)
+    assert found == limits
+
+
 def test_lenses_that_were_found_before_are_held_in_the_first_solve(monkeypatch):
     frees = []
 
