@@ -217,8 +217,8 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
             u, v, step = u - step_u, v - step_v, np.hypot(step_u, step_v)
             if not (step > _STILL).any():
                 break
-        # Beyond the first extremum of r (1 + k1 r^2 + k2 r^4) the picture is folded: at the least positive root
-        # of 1 + 3 k1 s + 5 k2 s^2, found as one over that of 1/s, as k1 and k2 may be next to none.
+        # Beyond the first extremum of r (1 + k1 r^2 + k2 r^4) the picture is folded. That is at the least
+        # positive root of 1 + 3 k1 s + 5 k2 s^2, found by way of 1 / s, as k1 and k2 may be next to none.
         root = np.sqrt(9.0 * k1 * k1 - 20.0 * k2)  # NaN where there is none
         folds = 2.0 / (-3.0 * k1 + np.array([root, -root]))
     largest = np.min(folds, where=folds > 0.0, initial=np.inf)
