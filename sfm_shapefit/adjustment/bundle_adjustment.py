@@ -96,10 +96,10 @@ def adjust_thinly(
             run, _, last = steps.solve_by_all_points(run)
             return run.estimate(last)
         solve = partial(steps.solve_twice_thinly, lenses_known=run.has_found_lenses)
-        again = steps.solve_thinly_again
-        run, last = steps.repeat_with_known_lenses(run, solve, again, for_lenses=only_lenses)
+        again, follows = steps.solve_thinly_again, only_lenses or by_all
+        run, last = steps.repeat_with_known_lenses(run, solve, again, more_follows=follows)
         if by_all and run.frees_more_than_poses:
-            run, _, last = steps.solve_by_all_points(run)
+            run, _, last = steps.solve_by_all_points(run, lenses_judged=True)
         return run.estimate(last, judged=not only_lenses)
     problem = None if len(images.frames.ids) < _MANY_FRAMES else steps.problem_of_fine_poses(run)
     if problem is None:

@@ -256,7 +256,12 @@ def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> Floa
     Raises:
         UnsolvableError: if the observations leave more open than a similarity.
     """
-    sigmas = estimate_covariances(problem, options).lens_sigmas[:, FOCAL_LENGTHS]
+    return focal_shares(problem, estimate_covariances(problem, options))
+
+
+def focal_shares(problem: AdjustmentProblem, known: FrameCovariances) -> FloatArray:
+    """Return the standard deviations (l,) of focal lengths as shares of them; 0 for what is held."""
+    sigmas = known.lens_sigmas[:, FOCAL_LENGTHS]
     values = np.array([lens.values()[FOCAL_LENGTHS] for lens in problem.lenses])
     return np.asarray((sigmas / values).max(axis=1))
 

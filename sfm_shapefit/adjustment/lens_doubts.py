@@ -8,7 +8,7 @@ doubt s: its camera stands off along its view by s times the depth of what it se
 
 import numpy as np
 
-from sfm_shapefit.adjustment.covariance import estimate_covariances
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -16,10 +16,12 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images
 
 
-def covariances_of_free_lenses(
+def errors_of_free_lenses(
     problem: AdjustmentProblem, options: AdjustmentOptions, freedom: Freedom
-) -> FloatArray:
-    """Return what lenses that are free add to the covariances of the frames' centers, (n, 3, 3).
+) -> tuple[FloatArray, FloatArray]:
+    """Return what free lenses add to the covariances (n, 3, 3) of centers, and their own sigmas (l,).
+
+    Sigmas are those of the focal lengths, as shares of them.
 
     Args:
         problem: at its minimum, with its priors.
@@ -29,13 +31,12 @@ def covariances_of_free_lenses(
     Raises:
         UnsolvableError: if the observations leave more open than a similarity.
     """
-    if not freedom.lenses.any():
-        return np.zeros((problem.num_frames, 3, 3))
     free = estimate_covariances(problem, options, **freedom.overrides())
     held = estimate_covariances(problem, options, deciding=free.deciding)
     more = np.nan_to_num(free.centers - held.centers)
     values, axes = np.linalg.eigh(0.5 * (more + more.transpose(0, 2, 1)))
-    return np.asarray((axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1))
+    added = (axes * np.maximum(values, 0.0)[:, None]) @ axes.transpose(0, 2, 1)
+    return added, focal_shares(problem, free)
 
 
 def covariances_of_open_lenses(

@@ -45,7 +45,7 @@ from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
-from sfm_shapefit.adjustment.lens_doubts import covariances_of_free_lenses, covariances_of_open_lenses
+from sfm_shapefit.adjustment.lens_doubts import covariances_of_open_lenses, errors_of_free_lenses
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
@@ -74,7 +74,8 @@ _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Damping at first, relative to the curvature of single cameras. A row of n bends with about n^-4 of
 # that: after the usual 1e-4, the fine solve of 2,500 cameras ends 5 % short of its minimum, and a made row of
 # 100 keeps 0.4 of its bend; after 1e-8, neither. Only where a solve has gone before: from averaged rotations
-# castle-P19 would end in another minimum, four cameras lost.
+# castle-P19 would end in another minimum, four cameras lost; and only if that has freed the same: of 457
+# guessed lenses freed at once, the first five steps are refused.
 _FIRST_DAMPING, _NEAR_DAMPING = AdjustmentOptions().first_damping, 1e-8
 # Tracks that hold each image in a fine solve, in those of the thin one. With 1, the median errors of six real
 # scenes are 1.0 to 1.3 times those with 3, and of a facade of 300 images 1.6 times; 6 is no better.
@@ -230,11 +231,15 @@ class AdjustmentRun:
             sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
         except UnsolvableError:
             sigmas = np.full(len(lenses), np.inf)
-        sigmas = np.where(np.isnan(sigmas), np.inf, sigmas)
         is_open = free.lenses.copy()
         for k in np.flatnonzero(free.lenses).tolist():
             is_open[k] = not lenses[k].is_credible(float(sigmas[k]))
-        return replace(self, focal_sigmas=np.where(free.focal, sigmas, np.nan)), is_open
+        return self._knowing(sigmas), is_open
+
+    def _knowing(self, sigmas: FloatArray) -> "AdjustmentRun":
+        """Return the run with how well the focal lengths that move are known, by sigmas (l,) of all."""
+        sigmas = np.where(np.isnan(sigmas), np.inf, sigmas)
+        return replace(self, focal_sigmas=np.where(self.freedom.focal, sigmas, np.nan))
 
     def holding(self, held: BoolArray) -> "AdjustmentRun":
         """Return the run with some lenses (l,) as they were given, their focal lengths held from now on.
@@ -266,7 +271,7 @@ class AdjustmentRun:
             errors, initial_error_px: see `Estimate`.
             judged: whether it is asked how well centers and sensors are known, which takes as long as steps.
         """
-        known = self._center_errors(last) if judged else None
+        run, known = self._center_errors(last) if judged else (self, None)
         free = self.freedom.sensors(self.images) & judged
         covariances = None
         if known is not None:
@@ -280,7 +285,7 @@ class AdjustmentRun:
             covariances=covariances,
             lens_errors=None if known is None else known.lens_errors(),
             scale_sigma=None if known is None else known.scale_sigma,
-            focal_sigmas=self.focal_sigmas,
+            focal_sigmas=run.focal_sigmas,
             undetermined=self.undetermined,
             sensor_sigmas=judge_sensors(self.images, free, last, self.options_at_optimum()),
             initial_error_px=initial_error_px,
@@ -288,24 +293,26 @@ class AdjustmentRun:
             iterations=self.iterations,
         )
 
-    def _center_errors(self, problem: AdjustmentProblem) -> CenterErrors | None:
-        """Return how well centers and scale are known; None if that is not known.
+    def _center_errors(self, problem: AdjustmentProblem) -> "tuple[AdjustmentRun, CenterErrors | None]":
+        """Return the run with how well focal lengths are known, and the same of centers; None if it is not.
 
         Errors are estimated by points that the model may have, if there are any: of two images' a single
         residual is left, which says little of them. With all points, standard deviations on castle-P19 and
         Herz-Jesus-P8 are a quarter less than the checked points give, and the errors are not.
         """
         if problem.num_frames > MOST_FRAMES:
-            return None
+            return self, None
         is_checked = np.bincount(problem.points_seen, minlength=problem.num_points) >= self.checked_length
         checked = problem.of_points(is_checked) if is_checked.any() else problem
         try:
             options = self.options_at_optimum()
             known = estimate_center_errors(checked, options, self.freedom.doubt_rad)
-            of_lenses = covariances_of_free_lenses(checked, options, self.freedom)
-            return replace(known, covariances=known.covariances + of_lenses)
+            if not self.freedom.lenses.any():
+                return self, known
+            of_lenses, sigmas = errors_of_free_lenses(checked, options, self.freedom)
+            return self._knowing(sigmas), replace(known, covariances=known.covariances + of_lenses)
         except UnsolvableError:
-            return None
+            return self, None
 
 
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
@@ -354,9 +361,9 @@ def fine_problem(run: AdjustmentRun) -> AdjustmentProblem | None:
     return run.thin_problem(joined, found, times=_FINE_TIMES) if len(found.points) else None
 
 
-def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem) -> Solved:
-    """Return the run at the optimum of a fine problem, after a coarse one."""
-    return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING)
+def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem, *, near: bool = True) -> Solved:
+    """Return the run at the optimum of a fine problem, after a coarse one, `near` if that freed the same."""
+    return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING if near else _FIRST_DAMPING)
 
 
 def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Solved:
@@ -376,7 +383,7 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
     if problem is None:
         return run, last
     del last
-    return solve_finely(run, problem)
+    return solve_finely(run, problem, near=not lenses_known)
 
 
 def solve_thinly_again(run: AdjustmentRun) -> Solved:
@@ -415,7 +422,7 @@ def repeat_with_known_lenses(
     solve: Callable[[AdjustmentRun], Solved],
     again: Callable[[AdjustmentRun], Solved],
     *,
-    for_lenses: bool = False,
+    more_follows: bool = False,
 ) -> Solved:
     """Solve, and where focal lengths are left open, hold what was given of them and solve again.
 
@@ -424,7 +431,8 @@ def repeat_with_known_lenses(
     Args:
         run: before the solve.
         solve, again: the first solve, and those after it.
-        for_lenses: whether lenses alone are wanted: those of few images are then held, and nothing follows.
+        more_follows: whether images are measured anew, or adjusted by all points, from here. Where lenses of
+            few images are held, nothing is then solved again.
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
@@ -432,7 +440,7 @@ def repeat_with_known_lenses(
         if not is_open.any():
             return run, last
         run = run.holding(is_open)
-        if for_lenses and np.mean(is_open[run.images.lens_of]) <= _FEW:
+        if more_follows and np.mean(is_open[run.images.lens_of]) <= _FEW:
             return run, last
         run, last = again(run)
     return run.judge_lenses(last)[0], last
@@ -442,7 +450,7 @@ def solve_placed(run: AdjustmentRun, problem: AdjustmentProblem, fall: float) ->
     """Return the run at the optimum of a problem; frames that gained nothing by moving are put back."""
     after, last = run.solve(problem, fall, settles_points=True)
     if run.frees_more_than_poses:
-        return after.judge_lenses(last)[0], last
+        return after, last
     returned = frames_not_gained(problem, last, after.loss_scale_px)
     rotations = np.where(returned[:, None, None], problem.rotations, last.rotations)
     centers = np.where(returned[:, None], problem.centers, last.centers)
@@ -456,13 +464,18 @@ def _solve_all(run: AdjustmentRun) -> Solved:
     return run.solve(run.problem_of_all()[2], FIRST_FALL, settles_points=True)
 
 
-def solve_by_all_points(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
-    """Return the run after two solves by all points, those that a model may have, and the last problem."""
-    run, last = repeat_with_known_lenses(run, _solve_all, _solve_all)
+def solve_by_all_points(
+    run: AdjustmentRun, *, lenses_judged: bool = False
+) -> tuple[AdjustmentRun, Points, AdjustmentProblem]:
+    """Return the run after two solves by all points, those that a model may have, and the last problem.
+
+    Where lenses were judged by fewer points, those left open are held already: all points tell no less.
+    """
+    run, _ = _solve_all(run) if lenses_judged else repeat_with_known_lenses(run, _solve_all, _solve_all)
     joined, found, problem = run.problem_of_all()
-    run, last = run.solve(problem, LAST_FALL, settles_points=True)
+    run, last = run.solve(problem, LAST_FALL, first_damping=_NEAR_DAMPING, settles_points=True)
     found = replace(found, points=last.points).of_length(run.checked_length)
-    return run.judge_lenses(last)[0], views_of(run.images).seen_points(joined, found), last
+    return run, views_of(run.images).seen_points(joined, found), last
 
 
 def solve_from_seed(run: AdjustmentRun) -> tuple[AdjustmentRun, Points, AdjustmentProblem, float]:

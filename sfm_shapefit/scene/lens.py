@@ -39,7 +39,7 @@ _MOST_STEPS, _STILL = 30, 1e-12
 _SAME_RAYS = 0.01  # difference of unit rays; more makes relative rotations worth measuring anew
 _PIXELS_A_SLICE = 20_000  # pixels undistorted at once; their arrays stay in the cache
 
-LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, the observations leave it open
+LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, nothing that was given is contradicted
 # Factor by which the errors that keypoints share make those of a focal length larger than the noise alone
 # does; measured on kitti-turn, driven straight ahead for the greatest part.
 _SHARED_NOISE = 7.0
@@ -193,7 +193,7 @@ class Lens:
         sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
         better = _SHARED_NOISE * sigma <= self.focal_sigma
         contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
-        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
+        return sound and (better or (contradicts and sigma <= LARGEST_SIGMA))
 
 
 def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float) -> FloatArray:
@@ -217,9 +217,11 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
             u, v, step = u - step_u, v - step_v, np.hypot(step_u, step_v)
             if not (step > _STILL).any():
                 break
-    # Beyond the first extremum of r (1 + k1 r^2 + k2 r^4) the picture is folded.
-    folds = np.roots([5.0 * k2, 3.0 * k1, 1.0])
-    largest = min((float(s.real) for s in folds if s.imag == 0.0 and s.real > 0.0), default=np.inf)
+        # Beyond the first extremum of r (1 + k1 r^2 + k2 r^4) the picture is folded. That is at the least
+        # positive root of 1 + 3 k1 s + 5 k2 s^2, found by way of 1 / s, as k1 and k2 may be next to none.
+        root = np.sqrt(9.0 * k1 * k1 - 20.0 * k2)  # NaN where there is none
+        folds = 2.0 / (-3.0 * k1 + np.array([root, -root]))
+    largest = np.min(folds, where=folds > 0.0, initial=np.inf)
     return np.where((step <= _STILL) & (u * u + v * v <= largest), [u, v], np.nan)
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -271,11 +272,12 @@ def test_points_at_the_wide_limit_are_looked_for_only_where_poses_may_be_coarse(
     assert found == limits
 
 
-def test_lenses_that_were_found_before_are_held_in_the_first_solve(monkeypatch):
-    frees = []
+def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in_the_second(monkeypatch):
+    frees, dampings = [], []
 
     def noting(problem, options, **others):
         frees.append(others["free_focal_lengths"])
+        dampings.append(others["first_damping"])
         return adjust(problem, options, **others)
 
     monkeypatch.setattr(adjustment_run, "adjust", noting)
@@ -286,7 +288,24 @@ def test_lenses_that_were_found_before_are_held_in_the_first_solve(monkeypatch):
     for one, is_free in ((given, True), (found, False)):
         adjust_thinly(images.with_lenses([one]), lambda: links, StructureOptions(), free, lenses_wanted=True)
         assert frees[:2] == [is_free, True]
+        assert dampings[:2] == [1e-4, 1e-8 if is_free else 1e-4]
         frees.clear()
+        dampings.clear()
+
+
+@pytest.mark.parametrize(("num_open", "follows", "num_solves"), [(1, True, 1), (1, False, 2), (2, True, 2)])
+def test_where_lenses_of_few_images_are_left_open_nothing_is_solved_again_if_more_follows(
+    num_open, follows, num_solves
+):
+    solved, judged = [], iter([np.arange(10) < num_open, np.zeros(10, bool)])
+    run = SimpleNamespace(images=SimpleNamespace(lens_of=np.arange(10)), holding=lambda _: run)
+    run.judge_lenses = lambda _: (run, next(judged))
+
+    def solve(run):
+        return run, solved.append(run)
+
+    adjustment_run.repeat_with_known_lenses(run, solve, solve, more_follows=follows)
+    assert len(solved) == num_solves
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])
@@ -301,7 +320,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
     assert not found.estimate.undetermined.any()
     assert 0.0 < found.estimate.focal_sigmas[0] < 0.01
-    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
+    monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
     held = adjusted_thinly(start, tracks, **free)
     assert held.estimate.undetermined.all()
     assert held.estimate.freedom.distortion.all()
@@ -322,7 +341,7 @@ def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monk
     truth = scene("PINHOLE")
     start = disturbed(truth)
     free = {"focal": np.ones(1, bool), "distortion": np.ones(1, bool)}
-    monkeypatch.setattr(lens, "LARGEST_SIGMA", 0.0)
+    monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
     found = adjusted_placement(start, matches_of(truth), **free)
     assert found.estimate.undetermined.all()
     given, kept = (model.camera(1).params.tolist() for model in (start, found.reconstruction))

@@ -31,6 +31,15 @@ def test_distortion_is_undone_as_by_pycolmap_and_where_the_picture_is_folded_the
     np.testing.assert_allclose(camera.img_from_cam(ahead), pixels[has_ray], atol=1e-9)
 
 
+def test_a_coefficient_next_to_none_is_none():
+    # An adjustment leaves as much of a coefficient that its prior alone pulls at, step by step.
+    pixels = np.array([[600.0, 400.0], [1300.0, 900.0], [-100.0, 400.0]])
+    plain = Lens("PINHOLE", (900.0, 900.0, 600.0, 400.0)).undistort(pixels)
+    for distortion in ((1e-310, 0.0), (-1e-310, 1e-310), (0.0, 1e-310), (0.0, -1e-310)):
+        found = Lens("RADIAL", (900.0, 600.0, 400.0, *distortion)).undistort(pixels)
+        np.testing.assert_array_equal(found, plain)
+
+
 @pytest.mark.parametrize(
     ("model", "focal", "distortion", "differs"),
     [
