@@ -178,7 +178,9 @@ def fit_images(
                 seen[count, 0], seen[count, 1] = on_plane[row, 0], on_plane[row, 1]
                 count += 1
         counts[i] = count
-        rotation[:] = rotations[i]
+        for c in range(3):
+            for k in range(3):
+                rotation[c, k] = rotations[i, c, k]
         if count >= FEWEST_POINTS:
             _fit_image(
                 held, seen, spread, count, rotation, focal_px[i], angular[i], lines, squares, work, system,

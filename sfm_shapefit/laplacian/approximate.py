@@ -79,12 +79,15 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
 
     The weights (m,) are non-negative; edges of weight 0 do not count.
     """
-    w = np.ascontiguousarray(weights, dtype=np.float64)
+    w = frozen(np.ascontiguousarray(weights, dtype=np.float64).view())
     if not (np.isfinite(w).all() and (w >= 0.0).all()):
         raise ValueError("approximate Cholesky needs finite weights >= 0")
     state = np.array([seed & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64)
-    parts = _eliminate_all(graph.pointers, graph.neighbors, graph.edge_of, w, state)
-    return ApproximateCholesky(*(frozen(part) for part in parts))
+    permutation, pointers, *entries, pivots = _eliminate_all(
+        graph.pointers, graph.neighbors, graph.edge_of, w, state
+    )
+    entries = [entry[: pointers[-1]].copy() for entry in entries]
+    return ApproximateCholesky(*(frozen(part) for part in (permutation, pointers, *entries, pivots)))
 
 
 @inner_kernel
@@ -118,9 +121,19 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
 
 @inner_kernel
 def _enlarge(array: Any, size: int) -> Any:
-    """Return a copy of an array with room for `size` entries."""
-    larger = np.empty((size, *array.shape[1:]), array.dtype)
-    larger[: len(array)] = array
+    """Return a copy of an array (.,) with room for `size` entries."""
+    larger = np.empty(size, array.dtype)
+    for k in range(len(array)):
+        larger[k] = array[k]
+    return larger
+
+
+@inner_kernel
+def _enlarge_links(links: Any, size: int) -> Any:
+    """Return a copy of links (., 2) with room for `size` of them."""
+    larger = np.empty((size, 2), np.int32)
+    for k in range(len(links)):
+        larger[k, 0], larger[k, 1] = links[k, 0], links[k, 1]
     return larger
 
 
@@ -235,7 +248,7 @@ def _sample_clique(
 
 @kernel
 def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, state: Any) -> Any:
-    """Eliminate all nodes, each time one with the fewest edges left."""
+    """Eliminate all nodes, each time one with the fewest edges left; rows and fractions have room left."""
     n = len(pointers) - 1
     head, links, values, degree, pool = _edge_lists(pointers, neighbors, edge_of, weights)
     bucket = np.full(len(neighbors) + 2, -1, np.int64)
@@ -263,14 +276,16 @@ def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, st
         if end > len(rows):
             rows, fractions = _enlarge(rows, 2 * end), _enlarge(fractions, 2 * end)
         if pool[1] + 2 * size > len(values):
-            links, values = _enlarge(links, 2 * len(values)), _enlarge(values, 2 * len(values))
-        rows[end - size : end] = star[:size]  # nodes now, steps once all steps are known
-        fractions[end - size : end] = star_weight[:size] / tail[0]
+            links, values = _enlarge_links(links, 2 * len(values)), _enlarge(values, 2 * len(values))
+        for a in range(size):  # nodes now, steps once all steps are known
+            rows[end - size + a], fractions[end - size + a] = star[a], star_weight[a] / tail[0]
         _sample_clique(size, star, star_weight, tail, head, links, values, degree, pool, state)
-        for u in star[:size]:
-            _push(bucket, above, below, degree, u)
-            lowest = min(lowest, degree[u])
-    return permutation, columns, step[rows[: columns[n]]], fractions[: columns[n]].copy(), pivots
+        for a in range(size):
+            _push(bucket, above, below, degree, star[a])
+            lowest = min(lowest, degree[star[a]])
+    for entry in range(columns[n]):
+        rows[entry] = step[rows[entry]]
+    return permutation, columns, rows, fractions, pivots
 
 
 @kernel

@@ -49,6 +49,7 @@ Parts come first, so that no two processes compile the same kernels, and of them
 the whole.
 """
 FURTHER = (
+    "place_flat_graph",
     "place_graph",
     "solve_sparse",
     "solve_by_splitting",
@@ -57,14 +58,13 @@ FURTHER = (
     "adjust_sparsely",
     "place_long_graph",
     "locate_from_tracks",
-    "place_flat_graph",
     "locate_around_fixed",
     "average_graphs",
     "map_matches",
     "relate_images",
     "draw_images",
 )
-"""Examples of the rest."""
+"""Examples of the rest; that which takes longest first, or it would be waited for."""
 
 # Kernels of these rooms are compiled by further examples only, all but one.
 _ROOMS_OF_FURTHER = ("rotations", "synthetic")

@@ -138,6 +138,25 @@ def test_no_kernel_hands_a_named_tuple_to_python():
     assert list(crossings({"a": sin, "b": "from a import f\ndef h(): return f()"})) == ["f", "f"]
 
 
+def arrays_in_slices(source):
+    """Yield the statements of kernels that write more than a number to a slice, as far as names tell."""
+    for function in ast.walk(ast.parse(source)):
+        if isinstance(function, ast.FunctionDef) and is_kernel(function):
+            for statement in ast.walk(function):
+                targets = statement.targets if isinstance(statement, ast.Assign) else ()
+                written = (n for t in targets for n in ast.walk(t) if isinstance(n, ast.Subscript))
+                is_slice = any(isinstance(n, ast.Slice) for s in written for n in ast.walk(s.slice))
+                if is_slice and ast.unparse(statement.value) not in ("0.0", "zero"):
+                    yield ast.unparse(statement)
+
+
+def test_no_kernel_writes_an_array_to_a_slice():
+    """Numba compiles the words of its error with it, for 3 s; a loop over the entries takes no time."""
+    paths = (ROOT / "sfm_shapefit").rglob("*.py")
+    assert [s for path in paths for s in arrays_in_slices(path.read_text(encoding="utf-8"))] == []
+    assert list(arrays_in_slices("@kernel\ndef f(a, b): a[:] = b")) == ["a[:] = b"]
+
+
 INTERRUPTED = """
 import signal
 import numpy as np

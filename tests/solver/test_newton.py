@@ -96,7 +96,7 @@ def test_exact_directions_give_the_truth_and_a_zero_dual(solver):
 def test_the_dense_factor_has_room_for_any_dimension():
     factor = dense._allocate_factor(12, 5, np.float32)
     assert (factor.diagonal.shape, factor.half.shape) == ((12, 5, 5), (5, 4))
-    assert (len(factor.matrix), len(factor.right)) == (60 * 60, 60)
+    assert (len(factor.single_matrix), len(factor.single_right)) == (60 * 60, 60)
 
 
 @SOLVERS

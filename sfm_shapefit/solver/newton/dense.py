@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.blas_threads import one_blas_thread
@@ -54,10 +55,16 @@ _OPERATIONS_PER_CALL = 4e9
 class DenseNewtonFactor(NamedTuple):
     """Room for M and its Cholesky factor, and what LAPACK is called with."""
 
-    matrix: Any
-    """(nd * nd,) lower triangle in column-major order, float32 or float64."""
-    right: Any
-    """(nd,) scratch of the same type: right-hand side, then solution."""
+    is_single: bool
+    """Whether the factor is of float32: one kernel for both types takes half as long to compile as two."""
+    matrix: FloatArray
+    """(nd * nd,) lower triangle in column-major order; empty if the factor is of float32."""
+    right: FloatArray
+    """(nd,) scratch: right-hand side, then solution; empty if the factor is of float32."""
+    single_matrix: npt.NDArray[np.float32]
+    """(nd * nd,) as `matrix`, of float32; else empty."""
+    single_right: npt.NDArray[np.float32]
+    """(nd,) as `right`, of float32; else empty."""
     diagonal: FloatArray
     """(n, d, d) scratch: the diagonal blocks of M."""
     half: FloatArray
@@ -101,10 +108,14 @@ def solve_newton_dense(
 
 def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseNewtonFactor:
     """Return room for a factor of float32 or float64."""
-    size = np.dtype(dtype).itemsize
+    size, order = np.dtype(dtype).itemsize, n * d
+    single, double = (order, 0) if size == 4 else (0, order)
     return DenseNewtonFactor(
-        matrix=np.empty((n * d) ** 2, dtype),
-        right=np.empty(n * d, dtype),
+        is_single=size == 4,
+        matrix=np.empty(double**2),
+        right=np.empty(double),
+        single_matrix=np.empty(single**2, np.float32),
+        single_right=np.empty(single, np.float32),
         diagonal=np.empty((n, d, d)),
         half=np.empty((d, d - 1)),
         blas=blas_of(dtype),
@@ -151,7 +162,7 @@ def _newton(
         progress = NewtonProgress(*close_cycle(iterate, progress, mu, first))
         count += 1
         stalled = 0 if progress.gap < 0.9 * first else stalled + 1
-        if progress.gap == first and factor.right.itemsize == 4:
+        if progress.gap == first and factor.is_single:
             stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
     scalars = progress.mu, progress.multiplier, progress.objective, progress.gap, progress.clips
     return count, stalled, scalars
@@ -175,9 +186,13 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     ridge, last = factor.ridge
     info = 1
     while info != 0 and ridge <= last:
-        _lift(problem, factor, size, ridge * size)
-        _add_edge_blocks(problem, linearization, factor)
-        info = potrf(factor.blas, (array_address(factor.matrix), order), order)
+        if factor.is_single:
+            _lift(problem, factor.single_matrix, size, ridge * size)
+            _add_edge_blocks(problem, linearization, factor.single_matrix, factor.diagonal, factor.half)
+        else:
+            _lift(problem, factor.matrix, size, ridge * size)
+            _add_edge_blocks(problem, linearization, factor.matrix, factor.diagonal, factor.half)
+        info = potrf(factor.blas, (_address(factor), order), order)
         ridge *= 100.0
     if info == 0:
         _solve(factor, problem.c, linearization.a)
@@ -185,13 +200,19 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
 
 
 @inner_kernel
-def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
-    """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
+def _address(factor: Any) -> Any:
+    """Return the address of the matrix that is used."""
+    return array_address(factor.single_matrix) if factor.is_single else array_address(factor.matrix)
+
+
+@inner_kernel
+def _lift(problem: Any, matrix: Any, size: float, ridge: float) -> None:
+    """Overwrite a matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
     order = problem.c.size
     c = problem.c.reshape(order)
     along_c, along_axis = size / dot(problem.c, problem.c), size / len(problem.c)
     for q in range(order):
-        column = factor.matrix[q * order + q : (q + 1) * order]
+        column = matrix[q * order + q : (q + 1) * order]
         rest = c[q:]
         slope = along_c * c[q]
         for p in range(len(column)):  # over views that begin at 0: an index that may be negative is slow
@@ -202,10 +223,9 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
 
 
 @inner_kernel
-def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
-    """Add D^T S D to the lower triangle of the matrix."""
+def _add_edge_blocks(problem: Any, linearization: Any, matrix: Any, diagonal: Any, half: Any) -> None:
+    """Add D^T S D to the lower triangle of a matrix."""
     edges, basis, s = problem.edges, problem.basis, linearization.s
-    matrix, diagonal, half = factor.matrix, factor.diagonal, factor.half
     n, d = len(problem.c), len(problem.axes)
     order = n * d
     diagonal[:] = 0.0
@@ -262,12 +282,20 @@ def _propose(
 @inner_kernel
 def _solve(factor: Any, nodes: Any, solution: Any) -> None:
     """Write M^-1 nodes, which may be in place."""
-    right = factor.right
+    if factor.is_single:
+        _solve_by(factor.blas, factor.single_matrix, factor.single_right, nodes, solution)
+    else:
+        _solve_by(factor.blas, factor.matrix, factor.right, nodes, solution)
+
+
+@inner_kernel
+def _solve_by(blas: Any, matrix: Any, right: Any, nodes: Any, solution: Any) -> None:
+    """Do what `_solve` does by arrays of one type."""
     n, d = nodes.shape
     for i in range(n):
         for k in range(d):
             right[i * d + k] = nodes[i, k]
-    solve_factored(factor.blas, (array_address(factor.matrix), right.size), right.size, array_address(right))
+    solve_factored(blas, (array_address(matrix), right.size), right.size, array_address(right))
     for i in range(n):
         for k in range(d):
             solution[i, k] = right[i * d + k]

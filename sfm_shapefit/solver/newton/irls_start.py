@@ -26,6 +26,7 @@ from sfm_shapefit.solver.newton.steps import (
     NewtonProgress,
     combine,
     dot,
+    largest,
     measure_gap,
     scale_to,
     set_residuals,
@@ -49,7 +50,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
     energy = dot(t, gradient)
-    if left > _LEFT * energy or energy <= _ROUNDING * degrees.max() * dot(t, t):
+    if left > _LEFT * energy or energy <= _ROUNDING * largest(degrees) * dot(t, t):
         return False
     mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     eps = _EPS
