@@ -98,6 +98,7 @@ def triangulate(
             done += task.tracks.num_tracks
             if limit_px == joining_limits[0]:  # nearly all tracks
                 advance(done, len(chosen))
+        del joined, sizes, chosen, tasks  # before the keypoints that are left are copied
     return number_points(parts)
 
 
