@@ -14,6 +14,7 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Origin
 
 _NAMED = 3  # cameras; more in doubt are told together, as a list of them is not read
+_LOOSE = 0.01  # relative sigma of a focal length; more of its distance is more than most cameras are off
 _UNCHANGED = 1e-12  # relative change of a parameter; less is rounding
 
 _FOUND = ("adjusted", "view graph")
@@ -181,3 +182,6 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
                 f"{noun} {first_of(cameras)} kept a focal length that was never measured, "
                 f"{what}; calibrate if the result is poor"
             )
+    if loose := [str(row.camera) for row in guessed if (row.focal_sigma_px or 0.0) > _LOOSE * row.focal_px]:
+        known = f"the matches know to {_LOOSE:.0%} at best, and the distance to what is seen no better"
+        yield f"{'cameras' if len(loose) > 1 else 'camera'} {first_of(loose)} got a focal length that {known}"
