@@ -12,23 +12,32 @@ from pathlib import Path
 
 import pdoc
 
-NAMES = (
-    *("base.errors", "scene.evaluation", "facts.options", "facts.result", "facts.map_result", "facts.tables"),
-    *("files.colmap.model", "files.colmap.quiet", "files.g2o", "files.glomap_text", "files.graph_text"),
-    *("files.nerf", "files.onedsfm", "files.opensfm", "files.tum", "pipeline", "pairs", "judgement"),
-    *("graph.rigidity", "graph.viewgraph", "placement.place", "placement.gauge", "placement.diagnosis"),
-    *("solver", "synthetic", "synthetic.fixtures", "synthetic.rendered_workspace", "synthetic.workspace"),
+import sfm_shapefit
+
+FURTHER = (
+    *("scene.evaluation", "facts.tables", "files.colmap.model", "files.g2o", "files.glomap_text"),
+    *("files.graph_text", "files.nerf", "files.onedsfm", "files.opensfm", "files.tum", "graph.rigidity"),
+    *("placement.gauge", "placement.diagnosis", "synthetic", "synthetic.fixtures"),
+    *("synthetic.rendered_workspace", "synthetic.workspace"),
 )
-MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
+"""Modules with a page beside those that public names come from."""
+
+
+def modules() -> list[str]:
+    """Return the modules that callers use."""
+    public = (getattr(sfm_shapefit, name) for name in sfm_shapefit.__all__)
+    further = (f"{sfm_shapefit.__name__}.{name}" for name in FURTHER)
+    return ["sfm_shapefit", *sorted({*(value.__module__ for value in public), *further})]
 
 
 def build(out: Path) -> None:
     """Write the pages into a folder."""
-    for module in map(import_module, MODULES):
+    names = modules()
+    for module in map(import_module, names):
         for name in getattr(module, "__all__", ()):
             getattr(module, name)  # pdoc sees only what is there, and some is imported at its first use
     pdoc.render.configure(docformat="google", show_source=False)
-    pdoc.pdoc(*MODULES, output_directory=out)
+    pdoc.pdoc(*names, output_directory=out)
 
 
 if __name__ == "__main__":

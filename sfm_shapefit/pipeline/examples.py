@@ -24,6 +24,8 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import assess
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import widest_level
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.adjust import read_bundle
 from sfm_shapefit.pipeline.evaluate import evaluate
@@ -122,11 +124,13 @@ def solve_by_splitting(_folder: Path) -> None:
 
 
 def solve_iteratively(_folder: Path) -> None:
-    """Solve a Laplacian without a factor."""
+    """Solve a Laplacian without a factor, in three dimensions and two, and ask whether one is worth it."""
     graph = _long_graph()
     solver = laplacian_factor(graph, Resources(threads=2, memory_bytes=0))
     solver.refactor(graph.weights)
-    solver.solve(np.ones((graph.num_nodes, 3)) * np.arange(3.0))
+    for dimension in (2, 3):
+        solver.solve(np.arange(float(graph.num_nodes * dimension)).reshape(-1, dimension))
+    widest_level(adjacency(graph.num_nodes, graph.edges))
 
 
 def find_pieces(_folder: Path) -> None:
@@ -151,8 +155,10 @@ def place_long_graph(_folder: Path) -> None:
 
 
 def place_flat_graph(_folder: Path) -> None:
-    """Place a graph in two dimensions."""
-    place(_random_graph(2), threads=2)
+    """Place a graph in two dimensions, and solve it by sparse Newton steps, as large ones are."""
+    graph = _random_graph(2)
+    place(graph, threads=2)
+    solve_newton_sparse(graph, 1e-8, 50)
 
 
 def locate_model(folder: Path) -> None:

@@ -8,7 +8,7 @@ from multiprocessing import Pipe
 import pytest
 
 from sfm_shapefit.base import kernel_cache
-from sfm_shapefit.laplacian import cholesky
+from sfm_shapefit.laplacian import cholesky, operators, ordering
 from sfm_shapefit.pipeline import examples
 from sfm_shapefit.pipeline import warm_up as module
 from sfm_shapefit.pipeline.warm_up import FURTHER, NEEDED, WarmUp, compile_together, warm_up
@@ -34,9 +34,12 @@ def test_examples_call_the_kernels_of_large_and_of_exact_graphs(tmp_path, monkey
 
     hear(cholesky, "gemm")
     hear(Anderson, "advance")
+    hear(operators, "_apply_entries")
+    hear(ordering, "_distances")
     examples.solve_sparse(tmp_path)
     examples.solve_by_splitting(tmp_path)
-    assert called == {"gemm", "advance"}
+    examples.solve_iteratively(tmp_path)
+    assert called == {"gemm", "advance", "_apply_entries", "_distances"}
 
 
 def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
