@@ -8,7 +8,6 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion
-from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
@@ -121,7 +120,10 @@ class ToldOpinion(Record):
     num_for: Annotated[int, "Pairs that support this model against the other, of wrong images."]
     num_against: Annotated[int, "Pairs of these that support the other."]
     ambiguous: Annotated[
-        tuple[str, ...], "Images that stand there too, though matches suit another rotation."
+        tuple[str, ...], "Images that stand there too, though matches suit another place or rotation."
+    ]
+    has_nothing_in_common: Annotated[
+        bool, "Whether the two have different shapes, and nothing says whose is right."
     ]
 
     @property
@@ -138,10 +140,10 @@ class ToldOpinion(Record):
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
         if self.ambiguous:
             where = f"{_cameras(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}, but matches speak as much for another rotation")
+            parts.append(f"{where}, but matches speak as much for another place or rotation")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
-        if not parts and self.usual > FEW:
+        if self.has_nothing_in_common:
             return f"{self.num_common} cameras have nothing in common with where they stand {by} ({usual})"
         told = "; ".join(parts) or f"{self.num_common} cameras stand in the same place {by}"
         return f"{told} ({usual})"
@@ -219,19 +221,12 @@ def _tell_group(group: Seam | Untied, images: Images) -> dict[str, Any]:
 
 
 def _tell_opinion(second: SecondOpinion, images: Images) -> ToldOpinion:
-    wrong, undecided, ambiguous = (
-        tuple(images.names[k] for k in rows.tolist())
-        for rows in (second.wrong, second.undecided, second.ambiguous)
-    )
-    return ToldOpinion(
-        num_common=second.num_common,
-        usual=second.usual,
-        wrong=wrong,
-        undecided=undecided,
-        num_for=second.num_for,
-        num_against=second.num_against,
-        ambiguous=ambiguous,
-    )
+    told = second._asdict()
+    del told["confirmed"]
+    named = {
+        key: tuple(images.names[k] for k in told[key].tolist()) for key in ("wrong", "undecided", "ambiguous")
+    }
+    return ToldOpinion(**told | named, has_nothing_in_common=second.has_nothing_in_common)
 
 
 def _cameras(names: tuple[str, ...]) -> str:

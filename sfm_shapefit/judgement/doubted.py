@@ -5,7 +5,7 @@
 With s = placed / (placed + turned) of `turns`, the share of the pairs that agree with a camera as placed:
 
     right         f = min(1, s / 0.75), which is 0.8 or more
-    ambiguous     f = 0.65: kept by default, and to be looked at
+    ambiguous     f = 0.67: kept by default, and to be looked at
     turned        f = s, which is less than 0.3
     unsupported   f = 0
     unknown       trust as by the share of pairs alone
@@ -21,11 +21,10 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.judgement.limits import MANY
 from sfm_shapefit.judgement.trust import LOW_TRUST, SOMEWHAT_LOOSE, USUAL_SHARE
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.verdicts import Assessment
-
-_AMBIGUOUS = 0.65  # f; kept by default, but below the trust that goes without reasons
 
 
 def weigh_doubts(assessment: Assessment, doubts: Doubts) -> Assessment:
@@ -71,7 +70,7 @@ def _factors(doubts: Doubts) -> FloatArray:
     share = doubts.placed / np.maximum(doubts.placed + doubts.turned, 1e-300)
     by_kind = {
         Doubt.RIGHT: np.minimum(share / USUAL_SHARE, 1.0),
-        Doubt.AMBIGUOUS: np.full(len(share), _AMBIGUOUS),
+        Doubt.AMBIGUOUS: np.full(len(share), 1.0 - MANY),
         Doubt.TURNED: share,
         Doubt.UNSUPPORTED: np.zeros(len(share)),
         Doubt.UNKNOWN: np.full(len(share), np.nan),

@@ -8,7 +8,7 @@ it has none at all. Half of the pairs between fisheyes in a park know theirs wor
 though the model is sound.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import FEW, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
+from sfm_shapefit.judgement.limits import FEW, HALF, KNOWN_DEG, MANY, OUTNUMBERED, SIGMAS, SURE_SIGMAS
 from sfm_shapefit.judgement.places import OtherPlace, find_other_places
 from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
@@ -146,6 +146,11 @@ class SecondOpinion(NamedTuple):
     """Rows of cameras that stand where they do in the other model, which doubts them; none is `confirmed`."""
 
     @property
+    def alike(self) -> IntArray:
+        """Rows of the cameras that stand where they do in the other model."""
+        return np.concatenate([self.confirmed, self.ambiguous])
+
+    @property
     def has_nothing_in_common(self) -> bool:
         """Whether the two have different shapes, and no pair says which is right."""
         return self.usual > FEW and not (len(self.wrong) or len(self.undecided) or len(self.ambiguous))
@@ -169,3 +174,22 @@ class ModelEvidence:
     """Cameras of the largest group that agreeing pairs, or points that fit, hold; None without pairs."""
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""
+
+    def beside(self, second: SecondOpinion) -> "ModelEvidence":
+        """Return the same with a second opinion, without what that clears.
+
+        Groups most of which stand alike in both are the right side of a seam, if others do not.
+        """
+
+        def may_be_wrong(group: Seam | Untied) -> bool:
+            return len(second.wrong) < 2 or bool(np.isin(group.cameras, second.alike).mean() < HALF)
+
+        confirmed = set(second.confirmed.tolist())
+        return replace(
+            self,
+            places=tuple(one for one in self.places if one.camera not in confirmed),
+            contradicted=tuple(one for one in self.contradicted if one.camera not in confirmed),
+            seams=tuple(filter(may_be_wrong, self.seams)),
+            untied=tuple(filter(may_be_wrong, self.untied)),
+            second=second,
+        )

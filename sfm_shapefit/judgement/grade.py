@@ -3,7 +3,7 @@
 Do not use, if any of these holds:
 
     the pairs that agree hold less than half of the cameras in one rigid piece, also with the points that fit,
-    however many contradict; of a bare graph, the residuals of its directions have a level above 5 degrees
+    however many contradict; of a bare graph, the residuals of its directions have a level above 6 degrees
     half or more of the observations of two or more matches contradict the cameras: they see no 3D point, and
     most of their matches miss the epipolar lines
     fewer than half of all images are in the output
@@ -39,20 +39,19 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.geometry import distances_in_spreads
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.judged import Judged
-from sfm_shapefit.judgement.limits import FEW, HALF, MANY, RARE
+from sfm_shapefit.judgement.limits import FEW, HALF, INSIDE, KNOWN_DEG, MANY, RARE, SURE_SIGMAS
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
-MOST_LEVEL_DEG = 5.0  # degrees, level of agreeing residuals; above, the model is not to be used
+MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
-_INSIDE = 30.0  # median distances from the median; cameras within say how large the scene is
 
 
 class Grade(enum.StrEnum):
@@ -121,14 +120,14 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     second = evidence.second
     wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
     if second is not None and len(wrong) > 1:  # which tells which side of a seam is wrong, and where it runs
-        apart = list(dict.fromkeys([*wrong, *np.setdiff1d(apart, second.confirmed).astype(int).tolist()]))
+        apart = list(dict.fromkeys([*wrong, *np.setdiff1d(apart, second.alike).astype(int).tolist()]))
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
     lenses = [wrong.lens for wrong in evidence.lenses]
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
     places = (place.camera for place in evidence.places)
     named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
     confirmed = set() if second is None else set(second.confirmed.tolist())
-    doubted = [one.camera for one in evidence.contradicted if one.camera not in confirmed]
+    doubted = [one.camera for one in evidence.contradicted]
     doubted += [*unchecked, *([] if second is None else second.ambiguous.tolist())]
     count = int(images.is_posed.sum())
     suspicions: list[str] = []
@@ -223,6 +222,5 @@ def largest_sigmas(placement: Judged) -> FloatArray:
 
 def _extent(locations: FloatArray) -> float:
     """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
-    distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
-    inside = locations[distances <= _INSIDE * median_spread(locations)]
+    inside = locations[distances_in_spreads(locations, locations) <= INSIDE]
     return float(np.linalg.norm(np.ptp(inside, axis=0)))

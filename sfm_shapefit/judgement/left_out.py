@@ -25,7 +25,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.base.jit import inner_kernel, kernel
-from sfm_shapefit.judgement.limits import FEWEST_POINTS, SIGMAS
+from sfm_shapefit.judgement.limits import FEWEST_POINTS, FITTING_PX
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.lens import LARGEST_SIGMA
@@ -35,16 +35,13 @@ _UNKNOWNS = 7  # rotation, shift, log of the focal length; in this order
 _MOST_STEPS = 25  # Gauss-Newton steps; ten are usual, a focal length 1.5 times too large takes 15
 _STILL = 1e-2  # standard deviations; a shorter step is the last
 _LONGEST_STEP = 0.3  # log of the focal length; its model is linear no farther
-_FARTHEST = 1.8  # log of the focal length; no lens is given 6 times too long, such a fit ran away
 _MOST_OBSERVATIONS = 600  # observations of an image, evenly taken; more cost time and say little
 _MEDIAN_SQUARE = 1.386  # median of the square of a residual of two axes with unit noise: 2 ln 2
 _WIDTH = 2.0  # standard deviations of Cauchy's loss; see Holland and Welsch (1977) for one axis
 _LEAST_DETERMINANT = 1e-12  # determinant of A over its trace cubed; below, the others do not hold a point
 _LEAST_PIVOT = 1e-13  # pivot of a unit diagonal; rounding leaves as much where nothing determines an unknown
 _ANGULAR = ("EQUIRECTANGULAR", "FOV")  # lenses beside the fisheyes whose pictures grow with the angle
-_LEAST_NOISY_PX = 1.0  # pixels; an image of more, and of three usual noises, fits nowhere
 _LEAST_NOISE = 1e-4  # pixels squared; exact points have none, but bend to what is wrong elsewhere
-
 _LEAST_FREE = 5e-6  # free share; exactly flat scenes have less, wrong lenses in true ones from 1e-5 on
 
 
@@ -69,10 +66,8 @@ class LeftOut:
         return np.asarray((self.sigmas <= LARGEST_SIGMA) & (self.free_shares >= _LEAST_FREE))
 
     def of_little_noise(self, usual: BoolArray) -> "LeftOut":
-        """Return the same without the sigmas of images whose noise is far above that of `usual` ones (i,)."""
-        noise_px = self.noise_px[usual & np.isfinite(self.noise_px)]
-        most_px = SIGMAS * float(np.median(noise_px)) if len(noise_px) else np.inf
-        noisy = ~usual & ~(self.noise_px <= max(most_px, _LEAST_NOISY_PX))
+        """Return the same without the sigmas of other images than `usual` ones (i,) that fit nowhere."""
+        noisy = ~usual & ~(self.noise_px <= FITTING_PX)
         return replace(self, sigmas=np.where(noisy, np.nan, self.sigmas))
 
 
@@ -202,7 +197,7 @@ def _fit_image(
         share = min(1.0, _LONGEST_STEP / max(abs(step[6]), 1e-300))
         _move(step, share, rotation, t)
         log_factor += share * step[6]
-        if scale == 0.0 or abs(log_factor) > _FARTHEST:
+        if scale == 0.0:
             return
         if length < _STILL * np.sqrt(scale):
             figures[0], figures[1] = log_factor, np.sqrt(scale / system[6, 6])

@@ -8,7 +8,7 @@ OUTNUMBERED = 2.0
 has twice as many is believed."""
 HALF = 1.0 / OUTNUMBERED
 """Share of those for the other explanation that one needs at least to be its rival."""
-MANY = 1 / 3
+MANY = 1.0 / (1.0 + OUTNUMBERED)
 """Share of pairs of a camera, or of cameras; where more speak against, the rest does not outnumber them."""
 FEW = 0.1
 """Share of cameras, of pairs, or of the spread of the scene; less is local and leaves the whole as it is."""
@@ -32,5 +32,9 @@ CHECKED_BY = 2
 """Matches of a keypoint in other images that check one another; one may be as false as its pair."""
 SMALLEST_SHAPE = 3
 """Cameras, frames or images; fewer have no shape, or no half."""
+FITTING_PX = 4.0
+"""Pixels; what misses its point by more does not fit, as COLMAP has it."""
+INSIDE = 30.0
+"""Median distances from the median; cameras and points within say how large the scene is."""
 MOST_COMPARED = 300
 """Turns that are compared with one another; the time grows with the square."""

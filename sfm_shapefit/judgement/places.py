@@ -6,8 +6,7 @@ camera. Each two rejected rays have a point nearest to both; where most of them 
 
 That it fits by chance is unlikely, but a camera that its pairs leave loose has many places. So the other one
 counts if three pairs or more are for it, half as many at least as are for this one alone, if most pairs that
-agree with this place do not pass there too. Directions that are a degree off in
-general, as where things move, tell no places.
+agree with this place do not pass there too. Directions that are a degree off in general tell no places.
 
 castle-P19 and P30, 40 % of whose pairs are rejected, have no camera with another place, nor has any of 13
 more scenes that are sound (`scripts/results/verdict.md` has spoiled ones).
@@ -21,7 +20,6 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.judgement.limits import ALIKE_DEG, FEWEST_ALIKE, HALF, NEAR_DEG, SIGMAS
 
-_LEAST_SINE = 0.1  # sine of the angle between two rays that define a place; flatter ones cut anywhere
 _MOST_RAYS = 30  # rejected rays of a camera that define places, evenly taken; all of them count
 
 
@@ -111,7 +109,7 @@ class _Rays(NamedTuple):
         u, v, between = self.directions[a], self.directions[b], self.origins[b] - self.origins[a]
         cosine = np.einsum("ka,ka->k", u, v)
         square = 1.0 - cosine**2
-        wide = square > _LEAST_SINE**2
+        wide = square > np.sin(np.radians(ALIKE_DEG)) ** 2  # flatter ones cut anywhere
         u, v, between, cosine, square = u[wide], v[wide], between[wide], cosine[wide], square[wide]
         along_u, along_v = np.einsum("ka,ka->k", u, between), np.einsum("ka,ka->k", v, between)
         s, t = (along_u - cosine * along_v) / square, (cosine * along_u - along_v) / square

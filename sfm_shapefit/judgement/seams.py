@@ -8,7 +8,7 @@ correlation clustering with a weight of 1 for each pair that agrees, and of -1 f
 Pairs of repeated structure contradict in numbers, too. A cut is a seam
 
     untied   if neither pairs nor points tie most of the group to what most of the rest is in (`ties`)
-    turned   else, if more than a tenth of the contradictions, and five, agree on one turn of the group, by
+    turned   else, if more than a tenth of the contradictions, and three, agree on one turn of the group, by
              the relative rotations that their matches have by themselves: Q = R_j^T R_ij R_i, i outside, j in
              the group. Where they agree on none, the rotations are right and the group is shifted or scaled,
              but moving things make pairs say so, too
@@ -25,10 +25,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
-from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, MOST_COMPARED, OUTNUMBERED
+from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, FEWEST_ALIKE, MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 
-_FEWEST_CONTRADICTING = 5  # pairs across a cut, and pairs on one turn; fewer are chance
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
 
 
@@ -80,7 +79,7 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
             continue  # a single camera is no group, and has tests of its own
         inside = bodies == body
         across = [side[inside[side].sum(axis=1) == 1] for side in (agreeing, contradicting)]
-        if len(across[1]) >= _FEWEST_CONTRADICTING and len(across[1]) > OUTNUMBERED * len(across[0]):
+        if len(across[1]) >= FEWEST_ALIKE and len(across[1]) > OUTNUMBERED * len(across[0]):
             is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
             cuts.append(Cut(np.flatnonzero(inside), len(across[0]), across[1], is_tied))
     return tuple(cuts)
@@ -105,7 +104,7 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         num_turned, turn_deg = _most_alike(turns)
         share = num_turned / max(len(rows), 1)
         num = len(cut.contradicting)
-        is_turned = num_turned >= _FEWEST_CONTRADICTING and share > FEW
+        is_turned = num_turned >= FEWEST_ALIKE and share > FEW
         if (is_turned and turn_deg > ALIKE_DEG) or not cut.is_tied:
             seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
     return tuple(seams)

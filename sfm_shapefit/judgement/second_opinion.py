@@ -3,8 +3,8 @@
 A group that is wrong as a whole agrees in itself, and where false pairs tie it to the rest too, no test of
 the model alone finds it. Another model that takes nothing of the first errs elsewhere, if at all. Both are
 brought together by a similarity that half of the cameras may fail (`fit_similarity_l1`). A camera stands
-elsewhere if it is off by more than is usual between the two, and by more than a hundredth of the scene or a
-degree.
+elsewhere if it is off by more than is usual between the two, and by more than half a degree, or what shows as
+that from across the scene.
 
 Which of the two is right there, the pairs say that it has with cameras on which both agree, and whose
 direction each model measures by its own rotations and lenses: a pair speaks for one of them if it misses the
@@ -22,9 +22,8 @@ from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, NEAR_DEG, OUTNUMBERED, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.scene.images import Images
 
-_CAP = 0.03  # spreads; farther off, a camera is lost, and half of them may be
-_ROUNDING, _ROUNDING_DEG = 1e-7, 1e-5  # spreads and degrees; usual differences of the same model are smaller
-_FAR = 0.01  # spreads; what is nearer needs no judge
+_FAR = np.radians(NEAR_DEG)  # spreads; what is nearer needs no judge, and six times as far a camera is lost
+_ROUNDING = 1e-7  # spreads and radians; usual differences of the same model are smaller
 _NO_DIRECTION_DEG = 90.0  # degrees; the matches of such a pair contradict the rotations, as badly as can be
 
 
@@ -48,12 +47,12 @@ def compare_models(
     spread = median_spread(images.centers[mine])
     if not spread > 0.0:
         return None
-    aligned = fit_similarity_l1(others.centers[theirs], images.centers[mine], cap=_CAP * spread)
+    aligned = fit_similarity_l1(others.centers[theirs], images.centers[mine], cap=SURE_SIGMAS * _FAR * spread)
     distances = np.linalg.norm(aligned.apply(others.centers[theirs]) - images.centers[mine], axis=1) / spread
     turns = np.swapaxes(others.rotations[theirs], 1, 2) @ images.rotations[mine]
     angles = rotation_angles_deg(np.swapaxes(turns, 1, 2) @ mean_rotation_l1(turns))
     usual = float(np.median(distances))
-    turned = max(float(np.median(angles)), _ROUNDING_DEG)
+    turned = max(float(np.median(angles)), np.degrees(_ROUNDING))
     unlike = distances > SURE_SIGMAS * max(usual, _ROUNDING), angles > SURE_SIGMAS * turned
     elsewhere = (unlike[0] & (distances > _FAR)) | (unlike[1] & (angles > NEAR_DEG))
     residuals = _residuals(fits, mine), _residuals(other_fits, theirs)

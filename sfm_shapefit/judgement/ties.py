@@ -28,9 +28,6 @@ from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, FEWEST_POINTS, OUTNUMBERED
 
-# NodeLinks that fit, those of them without any one camera, and how many may miss for each; see the header.
-_BY_POINTS = (FEWEST_POINTS, FEWEST_POINTS, 1.0 / OUTNUMBERED)
-_BY_PAIRS = (FEWEST_ALIKE, FEWEST_ALIKE - 1, OUTNUMBERED)
 _MOST_RAYS = 200  # rays per node that are asked first; what these leave apart is asked by all
 _LINKS_A_BLOCK = 500_000  # links that are counted at a time: 50 MB
 _UNKNOWNS = 7  # numbers; turn, shift and scale: fewer facts leave some of them open
@@ -50,6 +47,22 @@ class Untied(NamedTuple):
     """Points of three images or more between it and the rest that fit."""
     is_loose: bool
     """Whether nothing says how it stands to the rest."""
+
+
+class _Rule(NamedTuple):
+    """Links that fit, those of these without any one camera, and how many may miss for each; see above."""
+
+    least: int
+    spare: int
+    most_missing: float
+
+    def tie(self, fitting: FloatArray | int, missing: FloatArray | int) -> BoolArray:
+        """Return where enough fit, and few miss."""
+        return np.asarray((fitting >= self.least) & (missing <= self.most_missing * fitting))
+
+
+_BY_POINTS = _Rule(FEWEST_POINTS, FEWEST_POINTS, 1.0 / OUTNUMBERED)
+_BY_PAIRS = _Rule(FEWEST_ALIKE, FEWEST_ALIKE - 1, OUTNUMBERED)
 
 
 class NodeLinks(NamedTuple):
@@ -117,7 +130,7 @@ def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray
     others = np.bincount(rays.points, group[rays.nodes] != lowest[rays.points])
     points, is_done = rows_taken(rays, (others > 0)[rays.points]).links(), False
     while not is_done:
-        united = _unite(_unite(group, points, *_BY_POINTS), pairs, *_BY_PAIRS)
+        united = _unite(_unite(group, points, _BY_POINTS), pairs, _BY_PAIRS)
         is_done, group = len(np.unique(united)) == len(np.unique(group)), united
     sizes = np.bincount(group)
     names = np.argsort(-sizes, kind="stable")[: np.sum(sizes > 1)].tolist()
@@ -145,7 +158,7 @@ def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     rays, group = _of_three(rays), np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1
     names, fitting, missing = _count(group, rows_taken(rays, rays.points % step == 0).blocks())
-    names = names[(fitting >= FEWEST_POINTS) & (missing <= _BY_POINTS[2] * fitting)]
+    names = names[_BY_POINTS.tie(fitting, missing)]
     strong = np.concatenate([np.column_stack(np.divmod(names, count)), known])
     strong = np.unique(np.sort(strong, axis=1), axis=0)
     if len(strong):
@@ -157,12 +170,12 @@ def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     return np.unique(group, return_inverse=True)[1]
 
 
-def _unite(group: IntArray, links: NodeLinks, least: int, spare: int, most_missing: float) -> IntArray:
+def _unite(group: IntArray, links: NodeLinks, rule: _Rule) -> IntArray:
     """Return the groups (n,) after each has united with the larger one that most links tie it to, if any.
 
     A node by itself unites with a single group: it may stand in two that nothing else ties.
     """
-    pairs, numbers = _tied(group, links, least, spare, most_missing)
+    pairs, numbers = _tied(group, links, rule)
     sizes = np.bincount(group, minlength=len(group))
     order = np.lexsort((pairs, sizes[pairs]), axis=1)
     pairs = np.take_along_axis(pairs, order, axis=1)
@@ -176,14 +189,11 @@ def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
     """Return a group, the nodes inside, with what crosses between it and the rest."""
     ends, facts = [np.zeros((0, 2), dtype=np.int64)], 0
     numbers: list[int] = []
-    for links, says, most_missing in (
-        (pairs, _PAIR_SAYS, _BY_PAIRS[2]),
-        (points, _POINT_SAYS, _BY_POINTS[2]),
-    ):
+    for links, says, rule in ((pairs, _PAIR_SAYS, _BY_PAIRS), (points, _POINT_SAYS, _BY_POINTS)):
         across = rows_taken(links, inside[links.ends].sum(axis=1) == 1)
         fitting, missing = rows_taken(across, across.fits), rows_taken(across, ~across.fits)
         numbers += [fitting.number, missing.number]
-        if missing.number <= most_missing * fitting.number:
+        if rule._replace(least=0).tie(fitting.number, missing.number):
             ends.append(fitting.ends)
             facts += says * fitting.number
     every = np.concatenate(ends)
@@ -192,20 +202,10 @@ def _tell(inside: BoolArray, points: NodeLinks, pairs: NodeLinks) -> Untied:
     return Untied(np.flatnonzero(inside), agreeing, contradicting, shared, facts < _UNKNOWNS or of_one)
 
 
-def _tied(
-    group: IntArray, links: NodeLinks, least: int, spare: int, most_missing: float
-) -> tuple[IntArray, FloatArray]:
-    """Return the pairs of groups (p, 2) that links tie, of the groups of nodes (n,), and how many fit (p,).
-
-    Args:
-        group: (n,) group of each node.
-        links: between nodes.
-        least: links that fit.
-        spare: of these, without those of any one node of a group of several; a point counts for each.
-        most_missing: links that do not fit, for each that does.
-    """
+def _tied(group: IntArray, links: NodeLinks, rule: _Rule) -> tuple[IntArray, FloatArray]:
+    """Return the pairs (p, 2) that links tie of the groups of nodes (n,), and how many fit (p,)."""
     names, fitting, missing = _count(group, [links])
-    enough = (fitting >= least) & (missing <= most_missing * fitting)
+    enough = rule.tie(fitting, missing)
     both, sizes = np.column_stack(np.divmod(names, len(group))), np.bincount(group, minlength=len(group))
     across = rows_taken(links, links.fits & (group[links.ends[:, 0]] != group[links.ends[:, 1]]))
     ends = np.take_along_axis(across.ends, np.argsort(group[across.ends], axis=1), axis=1)
@@ -218,7 +218,7 @@ def _tied(
             total, most = np.zeros((2, len(names)))
             np.add.at(total, nodes // len(group), counts)
             np.maximum.at(most, nodes // len(group), counts)
-            enough &= ~several | (total - most >= spare)
+            enough &= ~several | (total - most >= rule.spare)
     return both[enough], fitting[enough]
 
 

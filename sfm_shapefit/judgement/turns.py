@@ -55,14 +55,12 @@ _MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are 
 _FLOOR_RAD = np.radians(0.1)  # radians; added for the errors of the given rotations
 _LEAST_TURN_RAD = np.radians(KNOWN_DEG)  # radians; a turn below this and ...
 _AGREEING_SIGMAS = 3.5  # ... below this, in standard deviations of the least certain axis: counts as none
-_PREFERENCE = 0.5  # standard deviations; a pair that fits an explanation better by less prefers none
 _LARGEST_SIGMA_RAD = np.radians(ALIKE_DEG)  # radians; agreement says nothing where more is as likely
 _LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1  # quantile of errors, and its value for normal ones; see above
 _UNEXPLAINED, _EXPLAINED = 0.7, 1.0 - RARE  # ratios of weights; given rotations fit not at all, and fully
 _MEAN_OF_MEDIAN = 0.8  # median residual of a robust fit over that of all matches; converts the second
 RIGHT_SHARE = 0.6
 """Share s; from here on a camera is right, below half of it turned."""
-TURNED_SHARE = HALF * RIGHT_SHARE
 _MOST_TURNED = 50  # bodies turned one after the other; each turn judges all others anew
 _AVERAGING_STEPS = 4  # steps of the robust mean turn; they start at the best vote
 
@@ -218,7 +216,7 @@ class _Judged(NamedTuple):
     def kind(self) -> Doubt:
         """The verdict."""
         share = self.placed / max(self.placed + self.turned, 1e-300)
-        if share < TURNED_SHARE and self.num_turned > 1:
+        if share < HALF * RIGHT_SHARE and self.num_turned > 1:
             return Doubt.TURNED
         if self.placed <= 0.0:
             return Doubt.UNSUPPORTED if self.is_alone and self.num_pairs else Doubt.UNKNOWN
@@ -374,7 +372,7 @@ def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: floa
     scale = np.where(finite, sigmas, 1.0)
     off_turned = np.where(finite, _angles(votes @ turn.T) / scale, np.inf)
     off_placed = np.where(finite, _angles(votes) / scale, np.inf)
-    turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned + _PREFERENCE < off_placed)
+    turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned < off_placed)
     # What fits as placed, within the accuracy of its own rotation, is no evidence for the turn.
     fit_both = np.where(off_placed <= _AGREEING_SIGMAS, support, 0.0)
     return judged._replace(

@@ -39,8 +39,9 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import median_spread
+from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.judgement.limits import FEW, INSIDE
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
@@ -51,8 +52,6 @@ _RIDGES = (
     1e-10,
     1e-8,
 )  # shares of each block's trace, added in turn; loose nodes become large, finite
-_LOOSE = 0.2  # spreads; a camera of larger standard deviation may not decide the gauge, ...
-_FAR = 10.0  # ... spreads from the cameras' median; nor may one that stands farther away
 _LOOSENING_ROUNDS = 20  # rounds in which cameras leave the gauge; a bound
 _SHORTEST = 1e-12  # share of the longest baseline; a shorter one counts as that long
 
@@ -255,26 +254,19 @@ def _fix_gauge(
     factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the covariances in the gauge of the cameras that are held, and which these are."""
-    gauge = is_camera & _is_near(locations, is_camera)
+    gauge = is_camera & (distances_in_spreads(locations, locations[is_camera]) <= INSIDE)
     least = max(3, int(np.sum(is_camera)) // 2)
     for _ in range(_LOOSENING_ROUNDS):
         covariances = _in_gauge(factor, inverse, *_gauge_pair(locations, gauge))
         sizes = np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
         largest = float(sizes[gauge].max())
-        if largest <= _LOOSE * median_spread(locations[gauge]):
+        if largest <= FEW * median_spread(locations[gauge]):
             break
         kept = gauge & (sizes < 0.5 * largest)
         if np.sum(kept) < least:
             break
         gauge = kept
     return covariances, gauge
-
-
-def _is_near(locations: FloatArray, is_camera: BoolArray) -> BoolArray:
-    """Return which nodes stand within a few spreads of the cameras' median."""
-    cameras = locations[is_camera]
-    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
-    return np.asarray(distances <= _FAR * median_spread(cameras))
 
 
 def _in_gauge(

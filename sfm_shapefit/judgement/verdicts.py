@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
-from sfm_shapefit.judgement.limits import SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import INSIDE, SMALLEST_SHAPE
 from sfm_shapefit.judgement.trust import judge_cameras
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (
@@ -34,7 +34,7 @@ _PART = 2_000  # directions whose error samples are worked on at a time; bounds 
 _LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nodes; with none, none would be
 # Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
 # not say how large the scene is.
-_REACHES = (np.inf, 1e3, 30.0)
+_REACHES = (np.inf, 1e3, INSIDE)
 _UNCHECKED_LEVERAGE = 0.99  # leverage; from here on agreement means nothing, 1 % of an error shows
 
 
@@ -60,8 +60,6 @@ class Assessment:
     NaN for agreeing pairs outside the largest rigid piece of those."""
     level_deg: float
     """Standard deviation, per axis, of the residuals of all pairs together (from their median)."""
-    excess_deg: float
-    """The part of it, per axis, that the pairs' own covariances do not explain."""
     trust: FloatArray
     """(k,) trust of each camera, in [0, 1], see `trust.judge_cameras`."""
     reasons: tuple[str, ...]
@@ -146,7 +144,6 @@ def assess(
         inliers=inliers,
         leverages=leverages,
         level_deg=float(np.degrees(agreement.level_rad)),
-        excess_deg=float(np.degrees(excess)),
         trust=judged.trust,
         reasons=judged.reasons,
         hold=judged.hold,
@@ -216,7 +213,7 @@ def _propagate_nodes(
             continue
         if found is None:
             break
-        inside = locations[nodes[distances[nodes] <= _REACHES[-1]]]
+        inside = locations[nodes[distances[nodes] <= INSIDE]]
         is_held = ~(found.sigmas > _extent(inside)).any(axis=1)
         covariances[nodes[is_held]] = found.covariances[is_held]
         leverages[rows] = found.leverages

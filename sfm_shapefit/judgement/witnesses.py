@@ -13,13 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
-from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED
+from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, FITTING_PX, OUTNUMBERED
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import keypoint_errors_px
-
-FITTING_PX = 4.0  # pixels; what misses its point by more does not fit, as COLMAP has it
 
 
 def are_confirmed(

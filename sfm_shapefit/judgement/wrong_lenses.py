@@ -1,12 +1,12 @@
 """Wrong lenses: whose images ask for another focal length when they are left out, one by one.
 
-A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Four do if
-they are 2.5 times those of any other image: before a wall, seen from the front, a camera that stands nearer
-hides nearly all of it. Where one took several, their points have bent to a wrong focal length, so that its
-value shows less than that the images ask for unlike ones: it is wrong if half of them change by more than
-0.4 % and three deviations. With right lenses, no image of 17 scenes changed by ten deviations, and half of
-those of a lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the
-points adjusted to that, half of them changed by 0.5 % or more.
+A lens that took one image is wrong if that changes by 2.5 % or more and ten standard deviations. Three do if
+they are twice those of any other image: before a wall, seen from the front, a camera that stands nearer hides
+nearly all of it. Where one took several, their points have bent to a wrong focal length, so that its value
+shows less than that the images ask for unlike ones: it is wrong if half of them change by more than 0.4 % and
+three deviations. With right lenses, no image of 17 scenes changed by ten deviations, and half of those of a
+lens changed by 0.2 % at most, or by two deviations; with all lenses wrong by 0.8 to 1.3 and the points
+adjusted to that, half of them changed by 0.5 % or more.
 """
 
 from typing import NamedTuple
@@ -16,15 +16,13 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.left_out import LeftOut, leave_one_out
-from sfm_shapefit.judgement.limits import HALF, SIGMAS, SMALLEST_SHAPE
+from sfm_shapefit.judgement.limits import HALF, OUTNUMBERED, SIGMAS, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 
 # Change of the focal length, and standard deviations, beyond which that of one image is wrong, and beyond
 # which half of the images of a lens show that it is; see the header.
 _ONE, _HALF = (0.025, 10.0), (0.004, SIGMAS)
-# Standard deviations, and how many times those of any other image: so clear is a lens of one image too.
-_CLEAR = (4.0, 2.5)
 
 
 class WrongLens(NamedTuple):
@@ -78,7 +76,7 @@ def wrong_lenses(left_out: LeftOut, images: Images) -> tuple[WrongLens, ...]:
     for lens in range(len(images.lenses)):
         own = images.lens_of == lens
         rows, others = (np.flatnonzero(side & left_out.observable) for side in (own, ~own))
-        (least, deviations), clear = _ONE, max(_CLEAR[0], _CLEAR[1] * scores[others].max(initial=0.0))
+        (least, deviations), clear = _ONE, max(SIGMAS, OUTNUMBERED * scores[others].max(initial=0.0))
         if len(rows) >= SMALLEST_SHAPE:
             least, deviations = _HALF
         elif own.sum() < SMALLEST_SHAPE and len(others) >= SMALLEST_SHAPE:

@@ -25,7 +25,7 @@ whose wide lenses show it little. If a camera is moved by 1 %, 35 % or more of i
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -137,9 +137,9 @@ def check_source(
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
-        if fits is not None and other is not None:
-            evidence = replace(evidence, second=_compare(matches, fits, structure, other))
-    cameras = _judge_cameras(model, quality, pairs, evidence)
+        cameras = _judge_cameras(model, quality, pairs, evidence)
+        second = None if fits is None or other is None else _compare(matches, fits, structure, other)
+        evidence = evidence if second is None else evidence.beside(second)
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)

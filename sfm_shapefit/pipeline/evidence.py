@@ -6,10 +6,10 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
-from sfm_shapefit.judgement.limits import OUTNUMBERED
+from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED
 from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
-from sfm_shapefit.judgement.witnesses import FITTING_PX, are_confirmed
+from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
 from sfm_shapefit.pipeline.doubts import ask_rotations
 from sfm_shapefit.pipeline.inputs import MatchSource

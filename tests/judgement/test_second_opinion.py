@@ -7,8 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.evidence import fit_pairs
+from sfm_shapefit.judgement.evidence import Contradicted, ModelEvidence, fit_pairs
+from sfm_shapefit.judgement.grade import weigh_evidence
+from sfm_shapefit.judgement.places import OtherPlace
+from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.second_opinion import compare_models
+from sfm_shapefit.judgement.ties import Untied
 from tests.judgement.test_pair_fits import measured
 from tests.judgement.test_seams import GROUP, N
 from tests.scenes import COURTYARD
@@ -74,6 +78,25 @@ def test_a_camera_that_the_other_model_doubts_is_not_confirmed_by_it(images):
     assert found.ambiguous.tolist() == [7]  # 5 stands elsewhere, where pairs support it
     assert found.wrong.tolist() == [5]
     assert sorted([*found.confirmed.tolist(), 5, 7]) == list(range(N))
+
+
+def test_what_it_clears_is_not_told(images):
+    """Of groups on both sides of a seam the wrong one is; who stands alike in both has one place."""
+    place = OtherPlace(5, 2, 3, np.ones(3), np.zeros((2, 2), dtype=int))
+    evidence = ModelEvidence(
+        places=(place, place._replace(camera=7)),
+        contradicted=(Contradicted(5, 9, 5), Contradicted(7, 9, 5)),
+        seams=tuple(Seam(np.array(rows), 1, 9, 0, np.nan) for rows in ([5, 6], [7, 8], [0, 7])),
+        untied=tuple(Untied(np.array(rows), 1, 9, 0, is_loose=True) for rows in ([5, 6], [7, 8])),
+    )
+    both = evidence.beside(compare(moved(images, [5, 6], shift=2.0), images, images, doubted=[0, 8]))
+    assert [one.camera for one in both.places] == [one.camera for one in both.contradicted] == [5]
+    assert [group.cameras.tolist() for group in (*both.seams, *both.untied)] == [[5, 6], [5, 6]]
+    against = weigh_evidence(both, images)
+    assert set(against.cameras) == {images.names[k] for k in (0, 5, 6, 8)}  # two are doubted there as well
+    assert f"2 of {N} cameras stand apart from the rest" in (*against.suspicions, *against.reasons)
+    one = evidence.beside(compare(moved(images, [5], shift=2.0), images, images))
+    assert (one.seams, one.untied) == (evidence.seams, evidence.untied)  # it says nothing of groups
 
 
 def test_where_pairs_support_neither_nobody_is_believed(images):

@@ -8,6 +8,7 @@ from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.verdicts import Verdict, assess
 from sfm_shapefit.placement.conditioning import Looseness
+from sfm_shapefit.refinement.agreement import find_agreement
 from sfm_shapefit.solver.program import differences
 from tests.problems import all_pairs, fit_angles
 
@@ -74,10 +75,10 @@ def test_the_excess_is_what_the_covariances_leave_unexplained():
     t = fit_angles(t, edges, v, 4)
     graph = ViewGraph(30, edges, v)
     less, more = (
-        assess(MeasuredGraph(graph, covariance=covariances(len(edges), share * SIGMA)), t).excess_deg
+        find_agreement(MeasuredGraph(graph, covariance=covariances(len(edges), share * SIGMA)), t).excess_rad
         for share in (0.6, 1.2)
     )
-    assert less == pytest.approx(np.degrees(0.8 * SIGMA), rel=0.15)
+    assert less == pytest.approx(0.8 * SIGMA, rel=0.15)
     assert more < 1e-6
 
 

@@ -110,7 +110,7 @@ def test_what_map_doubts_check_does_not_call_good():
         found = check(model, PHOTOGRAPHED / "database.db", second_opinion=mapped)
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
-        assert "matches speak as much for another rotation" in found.facts.evidence.second.statement
+        assert "matches speak as much for another place or rotation" in found.facts.evidence.second.statement
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
 
 

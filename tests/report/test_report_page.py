@@ -188,6 +188,7 @@ def doubted():
         num_for=0,
         num_against=9,
         ambiguous=(),
+        has_nothing_in_common=False,
     )
     evidence = ToldEvidence(places=(place,), seams=(apart([4, 5]), apart([3, 4, 5, 6])), second=second)
     return drawing, replace(facts, evidence=evidence, warnings=evidence.statements)
