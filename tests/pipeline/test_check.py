@@ -12,6 +12,7 @@ from sfm_shapefit.files.colmap.points import points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import weigh_evidence
 from sfm_shapefit.judgement.image_quality import image_quality
+from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.pipeline import checked
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.map import map_database
@@ -112,6 +113,15 @@ def test_what_map_doubts_check_does_not_call_good():
         assert found.facts.evidence.second.ambiguous == doubted
         assert "matches speak as much for another place or rotation" in found.facts.evidence.second.statement
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
+
+
+def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):
+    located = courtyard_mapped.models[0].located
+    place = OtherPlace(4, 3, 5, np.ones(3), np.zeros((3, 2), dtype=int))
+    doubtful = replace(located, evidence=ModelEvidence(places=(place,)))
+    other = replace(courtyard_mapped, models=(replace(courtyard_mapped.models[0], located=doubtful),))
+    found = check(COURTYARD / "truth", COURTYARD / "database.db", second_opinion=other)
+    assert found.facts.evidence.second.ambiguous == found.verdict.cameras == (located.placed.names[4],)
 
 
 def spoiled(folder, place=None, *, points=True, num_posed=None, names=None):
