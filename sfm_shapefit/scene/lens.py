@@ -39,7 +39,7 @@ _MOST_STEPS, _STILL = 30, 1e-12
 _SAME_RAYS = 0.01  # difference of unit rays; more makes relative rotations worth measuring anew
 _PIXELS_A_SLICE = 20_000  # pixels undistorted at once; their arrays stay in the cache
 
-LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, nothing that was given is contradicted
+LARGEST_SIGMA = 0.02  # relative sigma of a focal length; above it, the observations leave it open
 # Factor by which the errors that keypoints share make those of a focal length larger than the noise alone
 # does; measured on kitti-turn, driven straight ahead for the greatest part.
 _SHARED_NOISE = 7.0
@@ -193,7 +193,7 @@ class Lens:
         sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
         better = _SHARED_NOISE * sigma <= self.focal_sigma
         contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
-        return sound and (better or (contradicts and sigma <= LARGEST_SIGMA))
+        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
 
 
 def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float) -> FloatArray:
