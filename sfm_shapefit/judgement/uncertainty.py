@@ -41,7 +41,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.judgement.limits import FEW, INSIDE
+from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
@@ -52,6 +52,7 @@ _RIDGES = (
     1e-10,
     1e-8,
 )  # shares of each block's trace, added in turn; loose nodes become large, finite
+_FAR = 10.0  # spreads from the cameras' median; one that stands farther away may not decide the gauge
 _LOOSENING_ROUNDS = 20  # rounds in which cameras leave the gauge; a bound
 _SHORTEST = 1e-12  # share of the longest baseline; a shorter one counts as that long
 
@@ -254,7 +255,7 @@ def _fix_gauge(
     factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the covariances in the gauge of the cameras that are held, and which these are."""
-    gauge = is_camera & (distances_in_spreads(locations, locations[is_camera]) <= INSIDE)
+    gauge = is_camera & (distances_in_spreads(locations, locations[is_camera]) <= _FAR)
     least = max(3, int(np.sum(is_camera)) // 2)
     for _ in range(_LOOSENING_ROUNDS):
         covariances = _in_gauge(factor, inverse, *_gauge_pair(locations, gauge))
