@@ -301,7 +301,7 @@ class AdjustmentRun:
         Herz-Jesus-P8 are a quarter less than the checked points give, and the errors are not.
         """
         if problem.num_frames > MOST_FRAMES:
-            return self, None
+            return self.judge_lenses(problem)[0], None
         is_checked = np.bincount(problem.points_seen, minlength=problem.num_points) >= self.checked_length
         checked = problem.of_points(is_checked) if is_checked.any() else problem
         try:
@@ -312,7 +312,7 @@ class AdjustmentRun:
             of_lenses, sigmas = errors_of_free_lenses(checked, options, self.freedom)
             return self._knowing(sigmas), replace(known, covariances=known.covariances + of_lenses)
         except UnsolvableError:
-            return self, None
+            return self.judge_lenses(problem)[0], None
 
 
 Solved = tuple[AdjustmentRun, AdjustmentProblem]
@@ -431,8 +431,8 @@ def repeat_with_known_lenses(
     Args:
         run: before the solve.
         solve, again: the first solve, and those after it.
-        more_follows: whether images are measured anew, or adjusted by all points, from here. Where lenses of
-            few images are held, nothing is then solved again.
+        more_follows: whether images are measured anew, or adjusted by all points, while lenses move. Where
+            those of few images are held, and others move, nothing is then solved again.
     """
     run, last = solve(run)
     for _ in range(_MOST_REPETITIONS):
@@ -440,7 +440,8 @@ def repeat_with_known_lenses(
         if not is_open.any():
             return run, last
         run = run.holding(is_open)
-        if more_follows and np.mean(is_open[run.images.lens_of]) <= _FEW:
+        are_few = np.mean(is_open[run.images.lens_of]) <= _FEW
+        if more_follows and are_few and run.frees_more_than_poses:
             return run, last
         run, last = again(run)
     return run.judge_lenses(last)[0], last

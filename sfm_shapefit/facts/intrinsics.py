@@ -166,7 +166,7 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
 
 
 def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
-    """Yield which cameras keep a focal length that was never measured."""
+    """Yield which cameras keep a focal length that was never measured, or have one that is hardly known."""
     guessed = [row for row in rows if row.origin != Origin.CALIBRATION.value]
     for how, what in (
         (
@@ -182,6 +182,13 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
                 f"{noun} {first_of(cameras)} kept a focal length that was never measured, "
                 f"{what}; calibrate if the result is poor"
             )
-    if loose := [str(row.camera) for row in guessed if (row.focal_sigma_px or 0.0) > _LOOSE * row.focal_px]:
-        known = f"the matches know to {_LOOSE:.0%} at best, and the distance to what is seen no better"
-        yield f"{'cameras' if len(loose) > 1 else 'camera'} {first_of(loose)} got a focal length that {known}"
+    adjusted = (row for row in guessed if row.decided_by == "adjusted")
+    loose = [
+        str(row.camera) for row in adjusted if not (row.focal_sigma_px or np.inf) <= _LOOSE * row.focal_px
+    ]
+    if loose:
+        yield (
+            f"the matches hardly tell the focal length of {'cameras' if len(loose) > 1 else 'camera'} "
+            f"{first_of(loose)} (± {_LOOSE:.0%} or more), so these may stand too near to what they see, "
+            "or too far from it; calibrate them if that matters"
+        )

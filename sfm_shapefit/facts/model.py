@@ -383,7 +383,9 @@ class CheckedFacts(FactsOfModel):
     def next_step(self) -> NextStep:
         """What to do next."""
         path, second = shlex.quote(self.inputs.path), self.evidence.second
-        is_as_map_has_it = second is not None and not (second.wrong or second.undecided)
+        is_as_map_has_it = second is not None and not (
+            second.wrong or second.undecided or second.has_nothing_in_common
+        )
         if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
             step = next_of_model(self.verdict.grade, self.inputs)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))

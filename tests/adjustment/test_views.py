@@ -293,13 +293,16 @@ def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in
         dampings.clear()
 
 
-@pytest.mark.parametrize(("num_open", "follows", "num_solves"), [(1, True, 1), (1, False, 2), (2, True, 2)])
+@pytest.mark.parametrize(
+    ("num_open", "follows", "others_move", "num_solves"),
+    [(1, True, True, 1), (1, True, False, 2), (1, False, True, 2), (2, True, True, 2)],
+)
 def test_where_lenses_of_few_images_are_left_open_nothing_is_solved_again_if_more_follows(
-    num_open, follows, num_solves
+    num_open, follows, others_move, num_solves
 ):
     solved, judged = [], iter([np.arange(10) < num_open, np.zeros(10, bool)])
     run = SimpleNamespace(images=SimpleNamespace(lens_of=np.arange(10)), holding=lambda _: run)
-    run.judge_lenses = lambda _: (run, next(judged))
+    run.judge_lenses, run.frees_more_than_poses = lambda _: (run, next(judged)), others_move
 
     def solve(run):
         return run, solved.append(run)

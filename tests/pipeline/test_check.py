@@ -113,6 +113,9 @@ def test_what_map_doubts_check_does_not_call_good():
         assert found.facts.evidence.second.ambiguous == doubted
         assert "matches speak as much for another place or rotation" in found.facts.evidence.second.statement
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
+        evidence = found.facts.evidence
+        unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
+        assert "image_undistorter" not in replace(found.facts, evidence=unlike).next_step.command
 
 
 def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):
