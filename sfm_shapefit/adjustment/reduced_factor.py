@@ -131,7 +131,7 @@ class SparseFactor:
     unknown: FloatArray
     """(N, 6) 1 where a slot is an unknown."""
     system: ReducedSystem | None = None
-    """What is factored."""
+    """What is factored, while the factor has 32 bits."""
 
     @classmethod
     def plan(cls, layout: Layout, threads: int, dtype: npt.DTypeLike) -> "SparseFactor":
@@ -145,8 +145,8 @@ class SparseFactor:
         """Factor a system."""
         if not len(self.factor.panels):
             self._allocate(self.factor.dtype)
-        b, self.system = self.factor.block, system
-        is_full, diagonal = self.factor.dtype == np.float64, system.diagonal[:, :b, :b].copy()
+        b, is_full = self.factor.block, self.factor.dtype == np.float64
+        self.system, diagonal = None if is_full else system, system.diagonal[:, :b, :b].copy()
         np.einsum("naa->na", diagonal)[:] *= 1.0 if is_full else 1.0 + _RIDGE
         if self.factor.refactor_blocks(self.pair_nodes, diagonal, system.pairs[:, :b, :b]):
             return
