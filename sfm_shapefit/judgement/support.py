@@ -87,7 +87,7 @@ def count_observations(
         points: triangulated from these matches.
         images: some of them posed.
         num_keypoints: (i,)
-        batches: matches of all pairs of images.
+        batches: matches of all pairs of posed images, and maybe of others.
         rotations: (i, 3, 3) cam_from_world by which the rays of the matches are in world axes.
         max_error_px: distance from the epipolar line (of both images together, to first order) from which a
             match contradicts.

@@ -94,9 +94,10 @@ def seed_points(
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:
         limit_px, rotations = options.structure.max_reprojection_error_px, source.images.rotations
-        num_keypoints, batches = source.view.num_keypoints, source.view.batches(without=source.pairs_of_fixed)
-        counts = count_observations(points, images, num_keypoints, batches, rotations, limit_px)
-        source.view.give_back()
+        view, without = source.view, source.pairs_of_fixed
+        batches = view.batches(without=without, among=stand.among)
+        counts = count_observations(points, images, view.num_keypoints, batches, rotations, limit_px)
+        view.give_back()
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:
             seen = np.where(unsupported, points.count_seen(len(seen)), seen)

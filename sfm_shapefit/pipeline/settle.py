@@ -242,8 +242,7 @@ def _judge(stand: Stand, options: PlacingOptions, before: Images, clock: Clock) 
     """Return the evidence for a piece where its cameras stand, without the samples of errors that it took."""
     placement, source, relative = stand.placement, stand.source, None
     if not stand.given.believes_rotations:
-        among = placement.cameras if placement.piece else None
-        relative = ask_pairs(source, stand.directions, clock.threads, among)
+        relative = ask_pairs(source, stand.directions, clock.threads, stand.among)
     judged = judge(placement, source.economy.limit(options.placement))
     if stand.estimate is not None:
         judged = with_uncertainty(judged, before, stand.estimate, stand.scale)

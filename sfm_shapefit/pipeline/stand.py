@@ -73,6 +73,11 @@ class Stand(NamedTuple):
         freedom = Freedom.asked(options.freedom, (lenses.focal, lenses.distortion), rigs=has_rigs)
         return cls(given, source, directions, placement, gauge, freedom, lenses)
 
+    @property
+    def among(self) -> IntArray | None:
+        """The images whose matches are read: of a further piece, which is small, its own; None for all."""
+        return self.placement.cameras if self.placement.piece else None
+
     def failed(self, how: str) -> "Stand":
         """Return the same without a step that failed; `how` says which and why, a clause."""
         return self._replace(failures=(*self.failures, how))
@@ -108,10 +113,8 @@ class Stand(NamedTuple):
         view, pictures = self.source.view, self.pictures(posed)
         if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
             return collect_tracks(posed.images, pictures, self.source.matches.points_of(posed.images))
-        # A further piece is small: read no more than it needs.
-        among = self.placement.cameras if self.placement.piece else None
         without = self.placement.rejected_pairs
-        links = view.links(without=without, among=among, advance=advance, consume=True)
+        links = view.links(without=without, among=self.among, advance=advance, consume=True)
         place = np.full(self.source.images.num_images, -1)
         place[posed.rows] = np.arange(len(posed.rows))
         return collect_matches(posed.images, pictures, place, links, view.num_matches)

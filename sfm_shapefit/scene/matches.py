@@ -251,22 +251,28 @@ class View:
         return self.matches.keypoints(self.images.names[image])
 
     def batches(
-        self, min_matches: int = 1, without: IntArray | None = None, advance: Advance = nobody
+        self,
+        min_matches: int = 1,
+        without: IntArray | None = None,
+        among: IntArray | None = None,
+        advance: Advance = nobody,
     ) -> Iterator[MatchBatch]:
         """Yield the matches with rays in world axes, in batches; few matches are kept with these.
 
         Args:
             min_matches: pairs with fewer are left out.
             without: (m, 2) pairs that are left out, too, whatever the order of their images.
+            among: only pairs of these images.
             advance: hears of the pairs that are done, while batches are consumed, and of their number.
 
         Raises:
             InputError: as `Matches.read`.
         """
-        if min_matches in self._kept and without is None:
+        are_all = without is None and among is None
+        if min_matches in self._kept and are_all:
             return self._tell(iter(self._kept[min_matches]), advance)
-        found = self._batches(self._choose(min_matches, without), min_matches)
-        if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
+        found = self._batches(self._choose(min_matches, without, among), min_matches)
+        if self.reading.keeps and self.num_matches <= KEPT_MATCHES and are_all:
             found = iter(self._kept.setdefault(min_matches, list(found)))
         return self._tell(found, advance)
 
@@ -284,7 +290,7 @@ class View:
         Args:
             min_matches: as in `batches`.
             without: as in `batches`.
-            among: only pairs of these images.
+            among: as in `batches`.
             advance: as in `batches`.
             consume: give back the memory of rays, at once and in the end, and then that of very many matches:
                 to make tracks of them takes more memory than anything else.
