@@ -74,7 +74,7 @@ COUNTS = {
     "locate COURTYARD/sparse/0 OUT": Counts(5, 1, 1, 1, 2),
     "locate COURTYARD/sparse/0 OUT --adjust full": Counts(5, 1, 1, 1, 2),
     "locate RING/sparse/0 OUT --config TRACKS": Counts(2, 1, 1, 0, 2),
-    "locate RIGS/sparse/0 OUT": Counts(4, 1, 2, 1, 2),
+    "locate RIGS/sparse/0 OUT": Counts(4, 1, 1, 1, 2),
     "locate HINGED/sparse/0 OUT --points never": Counts(5, 2, 2, 1, 3),
     "map PHOTOGRAPHED/database.db OUT": Counts(8, 1, 1, 1, 2),
     "map GUESSED/database.db OUT": Counts(9, 1, 1, 1, 2),

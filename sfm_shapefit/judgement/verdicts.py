@@ -26,7 +26,7 @@ from sfm_shapefit.judgement.uncertainty import (
     standard_deviations,
 )
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.placement.conditioning import LooseCameras, condition
+from sfm_shapefit.placement.conditioning import Conditioning, LooseCameras, condition
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement, own_covariances
 from sfm_shapefit.solver.tied import largest_tied
 
@@ -115,42 +115,50 @@ def assess(
         max_bytes: limit of the factor for standard deviations.
         agreement: agreement of the same graph with the same locations; computed anew if None.
     """
-    graph, groups, k = measured.graph, measured.groups, measured.num_cameras
-    freedom, own = graph.dimension - 1, own_covariances(measured)
     agreement = agreement or find_agreement(measured, locations)
-    angles, inliers, excess = agreement.angles_rad, agreement.agrees, agreement.excess_rad
-    information = np.linalg.inv(own + excess**2 * np.eye(freedom))
-    bases = tangent_bases(graph.directions)
-    sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
-    # Exact directions are propagated as if they had some noise, and scaled back.
-    scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
-    information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
-    errors = None if measured.evidence is None else measured.evidence.errors
-    sampled = None if errors is None else _Sampled(errors, excess, scale)
-    holding = inliers
-    if undetermined_nodes is not None:
-        holding = inliers & ~np.isin(graph.edges, undetermined_nodes).any(axis=1)
-    propagate_all = _propagate_nodes if groups is None else _propagate_groups
-    covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
-    leverages[inliers & ~holding] = np.nan
-    if sampled is None and measured.evidence is not None:
-        covariances = covariances / measured.evidence.facts_per_match
-    covariances = scale**2 * covariances
-    sigmas = standard_deviations(covariances)
-    conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
-    judged = judge_cameras(measured, locations, inliers, sigmas, conditioning)
+    covariances, leverages, held = find_hold(measured, locations, agreement, undetermined_nodes, max_bytes)
+    judged = judge_cameras(measured, locations, agreement.agrees, standard_deviations(covariances), held)
     return Assessment(
-        residuals_deg=np.degrees(angles),
-        inliers=inliers,
+        residuals_deg=np.degrees(agreement.angles_rad),
+        inliers=agreement.agrees,
         leverages=leverages,
         level_deg=float(np.degrees(agreement.level_rad)),
         trust=judged.trust,
         reasons=judged.reasons,
         hold=judged.hold,
         loose_reasons=judged.loose_reasons,
-        loose_groups=conditioning.groups,
+        loose_groups=held.groups,
         covariances=covariances,
     )
+
+
+def find_hold(
+    measured: MeasuredGraph,
+    locations: FloatArray,
+    agreement: AngularAgreement,
+    undetermined_nodes: IntArray | None,
+    max_bytes: int,
+) -> tuple[FloatArray, FloatArray, Conditioning]:
+    """Return covariances, leverages (see `Assessment`), and how well the agreeing pairs hold each camera."""
+    graph, freedom, inliers = measured.graph, measured.graph.dimension - 1, agreement.agrees
+    own, excess, bases = own_covariances(measured), agreement.excess_rad, tangent_bases(graph.directions)
+    information = np.linalg.inv(own + excess**2 * np.eye(freedom))
+    sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
+    # Exact directions are propagated as if they had some noise, and scaled back.
+    scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
+    information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
+    errors = None if measured.evidence is None else measured.evidence.errors
+    sampled = None if errors is None else _Sampled(errors, excess, scale)
+    open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes
+    holding = inliers & ~np.isin(graph.edges, open_nodes).any(axis=1)
+    propagate_all = _propagate_nodes if measured.groups is None else _propagate_groups
+    covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
+    leverages[inliers & ~holding] = np.nan
+    if sampled is None and measured.evidence is not None:
+        covariances = covariances / measured.evidence.facts_per_match
+    covariances = scale**2 * covariances
+    k, sigmas = measured.num_cameras, standard_deviations(covariances)
+    return covariances, leverages, condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
 
 
 class _Sampled(NamedTuple):
