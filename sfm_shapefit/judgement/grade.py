@@ -51,6 +51,8 @@ from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
 MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
+IS_ITS_DATABASE = "is this the model's database?"
+"""How a reason ends that doubts the matches rather than the model."""
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 
 
@@ -77,6 +79,11 @@ class ModelVerdict(Record):
     def is_bad(self) -> bool:
         """Whether the model should not be used."""
         return self.grade is Grade.DO_NOT_USE
+
+    @property
+    def doubts_database(self) -> bool:
+        """Whether the matches are those of other images, as it seems."""
+        return any(reason.endswith(IS_ITS_DATABASE) for reason in self.reasons)
 
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:

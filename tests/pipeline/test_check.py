@@ -182,8 +182,8 @@ def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
 @pytest.mark.parametrize(
     ("model", "database", "words"),
     [
-        ("photographed/truth", "ring8", "contradict it and none agrees: is this its database?"),
-        ("courtyard/truth", "photographed", "contradict it and none agrees: is this its database?"),
+        ("photographed/truth", "ring8", "contradict it and none agrees: is this the model's database?"),
+        ("courtyard/truth", "photographed", "contradict it and none agrees: is this the model's database?"),
     ],
 )
 def test_a_model_beside_another_scenes_database_is_doubted(model, database, words):
@@ -206,8 +206,9 @@ def test_pairs_that_leave_everything_open_do_not_contradict_a_model(monkeypatch)
 
 def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
     strange = spoiled(tmp_path / "strange", names=lambda name: "other.jpg" if name == "0003.jpg" else name)
-    told = check(strange, RING / "database.db", second_opinion=False).verdict
-    assert told.statement == "look: the database lacks 1 image: is it that of the model?"
+    told = check(strange, RING / "database.db", second_opinion=False).facts
+    assert told.verdict.statement == "look: the database lacks 1 image: is this the model's database?"
+    assert told.next_step.command == f"sfm-shapefit check {strange} --database ITS_DATABASE"
 
 
 def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):
