@@ -154,8 +154,8 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))
         yield (
-            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} by {by} "
-            "degrees as against it"
+            f"the scene seems to repeat itself: many matches speak for turning {first_of(names)} by {by} "
+            "degrees, and many against it"
         )
 
 

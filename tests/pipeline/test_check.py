@@ -103,7 +103,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
 
 
 def test_what_map_doubts_check_does_not_call_good():
-    """Houses look the same: as many matches speak for another rotation of two cameras."""
+    """Houses look the same: matches speak for another rotation of two cameras, too."""
     mapped = map_database(PHOTOGRAPHED / "database.db")
     doubted = mapped.models[0].located.verdict.cameras
     assert doubted
@@ -111,7 +111,10 @@ def test_what_map_doubts_check_does_not_call_good():
         found = check(model, PHOTOGRAPHED / "database.db", second_opinion=mapped)
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
-        assert "matches speak as much for another place or rotation" in found.facts.evidence.second.statement
+        assert (
+            "at least half as much speaks for another place or rotation"
+            in found.facts.evidence.second.statement
+        )
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
