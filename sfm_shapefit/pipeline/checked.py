@@ -139,7 +139,8 @@ def check_source(
         evidence = gather_evidence(matches, fits, structure, clock.threads)
         cameras = _judge_cameras(model, quality, pairs, evidence)
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
-        evidence = evidence if second is None else evidence.beside(second)
+        if fits is not None and second is not None:
+            evidence = evidence.beside(second, fits.sides[1])
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
