@@ -169,7 +169,8 @@ def ground_system(problem: AdjustmentProblem, options: AdjustmentOptions) -> Gro
     free = free_similarities(problem, options)
     motions = _motions(problem, layout, free, unseen)
     factor = choose_factor(layout, options)
-    _ground(system, motions, _two_nodes(problem, layout, unseen))
+    if free.size:
+        _ground(system, motions, _two_nodes(problem, layout, unseen))
     _factor(factor, system)
     return GroundedSystem(
         layout=layout, factor=factor, inverses=system.inverses, free=free, motions=motions, unseen=unseen
@@ -199,8 +200,6 @@ def _two_nodes(problem: AdjustmentProblem, layout: Layout, unseen: BoolArray) ->
 def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None:
     """Double a diagonal entry of the given nodes for each motion, chosen to distinguish the motions."""
     count = motions.shape[2]
-    if count == 0:
-        return
     seen_there = motions[nodes].reshape(-1, count)
     _, order, *_ = dgeqp3((seen_there / np.abs(motions).max(axis=(0, 1))).T)  # it counts from 1
     rows, slots = np.divmod(order[:count] - 1, SLOTS)

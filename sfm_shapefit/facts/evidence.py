@@ -140,7 +140,7 @@ class ToldOpinion(Record):
             parts.append(f"{_cameras(self.undecided)} elsewhere {by}, and pairs support neither")
         if self.ambiguous:
             where = f"{_cameras(self.ambiguous)} in the same place {by}"
-            parts.append(f"{where}, but matches speak as much for another place or rotation")
+            parts.append(f"{where}, but at least half as much speaks for another place or rotation")
         percent = rounded(100.0 * self.usual, digits=2) if self.usual > _LEAST_TOLD else "less than 0.001"
         usual = f"positions differ by {percent} % of their spread, median"
         if self.has_nothing_in_common:

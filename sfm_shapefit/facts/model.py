@@ -296,6 +296,11 @@ class ModelFacts(FactsOfModel, PlacedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
+        if self.verdict.doubts_database:
+            text = "Next: place it by the database that it was made from."
+            model, sigma_deg = shlex.quote(self.inputs.model), self.options["rotations"]
+            by = f"--database ITS_DATABASE --rotations {sigma_deg:g}"
+            return NextStep(text, f"sfm-shapefit locate {model} {{out}} --overwrite {by}")
         return next_of_model(self.verdict.grade, self.inputs)
 
     def scene_rows(self) -> list[Row]:
@@ -392,9 +397,10 @@ class CheckedFacts(FactsOfModel):
         if second is not None and second.wrong:
             command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
             return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
-        if not self.inputs.database or self.figures.pair_error_deg is None:
+        nothing_said = not self.inputs.database or self.figures.pair_error_deg is None
+        if nothing_said or self.verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
-            return NextStep(text, f"sfm-shapefit check {path} --database DATABASE")
+            return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 

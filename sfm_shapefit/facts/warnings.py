@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.judgement.grade import MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
+from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
 from sfm_shapefit.judgement.options import TrustOptions
@@ -54,7 +54,7 @@ def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[st
     """Yield that all given rotations, said to be off by `sigma_deg`, are farther off, as of another scene."""
     typical = float(np.nanmedian(turned_deg)) / _MEDIAN_TURN if np.isfinite(turned_deg).any() else 0.0
     if typical > _GROSS * sigma_deg:
-        yield f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: is this the model's database?"
+        yield f"the rotations are {typical:.0f} degrees off, not {sigma_deg:g}: {IS_ITS_DATABASE}"
 
 
 def quality_warnings(placement: Judged) -> Iterator[str]:
@@ -110,8 +110,8 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
     against = counts.get(DirectionStatus.LOW_INLIER_RATIO, 0)
     if against > _ALARMING_SHARE * len(directions.pairs):
         yield (
-            f"the matches of {against} of {len(directions.pairs)} pairs contradict the rotations: the "
-            "scene repeats itself, or rotations or intrinsics are wrong"
+            f"the matches of {against} of {len(directions.pairs)} pairs contradict the rotations: the scene "
+            "repeats itself, rotations or intrinsics are wrong, or the matches are those of another scene"
         )
 
 
@@ -154,8 +154,8 @@ def ambiguity_warnings(placement: Judged) -> Iterator[str]:
         angles = sorted({f"{angle:.0f}" for angle in doubts.angles_deg[members].tolist()}, key=float)
         by = " to ".join(dict.fromkeys((angles[0], angles[-1])))
         yield (
-            f"the scene seems to repeat itself: as many matches speak for turning {first_of(names)} by {by} "
-            "degrees as against it"
+            f"the scene seems to repeat itself: many matches speak for turning {first_of(names)} by {by} "
+            "degrees, and many against it"
         )
 
 

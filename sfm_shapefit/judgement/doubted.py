@@ -86,7 +86,8 @@ def _reason(doubts: Doubts, camera: int) -> str:
     if kind is Doubt.TURNED:
         return f"its rotation is wrong: {doubts.num_turned[camera]} of its pairs agree on {turn}"
     if kind is Doubt.AMBIGUOUS:
-        return f"repeated structure, or a wrong rotation: its matches speak as much for {turn}"
+        share = doubts.turned[camera] / (doubts.placed[camera] + doubts.turned[camera])
+        return f"repeated structure, or a wrong rotation: {share:.0%} of its evidence is for {turn}"
     if kind is Doubt.UNSUPPORTED:
         return "none of its pairs agrees with it: its rotation may be wrong"
     return ""

@@ -74,8 +74,8 @@ class PairFits:
         usual = float(np.median(shares[asked])) if asked.any() else 0.0
         many = asked & (shares > max(MANY, OUTNUMBERED * usual))
         rows = np.flatnonzero(many[images.frame_of] & np.isfinite(self.centers).all(axis=1))
-        counts = zip(rows.tolist(), total[images.frame_of[rows]].tolist(), strict=True)
-        return tuple(Contradicted(k, all_, int(against[images.frame_of[k]])) for k, all_ in counts)
+        of = images.frame_of.tolist()
+        return tuple(Contradicted(k, int(total[of[k]]), int(against[of[k]])) for k in rows.tolist())
 
     def held(self, images: Images, points: Points | None = None) -> BoolArray:
         """Return which cameras (n,) are in the largest rigid piece of agreeing pairs, each frame one node.
@@ -150,6 +150,10 @@ class SecondOpinion(NamedTuple):
         """Rows of the cameras that stand where they do in the other model."""
         return np.concatenate([self.confirmed, self.ambiguous])
 
+    def has_most_alike(self, cameras: IntArray) -> bool:
+        """Return whether half or more of some cameras stand where they do in the other model."""
+        return bool(np.isin(cameras, self.alike).mean() >= HALF)
+
     @property
     def has_nothing_in_common(self) -> bool:
         """Whether the two have different shapes, and no pair says which is right."""
@@ -175,14 +179,17 @@ class ModelEvidence:
     second: SecondOpinion | None = None
     """How another model of the same matches compares; None if there is none."""
 
-    def beside(self, second: SecondOpinion) -> "ModelEvidence":
-        """Return the same with a second opinion, without what that clears.
+    def beside(self, second: SecondOpinion, contradicting: IntArray) -> "ModelEvidence":
+        """Return the same with a second opinion, without what that clears; `contradicting` is (b, 2) pairs.
 
-        Groups most of which stand alike in both are the right side of a seam, if others do not.
+        A group most of which is alike in both is right if most pairs that contradict it are with wrong ones.
         """
 
         def may_be_wrong(group: Seam | Untied) -> bool:
-            return len(second.wrong) < 2 or bool(np.isin(group.cameras, second.alike).mean() < HALF)
+            inside = np.isin(contradicting, group.cameras)
+            across = inside.sum(axis=1) == 1
+            by_wrong = (np.isin(contradicting, second.wrong) & ~inside)[across].any(axis=1)
+            return not (second.has_most_alike(group.cameras) and by_wrong.sum() > HALF * across.sum())
 
         confirmed = set(second.confirmed.tolist())
         return replace(

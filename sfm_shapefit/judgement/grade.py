@@ -51,6 +51,7 @@ from sfm_shapefit.placement.place import SMALLEST_PIECE
 from sfm_shapefit.scene.images import Images
 
 MOST_LEVEL_DEG = SURE_SIGMAS * KNOWN_DEG  # degrees, level of agreeing residuals; see the header
+IS_ITS_DATABASE = "is this the model's database?"  # ends a reason that doubts the matches, not the model
 FEW_PLACED = 1.0 - RARE  # share of images in the output; below, the model is to be looked at
 
 
@@ -77,6 +78,11 @@ class ModelVerdict(Record):
     def is_bad(self) -> bool:
         """Whether the model should not be used."""
         return self.grade is Grade.DO_NOT_USE
+
+    @property
+    def doubts_database(self) -> bool:
+        """Whether the matches are those of other images, as it seems."""
+        return any(reason.endswith(IS_ITS_DATABASE) for reason in self.reasons)
 
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:
@@ -115,16 +121,16 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     """Return what evidence says against a model of some images; the others are not posed."""
     loose = [group.cameras for group in evidence.untied if group.is_loose]
     unchecked = [camera for group in evidence.untied for camera in group.cameras.tolist()]
-    groups = [*(seam.cameras for seam in evidence.seams), *loose]
-    apart = [camera for cameras in groups for camera in cameras.tolist()]
-    second = evidence.second
+    groups, second = [*(seam.cameras for seam in evidence.seams), *loose], evidence.second
+    if second is not None and len(second.wrong) > 1:  # which tells where the seam of these runs
+        groups = [g if second.has_most_alike(g) else np.setdiff1d(g, second.alike) for g in groups]
+        groups.insert(0, second.wrong)
+    apart = list(dict.fromkeys(camera for group in groups for camera in group.tolist()))
     wrong, undecided = ([], []) if second is None else (second.wrong.tolist(), second.undecided.tolist())
-    if second is not None and len(wrong) > 1:  # which tells which side of a seam is wrong, and where it runs
-        apart = list(dict.fromkeys([*wrong, *np.setdiff1d(apart, second.alike).astype(int).tolist()]))
     alone = np.bincount(images.lens_of[images.is_posed], minlength=len(images.lenses)) == 1
     lenses = [wrong.lens for wrong in evidence.lenses]
     through = np.flatnonzero(images.is_posed & np.isin(images.lens_of, lenses) & alone[images.lens_of])
-    places = (place.camera for place in evidence.places)
+    places = [place.camera for place in evidence.places]
     named = dict.fromkeys([*apart, *wrong, *undecided, *places, *through.tolist()])
     confirmed = set() if second is None else set(second.confirmed.tolist())
     doubted = [one.camera for one in evidence.contradicted]

@@ -27,6 +27,7 @@ from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.limits import ALIKE_DEG, FEW, FEWEST_ALIKE, MOST_COMPARED, OUTNUMBERED
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.scene.matches import is_among
 
 _MOST_ROUNDS = 10  # passes of moves; two or three are usual
 
@@ -82,8 +83,8 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
             continue  # a single camera is no group, and has tests of its own
         inside = bodies == body
         contradicted = across[1][inside[across[1]].any(axis=1)]
-        is_tied = _most_frequent(group[inside]) == _most_frequent(group[bodies == main])
-        cuts.append(Cut(np.flatnonzero(inside), int(num_agreeing[body]), contradicted, is_tied))
+        mostly, rest = (int(np.bincount(group[bodies == one]).argmax()) for one in (body, main))
+        cuts.append(Cut(np.flatnonzero(inside), int(num_agreeing[body]), contradicted, mostly == rest))
     return tuple(cuts)
 
 
@@ -96,25 +97,18 @@ def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: Fl
         rotations: (n, 3, 3) cam_from_world of the cameras.
     """
     sound = relative.subset(relative.are_sound())
-    row_of = {pair: row for row, pair in enumerate(map(tuple, sound.pairs.tolist()))}
     seams = []
     for cut in cuts:
-        rows = np.array([row_of[p] for p in map(tuple, cut.contradicting.tolist()) if p in row_of], np.int64)
+        rows = np.flatnonzero(is_among(sound.pairs, cut.contradicting))
         taken = min(len(rows), MOST_COMPARED)
         rows = rows[np.arange(taken) * len(rows) // max(taken, 1)]
         turns = _turns(sound.subset(rows), rotations, cut.cameras)
         num_turned, turn_deg = _most_alike(turns)
-        share = num_turned / max(len(rows), 1)
-        num = len(cut.contradicting)
-        is_turned = num_turned >= FEWEST_ALIKE and share > FEW
+        is_turned = num_turned >= FEWEST_ALIKE and num_turned > FEW * len(rows)
         if (is_turned and turn_deg > ALIKE_DEG) or not cut.is_tied:
+            num = len(cut.contradicting)
             seams.append(Seam(cut.cameras, cut.num_agreeing, num, num_turned, turn_deg))
     return tuple(seams)
-
-
-def _most_frequent(values: IntArray) -> int:
-    """Return the value that occurs most often, the smallest of equals."""
-    return int(np.argmax(np.bincount(values)))
 
 
 def _moved(bodies: IntArray, pairs: IntArray, weights: FloatArray) -> IntArray:

@@ -49,6 +49,7 @@ from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MOST_COMPA
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import LAST_WIDTH_PX
+from sfm_shapefit.scene.matches import rows_of_pairs
 
 _INDEPENDENT_MATCHES = 20.0  # matches of a pair that count for its turn; their errors are in part the same
 _MOST_WEIGHT = 200.0  # matches of a pair that count for its vote; hundreds are no independent witnesses
@@ -137,17 +138,9 @@ def weigh_pairs(
         relative: relative rotations of some of these pairs, in any order; a pair without counts by direction.
         rotations: (n, 3, 3) the given ones, cam_from_world.
     """
-    k, n = len(directions.pairs), len(rotations)
-    codes = directions.pairs[:, 0] * n + directions.pairs[:, 1]
-    order = np.argsort(codes, kind="stable")
-    codes_of_relative = relative.pairs[:, 0] * n + relative.pairs[:, 1]
-    row = (
-        order[np.minimum(np.searchsorted(codes[order], codes_of_relative), k - 1)]
-        if k
-        else np.zeros(0, dtype=np.int64)
-    )
-    has_rotation = codes[row] == codes_of_relative if k else np.zeros(0, dtype=np.bool_)
-    relative, row = relative.subset(has_rotation), row[has_rotation]
+    k = len(directions.pairs)
+    row = rows_of_pairs(relative.pairs, directions.pairs)
+    relative, row = relative.subset(row >= 0), row[row >= 0]
 
     i, j = relative.pairs.T
     turns, sigmas = np.tile(np.eye(3), (k, 1, 1)), np.full(k, np.inf)

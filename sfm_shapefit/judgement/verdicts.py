@@ -79,7 +79,7 @@ class Assessment:
 
     @property
     def ambiguous(self) -> BoolArray:
-        """(k,) cameras whose matches speak as much for another rotation, and which no pixels confirm."""
+        """(k,) cameras that another rotation rivals by their matches, and which no pixels confirm."""
         kinds = [None] * len(self.trust) if self.doubts is None else self.doubts.kinds
         return np.array([kind is Doubt.AMBIGUOUS for kind in kinds], dtype=np.bool_)
 

@@ -45,7 +45,7 @@ from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_of
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
-from sfm_shapefit.judgement.grade import Grade, ModelVerdict, weigh_evidence
+from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
@@ -139,7 +139,8 @@ def check_source(
         evidence = gather_evidence(matches, fits, structure, clock.threads)
         cameras = _judge_cameras(model, quality, pairs, evidence)
         second = None if fits is None or other is None else _compare(matches, fits, structure, other)
-        evidence = evidence if second is None else evidence.beside(second)
+        if fits is not None and second is not None:
+            evidence = evidence.beside(second, fits.sides[1])
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
@@ -261,7 +262,7 @@ def _grade(
     pointless = model.reconstruction.num_points3D() == 0
     reasons = ("it has no 3D points, so that only matches say where its cameras stand",) if pointless else ()
     if num_missing:
-        reasons = (*reasons, f"the database lacks {counted(num_missing, 'image')}: is it that of the model?")
+        reasons = (*reasons, f"the database lacks {counted(num_missing, 'image')}: {IS_ITS_DATABASE}")
     reasons = (*reasons, *against.suspicions)
     return ModelVerdict(grade=Grade.LOOK if named or reasons else Grade.GOOD, cameras=named, reasons=reasons)
 
@@ -278,7 +279,7 @@ def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
     """Yield that pairs contradict and none agrees; a model's own points tie it whatever its database is."""
     if fits is not None and fits.contradicts.any() and not fits.agrees.any():
         against = counted(int(fits.contradicts.sum()), "pair")
-        yield f"{against} contradict it and none agrees: is this its database?"
+        yield f"{against} contradict it and none agrees: {IS_ITS_DATABASE}"
 
 
 def _tell(

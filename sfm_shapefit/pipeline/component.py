@@ -103,9 +103,7 @@ def _locate_component(
         inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
     source = replace(see_matches(run.matches, images, inputs, run.options), alone=among)
     found = act(partial(_place, run, members), _given(run, images, inputs), source, run.options)
-    ends = members[found.directions.pairs].tolist()
-    unknown = (np.nan, np.nan)
-    scores = np.array([run.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
+    scores = run.scores.of(members[found.directions.pairs])
     return replace(
         found,
         triplet_scores=scores[:, 0],

@@ -3,7 +3,7 @@
 Frames that the averaging of a component drops are grouped anew by the pairs among themselves.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,12 +20,26 @@ from sfm_shapefit.rotations.average import average_relative_rotations, check_pai
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.options import AveragingOptions
 from sfm_shapefit.scene.given import Gravity
+from sfm_shapefit.scene.matches import rows_of_pairs
 
 # What only unsound pairs, or pairs below `min_matches`, tie to the rest.
 _UNTIED = (
     "no pair that can be believed ties it to the others: their matches are few, fit no one relative pose, or "
     "contradict the rest"
 )
+
+
+class PairScores(NamedTuple):
+    """Scores of pairs with a relative rotation, by which those of repeated structure are told."""
+
+    pairs: IntArray = np.zeros((0, 2), dtype=np.int64)
+    """(m, 2)"""
+    values: FloatArray = np.zeros((0, 2))
+    """(m, 2) by triangles, and the matched share of their overlap; NaN where unknown."""
+
+    def of(self, pairs: IntArray) -> FloatArray:
+        """Return those of some pairs (k, 2), (k, 2)."""
+        return np.vstack([self.values, [np.nan, np.nan]])[rows_of_pairs(pairs, self.pairs)]
 
 
 class ComponentAveraging(NamedTuple):
@@ -35,8 +49,8 @@ class ComponentAveraging(NamedTuple):
     clock: Clock
     gravity: Gravity | None
     """Gravity in the axes of frames."""
-    shares: Mapping[tuple[int, int], float]
-    """The matched share of the overlap of pairs of frames, as far as it is known."""
+    scores: PairScores = PairScores()
+    """Scores of pairs of frames, as far as they are known."""
 
     def average(
         self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
@@ -112,8 +126,7 @@ class ComponentAveraging(NamedTuple):
 
     def _evidence_of(self, relative: RelativeRotations) -> FloatArray:
         """Return how much speaks for each pair of frames."""
-        shares = [self.shares.get(pair, np.nan) for pair in map(tuple, relative.pairs.tolist())]
-        return evidence_of(relative, np.array(shares))
+        return evidence_of(relative, self.scores.of(relative.pairs)[:, 1])
 
 
 def pairs_among(

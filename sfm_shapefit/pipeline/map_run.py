@@ -1,9 +1,8 @@
 """What `map_database` reads and measures once, for all components."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.components import ComponentAveraging
+from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
 from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
@@ -32,7 +31,7 @@ from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import PairNames, View
+from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
 
 _MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match
 
@@ -80,8 +79,8 @@ class MapRun(NamedTuple):
     known: Known
     without: PairNames
     """Pairs that are taken for unmatched."""
-    scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
-    """Scores of pairs with a relative rotation: by triangles, and the matched share of their overlap."""
+    scores: PairScores = PairScores()
+    """Scores of pairs of images."""
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
@@ -116,10 +115,9 @@ class MapRun(NamedTuple):
 
     def score_pairs(self, relative: RelativeRotations) -> "MapRun":
         """Return the run with the scores by which pairs of repeated structure are told."""
-        pairs = list(map(tuple, relative.pairs.tolist()))
-        triplets = score_triplets(self.images.num_images, relative).tolist()
-        shares: dict[tuple[int, int], float] = {}
-        if len(pairs) <= _MOST_SCORED_PAIRS:
+        scores = np.full((len(relative.pairs), 2), np.nan)
+        scores[:, 0] = score_triplets(self.images.num_images, relative)
+        if len(scores) <= _MOST_SCORED_PAIRS:
             with self.clock("scores of pairs"):
                 view = self.view()
                 pixels = [view.keypoints(k) for k in range(self.images.num_images)]
@@ -127,10 +125,9 @@ class MapRun(NamedTuple):
                 batches = list(view.links(LEAST_MATCHES))  # both look at all of them
                 partners = count_partners([len(own) for own in pixels], batches)
                 for batch in batches:
-                    found = matched_shares(pixels, sizes, partners, batch).tolist()
-                    shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
-        both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
-        return self._replace(scores=dict(zip(pairs, both, strict=True)))
+                    rows = rows_of_pairs(batch.pairs, relative.pairs)
+                    scores[rows[rows >= 0], 1] = matched_shares(pixels, sizes, partners, batch)[rows >= 0]
+        return self._replace(scores=PairScores(relative.pairs, scores))
 
     def share_of_doubted_lenses(self) -> float:
         """Return the share of images whose intrinsics are in doubt."""
@@ -145,7 +142,9 @@ class MapRun(NamedTuple):
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
         gravity = self.known.gravity
         gravity = None if gravity is None else gravity.of_frames(of_image, sensors)
-        averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, self.shares_of_frames())
+        is_single = np.array_equal(of_image, np.arange(len(of_image)))  # else frames are those of rigs
+        scores = self.scores if is_single else PairScores()
+        averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, scores)
         for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
             members = np.flatnonzero(np.isin(of_image, frames))
             places = np.searchsorted(frames, of_image[members])
@@ -157,12 +156,6 @@ class MapRun(NamedTuple):
         frame_of = self.images.frame_of
         _, first = np.unique(frame_of, return_index=True)
         return np.argsort(np.argsort(first))[frame_of]
-
-    def shares_of_frames(self) -> dict[tuple[int, int], float]:
-        """Return the matched shares by pairs of frames; none where frames are those of rigs."""
-        if not np.array_equal(self.frame_of_image, np.arange(len(self.frame_of_image))):
-            return {}
-        return {pair: share for pair, (_, share) in self.scores.items()}
 
     @property
     def inputs(self) -> Inputs:

@@ -23,7 +23,7 @@ from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch, is_among
+from sfm_shapefit.scene.matches import MatchBatch, is_among, rows_of_pairs
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, covering_set, join_points
 from sfm_shapefit.tracks.options import NodeOptions, PointNodes
 
@@ -132,9 +132,8 @@ def _new_joiner(source: MatchSource, threshold_px: float) -> TrackJoiner:
 
 def _again(source: MatchSource, directions: PairDirections) -> Iterator[tuple[MatchBatch, PairDirections]]:
     """Yield the matches of a source once more, with the directions of their pairs."""
-    row_of = {tuple(pair): row for row, pair in enumerate(directions.pairs.tolist())}
     for batch in source.view.batches(without=source.pairs_of_fixed):
-        yield batch, directions.subset(np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()]))
+        yield batch, directions.subset(rows_of_pairs(batch.pairs, directions.pairs))
 
 
 class _Beside:
@@ -158,7 +157,7 @@ class _Beside:
             self.joiner.add(batch, directions)
         usable = directions.usable()
         self._num_usable += len(usable)
-        for row in usable.tolist() if self._counts_pairs else ():
+        for row in usable.tolist() if self._counts_pairs else ():  # faster than `np.add.at`
             own = batch.keypoints[batch.offsets[row] : batch.offsets[row + 1]]
             self._num_pairs_of[self._begins[batch.pairs[row]] + own] += 1
         if self._num_usable > _MAX_SAMPLED_PAIRS:

@@ -121,7 +121,7 @@ def diagnose(
     pieces = order_pieces(graph, n)
     obstacle = ""
     try:
-        refuse_without_triangle(graph, pieces, n)
+        refuse_without_triangle(measured, pieces)
     except UnsolvableError as error:
         obstacle = str(error)
     scores = triangle_scores(pairs) if pairs.num_edges <= _MAX_SCORED_PAIRS else None
@@ -129,9 +129,8 @@ def diagnose(
     if scores is not None:
         contradicted[measured.pairs] = scores > WRONG_SCORE_RAD
     confirmed = np.zeros(n, dtype=np.bool_) if confirmed is None else confirmed
-    against = np.zeros((0, 2), dtype=np.int64)
-    if measured.evidence is not None:
-        against = measured.evidence.contradicting
+    none = np.zeros((0, 2), dtype=np.int64)
+    against = none if measured.evidence is None else measured.evidence.contradicting
     outside = left_out_reasons(graph, [] if obstacle else pieces)
     return Diagnosis(
         dimension=graph.dimension,

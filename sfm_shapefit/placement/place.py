@@ -238,7 +238,7 @@ def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiec
         refuse_admm(options.solver)
         return [find_tied_piece(measured)]
     pieces = order_pieces(measured.graph, measured.num_cameras)
-    refuse_without_triangle(measured.graph, pieces, measured.num_cameras)
+    refuse_without_triangle(measured, pieces)
     return pieces
 
 
@@ -268,12 +268,16 @@ def count_large(pieces: list[RigidPiece], num_cameras: int) -> int:
     return sum(int(np.sum(piece.nodes < num_cameras)) >= SMALLEST_PIECE for piece in pieces)
 
 
-def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_cameras: int) -> None:
+def refuse_without_triangle(measured: MeasuredGraph, pieces: list[RigidPiece]) -> None:
     """Raise UnsolvableError if a graph of many cameras has no three that are rigid."""
+    num_cameras, num_edges = measured.num_cameras, measured.graph.num_edges
     if not pieces or np.sum(pieces[0].nodes < num_cameras) < min(SMALLEST_PIECE, num_cameras):
+        cure = "match more pairs, above all pairs that close triangles, if these are the right matches"
+        against = () if measured.evidence is None else measured.evidence.contradicting
+        if len(against) > num_edges:
+            cure = f"{len(against)} pairs contradict the rotations: these are wrong, or of another scene"
         raise UnsolvableError(
-            f"the {graph.num_edges} usable directions tie no three cameras to one another; "
-            "match more pairs, above all pairs that close triangles, if these are the right matches"
+            f"the {num_edges} usable directions tie no three cameras to one another; {cure}"
         )
 
 

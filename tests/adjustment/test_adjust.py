@@ -18,6 +18,7 @@ from sfm_shapefit.adjustment import (
     Rig,
     RotationPrior,
     adjust,
+    estimate_covariances,
     frames_not_gained,
     isotropic_information,
     reduced_factor,
@@ -100,12 +101,14 @@ def test_fixed_frames_stay_to_the_bit(fixed, hold):
     assert moved.sum() == truth.num_frames - len(fixed)
 
 
-def test_everything_fixed_leaves_points_to_adjust():
+@pytest.mark.parametrize("solver", ["dense", "sparse"])
+def test_everything_fixed_leaves_points_to_adjust(solver):
     truth, start = make_start(fixed=range(12))
-    found = adjust(start, TIGHT)
+    found = adjust(start, replace(TIGHT, linear_solver=solver))
     assert found.gradient_norm < 1e-7
     off = np.linalg.norm(found.problem.points - truth.points, axis=1)
     assert np.median(off) < 0.2 * np.median(np.linalg.norm(start.points - truth.points, axis=1))
+    assert not estimate_covariances(found.problem, linear_solver=solver).centers.any()
 
 
 def test_a_tiny_sigma_equals_held_rotations_and_a_huge_one_free_ones():

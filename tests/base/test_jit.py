@@ -1,6 +1,7 @@
 """The door to numba: what is compiled, and what is found on disk."""
 
 import ast
+from collections import Counter
 
 import numba
 import numpy as np
@@ -138,23 +139,60 @@ def test_no_kernel_hands_a_named_tuple_to_python():
     assert list(crossings({"a": sin, "b": "from a import f\ndef h(): return f()"})) == ["f", "f"]
 
 
+def rank(index):
+    """The number of indices of a subscript."""
+    return len(index.elts) if isinstance(index, ast.Tuple) else 1
+
+
 def arrays_in_slices(source):
-    """Yield the statements of kernels that write more than a number to a slice, as far as names tell."""
-    for function in ast.walk(ast.parse(source)):
-        if isinstance(function, ast.FunctionDef) and is_kernel(function):
-            for statement in ast.walk(function):
-                targets = statement.targets if isinstance(statement, ast.Assign) else ()
-                written = (n for t in targets for n in ast.walk(t) if isinstance(n, ast.Subscript))
-                is_slice = any(isinstance(n, ast.Slice) for s in written for n in ast.walk(s.slice))
-                if is_slice and ast.unparse(statement.value) not in ("0.0", "zero"):
+    """Yield the statements of kernels that write an array to a slice or a row, or change an array at once.
+
+    A row is told by a name that takes more indices elsewhere in the kernel.
+    """
+    functions = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef))
+    for function in filter(is_kernel, functions):
+        inside = list(ast.walk(function))
+        ranks = Counter()
+        for n in inside:
+            if isinstance(n, ast.Subscript):
+                ranks[ast.unparse(n.value)] = max(ranks[ast.unparse(n.value)], rank(n.slice))
+        for statement in inside:
+            if isinstance(statement, ast.Assign):
+                written = [n for target in statement.targets for n in ast.walk(target)]
+                is_filled = ast.unparse(statement.value) in ("0.0", "zero")
+            elif isinstance(statement, ast.AugAssign):
+                written, is_filled = [statement.target], False
+                if isinstance(statement.target, ast.Name) and ranks[statement.target.id]:
                     yield ast.unparse(statement)
+            else:
+                continue
+            parts = [n for n in written if isinstance(n, ast.Subscript) and isinstance(n.ctx, ast.Store)]
+            sliced = any(isinstance(n, ast.Slice) for part in parts for n in ast.walk(part.slice))
+            if (sliced or any(rank(n.slice) < ranks[ast.unparse(n.value)] for n in parts)) and not is_filled:
+                yield ast.unparse(statement)
 
 
-def test_no_kernel_writes_an_array_to_a_slice():
+@pytest.mark.parametrize(
+    ("sin", "harmless"),
+    [
+        ("a[:] = b", "a[:] = 0.0"),
+        ("a[:] += b", "a[0] += b[0]"),
+        ("a[0] = b[1]; a[0, 0] = 1.0", "a[0] = b[1]"),
+        ("a[0, 1] = b[1]; c = a[0, 1, 0]", "a[0, 1] = b[1]"),
+        ("a += b; c = a[0]", "a += b"),
+        ("c, a[1:] = b", "c, a[1] = b"),
+    ],
+)
+def test_a_search_finds_what_writes_an_array(sin, harmless):
+    kernel = "@kernel\ndef f(a, b): {}"
+    assert len(list(arrays_in_slices(kernel.format(sin)))) == 1
+    assert list(arrays_in_slices(kernel.format(harmless))) == []
+
+
+def test_no_kernel_writes_an_array_to_a_slice_or_a_row():
     """Numba compiles the words of its error with it, for 3 s; a loop over the entries takes no time."""
     paths = (ROOT / "sfm_shapefit").rglob("*.py")
     assert [s for path in paths for s in arrays_in_slices(path.read_text(encoding="utf-8"))] == []
-    assert list(arrays_in_slices("@kernel\ndef f(a, b): a[:] = b")) == ["a[:] = b"]
 
 
 INTERRUPTED = """

@@ -61,7 +61,7 @@ def test_the_database_of_another_scene_gets_a_verdict():
     said = run("check", RING / "sparse/0", "--database", COURTYARD / "database.db", code=0).stdout
     assert "verdict: do not use" in said
     assert "courtyard/database.db; no pair says where cameras stand\n" in said
-    assert "contradict it and none agrees: is this its database?\n" in said
+    assert "contradict it and none agrees: is this the model's database?\n" in said
     assert "second opinion: 8 cameras have nothing in common with where they stand" in said
 
 

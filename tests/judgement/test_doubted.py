@@ -50,11 +50,14 @@ def test_right_cameras_of_a_symmetric_scene_are_kept_and_the_group_is_named():
     assert found.kept.all()
     ambiguous = np.flatnonzero(found.placement.assessment.ambiguous)
     assert [found.images.names[k] for k in ambiguous] == ["0004.jpg", "0005.jpg"]  # pixels confirm 0003.jpg
-    assert any("turning 0004.jpg, 0005.jpg by 90 degrees" in w for w in found.warnings)
+    assert any("many matches speak for turning 0004.jpg, 0005.jpg by 90 degrees" in w for w in found.warnings)
     assert set(found.verdict.cameras) == {"0004.jpg", "0005.jpg"}
     reasons = {row.name: row.reason for row in found.cameras if row.reason}
     assert set(reasons) == {"0004.jpg", "0005.jpg"}
-    assert all("a turn by 90 degrees, together with 1 other camera" in reason for reason in reasons.values())
+    doubts = found.placement.assessment.doubts
+    for k, reason in zip(ambiguous.tolist(), reasons.values(), strict=True):
+        share = doubts.turned[k] / (doubts.placed[k] + doubts.turned[k])
+        assert f"{share:.0%} of its evidence is for a turn by 90 degrees, together with 1 other" in reason
 
 
 def test_confirmed_cameras_are_trusted_and_no_reason_counts_them():

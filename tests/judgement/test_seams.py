@@ -116,3 +116,16 @@ def test_a_camera_moves_to_where_its_pairs_agree():
     extra = np.tile([[12, 14]], (3, 1))
     (cut,) = cut_of(np.concatenate([agreeing, extra]), contradicting)
     assert cut.cameras.tolist() == GROUP.tolist()
+
+
+def test_cuts_of_a_hand_made_graph_are_all_that_is_cut_off_largest_first():
+    """Bodies 0..5, 6..8 and 9..10 agree in themselves; 11 is alone, 12 has no pair."""
+    bodies = [range(6), range(6, 9), range(9, 11)]
+    inside = [(i, j) for body in bodies for i in body for j in body if i < j]
+    apart = [(0, 9), (1, 9), (6, 10), (2, 6), (3, 7), (4, 8), (5, 8), (0, 11), (1, 11), (2, 11)]
+    group = np.array([*6 * [0], 0, 0, 1, *4 * [1]])
+    first, second = find_cuts(np.array([*inside, (0, 6)]), np.array(apart), group)
+    assert (first.cameras.tolist(), first.num_agreeing, first.is_tied) == ([6, 7, 8], 1, True)
+    assert first.contradicting.tolist() == [[6, 10], [2, 6], [3, 7], [4, 8], [5, 8]]
+    assert (second.cameras.tolist(), second.num_agreeing, second.is_tied) == ([9, 10], 0, False)
+    assert second.contradicting.tolist() == [[0, 9], [1, 9], [6, 10]]

@@ -89,16 +89,17 @@ def test_what_it_clears_is_not_told(images):
         seams=tuple(Seam(np.array(rows), 1, 9, 0, np.nan) for rows in ([5, 6], [8, 9], [0, 7])),
         untied=tuple(Untied(np.array(rows), 1, 9, 0, is_loose=True) for rows in ([5, 6], [8, 9])),
     )
-    both = evidence.beside(compare(moved(images, [5, 6], shift=2.0), images, images, doubted=[0, 8, 9]))
+    contradicting = np.array([(5, 8), (6, 8), (5, 9), (4, 8), (0, 1), (2, 7), (0, 5), (6, 7)])
+    second = compare(moved(images, [5, 6], shift=2.0), images, images, doubted=[0, 8, 9])
+    both = evidence.beside(second, contradicting)
     assert [one.camera for one in both.places] == [one.camera for one in both.contradicted] == [5]
-    assert [group.cameras.tolist() for group in (*both.seams, *both.untied)] == [[5, 6], [5, 6]]
+    # Only half of the pairs that contradict 0 and 7 are with what is wrong.
+    assert [group.cameras.tolist() for group in (*both.seams, *both.untied)] == [[5, 6], [0, 7], [5, 6]]
     against = weigh_evidence(both, images)
-    assert set(against.cameras) == {
-        images.names[k] for k in (0, 5, 6, 8, 9)
-    }  # three are doubted there as well
-    assert f"2 of {N} cameras stand apart from the rest" in (*against.suspicions, *against.reasons)
-    one = evidence.beside(compare(moved(images, [5], shift=2.0), images, images))
-    assert (one.seams, one.untied) == (evidence.seams, evidence.untied)  # it says nothing of groups
+    assert set(against.cameras) == {images.names[k] for k in (0, 5, 6, 7, 8, 9)}  # three are doubted there
+    assert f"4 of {N} cameras stand apart from the rest" in (*against.suspicions, *against.reasons)
+    neither = evidence.beside(second._replace(wrong=second.wrong[:0]), contradicting)
+    assert (neither.seams, neither.untied) == (evidence.seams, evidence.untied)
 
 
 def test_where_pairs_support_neither_nobody_is_believed(images):

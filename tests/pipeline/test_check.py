@@ -103,7 +103,7 @@ def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_
 
 
 def test_what_map_doubts_check_does_not_call_good():
-    """Houses look the same: as many matches speak for another rotation of two cameras."""
+    """Houses look the same: matches speak for another rotation of two cameras, too."""
     mapped = map_database(PHOTOGRAPHED / "database.db")
     doubted = mapped.models[0].located.verdict.cameras
     assert doubted
@@ -111,7 +111,10 @@ def test_what_map_doubts_check_does_not_call_good():
         found = check(model, PHOTOGRAPHED / "database.db", second_opinion=mapped)
         assert found.verdict.cameras == doubted
         assert found.facts.evidence.second.ambiguous == doubted
-        assert "matches speak as much for another place or rotation" in found.facts.evidence.second.statement
+        assert (
+            "at least half as much speaks for another place or rotation"
+            in found.facts.evidence.second.statement
+        )
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
@@ -182,8 +185,8 @@ def test_a_model_that_nothing_speaks_for_is_not_to_be_used(tmp_path):
 @pytest.mark.parametrize(
     ("model", "database", "words"),
     [
-        ("photographed/truth", "ring8", "contradict it and none agrees: is this its database?"),
-        ("courtyard/truth", "photographed", "contradict it and none agrees: is this its database?"),
+        ("photographed/truth", "ring8", "contradict it and none agrees: is this the model's database?"),
+        ("courtyard/truth", "photographed", "contradict it and none agrees: is this the model's database?"),
     ],
 )
 def test_a_model_beside_another_scenes_database_is_doubted(model, database, words):
@@ -206,8 +209,9 @@ def test_pairs_that_leave_everything_open_do_not_contradict_a_model(monkeypatch)
 
 def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
     strange = spoiled(tmp_path / "strange", names=lambda name: "other.jpg" if name == "0003.jpg" else name)
-    told = check(strange, RING / "database.db", second_opinion=False).verdict
-    assert told.statement == "look: the database lacks 1 image: is it that of the model?"
+    told = check(strange, RING / "database.db", second_opinion=False).facts
+    assert told.verdict.statement == "look: the database lacks 1 image: is this the model's database?"
+    assert told.next_step.command == f"sfm-shapefit check {strange} --database ITS_DATABASE"
 
 
 def test_a_second_opinion_of_another_shape_is_a_reason_to_look(tmp_path):

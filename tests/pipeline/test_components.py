@@ -6,7 +6,7 @@ import pytest
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.components import ComponentAveraging
+from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
 from sfm_shapefit.rotations.options import AveragingOptions
 
 
@@ -21,7 +21,7 @@ def averaged(pairs, weight_shares, **options):
         weight_shares=np.array(weight_shares),
     )
     reasons: dict[int, str] = {}
-    components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None, shares={})
+    components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None)
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
     return [frames.tolist() for frames, _ in found], reasons
 
@@ -54,3 +54,12 @@ def test_a_stage_that_fails_has_taken_its_time():
     with pytest.raises(UnsolvableError), clock("locate"):
         raise UnsolvableError
     assert list(clock.seconds) == ["locate"]
+
+
+def test_scores_of_pairs_are_found_whatever_the_order_and_unknown_ones_are_nan():
+    scores = PairScores(np.array([(3, 4), (0, 2), (1, 2)]), np.array([[0.3, 0.4], [0.0, 0.2], [0.1, np.nan]]))
+    found = scores.of(np.array([(0, 2), (4, 3), (0, 1), (1, 2), (2, 9)]))
+    unknown = [np.nan, np.nan]
+    np.testing.assert_array_equal(found, [[0.0, 0.2], [0.3, 0.4], unknown, [0.1, np.nan], unknown])
+    np.testing.assert_array_equal(PairScores().of(np.array([(0, 1)])), [unknown])
+    assert PairScores().of(np.zeros((0, 2), dtype=np.int64)).shape == (0, 2)

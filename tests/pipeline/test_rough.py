@@ -115,6 +115,8 @@ def test_poses_of_another_scene_are_doubted(tmp_path):
     found = sfm_shapefit.locate(BUNDLED / "ring8/sparse/0", DATABASE, rotations=2.0, min_trust=0.0)
     assert found.verdict.grade != "good"
     assert "is this the model's database?" in found.verdict.statement
+    command = f"sfm-shapefit locate {BUNDLED}/ring8/sparse/0 {{out}} --overwrite"
+    assert found.facts.next_step.command == f"{command} --database ITS_DATABASE --rotations 2"
 
 
 def test_moved_is_not_told_where_the_given_centers_are_no_places(spoiled):

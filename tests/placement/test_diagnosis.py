@@ -173,6 +173,16 @@ def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_pa
     assert len(facts["left_out"]) == 5
 
 
+@pytest.mark.parametrize(
+    ("num_against", "cure"), [(2, "match more pairs"), (3, "these are wrong, or of another scene")]
+)
+def test_few_directions_beside_many_contradicted_rotations_ask_for_the_scene(num_against, cure):
+    t = np.random.default_rng(8).standard_normal((6, 3))
+    against = np.array([(0, 2), (1, 3), (2, 4)])[:num_against]
+    measured = MeasuredGraph(exact_graph(t, [(0, 1), (1, 2)]), evidence=Evidence(contradicting=against))
+    assert cure in diagnose(measured).obstacle
+
+
 def test_a_model_without_usable_directions_is_refused_as_by_locate():
     with pytest.raises(UnsolvableError, match="none of the"):
         sfm_shapefit.inspect(RING / "sparse" / "0", min_inliers=100_000)

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_shapefit.adjustment import adjust, choose_loss_scale_px
 from sfm_shapefit.tracks import triangulation
-from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
@@ -214,6 +214,33 @@ def test_what_agrees_best_is_joined_first_so_that_wrong_matches_make_no_chains_o
     truth = points[joined.keypoints[joined.offsets[pure]]]
     distances = np.linalg.norm(in_turn.points[pure] - truth, axis=1)
     assert np.median(distances) < 0.01 * np.ptp(points, axis=0).max()
+
+
+def test_without_chains_matches_are_joined_once(monkeypatch):
+    tracks, poses, _ = made(noise_px=0.3)
+    found, joins, join = matched(tracks), [], MatchedKeypoints.join
+    monkeypatch.setattr(MatchedKeypoints, "join", lambda *given: joins.append(given[2]) or join(*given))
+    joined, in_turn = triangulate_matches(found, poses, replace(LIMITS, max_error_px=16.0), 4.0)
+    assert joins == [16.0]
+    at_once = found.observed(join(found, poses, 16.0))
+    expected = triangulate_tracks(at_once, poses, replace(LIMITS, max_error_px=16.0))
+    np.testing.assert_array_equal(in_turn.points, expected.points)
+    of_points = at_once.of_points(expected.points_seen)
+    for name in ("offsets", "cameras", "keypoints", "pixels", "ids"):
+        np.testing.assert_array_equal(getattr(joined, name), getattr(of_points, name))
+
+
+def test_tracks_of_points_are_the_rows_that_see_each():
+    rows = JoinedRows(np.array([0, 3, 5]), np.array([70, 60, 50, 40, 30]))
+    offsets, of_points = rows.of_points(np.array([1, -1, 0, 0, 1]))
+    assert (offsets.tolist(), of_points.tolist()) == ([0, 2, 4], [50, 40, 70, 30])
+    tracks = made()[0].subset(np.array([2, 0]))
+    own = np.repeat([0, 1], tracks.lengths())
+    assert tracks.of_points(own).pixels is tracks.pixels  # nothing is copied
+    assert tracks.of_points(own).ids.tolist() == [0, 1]
+    swapped = tracks.of_points(1 - own)
+    np.testing.assert_array_equal(swapped.pixels, tracks.subset(np.array([1, 0])).pixels)
+    assert swapped.ids.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(("widest_px", "expected"), [(4.0, [2.0, 4.0]), (16.0, [2.0, 4.0, 8.0, 16.0])])
