@@ -47,8 +47,11 @@ def copy_without_points(model):
 
 def colored(model, original):
     """A copy whose points have the colors of another model's."""
-    copy = pycolmap.Reconstruction(model)
-    color_points(copy, read_colors(original, {}))
+    copy, images = pycolmap.Reconstruction(model), posed_images(model)
+    points, pixels = points_of(model, images), points2d_of(model, images)
+    colors = color_points(points, images.ids.tolist(), pixels, read_colors(original, {}))
+    for k in np.flatnonzero(colors.any(axis=1)).tolist():
+        copy.point3D(int(points.ids[k])).color = colors[k]
     return copy
 
 
@@ -82,7 +85,7 @@ def with_points(model, points, options=None):
     """A copy with these points instead of its own, filtered."""
     images, copy = posed_images(model), copy_without_points(model)
     kept = filter_points(points, images, pictures_of(model, images), options or StructureOptions())
-    add_points(copy, images, kept)
+    add_points(copy, images.ids, kept, np.zeros((kept.num_points, 3), dtype=np.uint8))
     return copy
 
 

@@ -53,10 +53,9 @@ def lost_distances(
 ) -> Iterator[str]:
     """Yield what became of known distances that are in no model."""
     model_of = {
-        image.name: number
+        model.located.placed.names[image]: number
         for number, model in enumerate(models)
-        for image in model.located.reconstruction.images.values()
-        if image.has_pose
+        for image in np.flatnonzero(model.located.placed.is_posed).tolist()
     }
     for first, second, _ in known:
         ends = [model_of.get(name) for name in (first, second)]

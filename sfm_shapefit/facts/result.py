@@ -73,7 +73,6 @@ from sfm_shapefit.solver.options import SolverResult
 if TYPE_CHECKING:
     import pycolmap
 
-
 NO_SUPPORT = "hardly any of its matches makes a point with a third image: its pose is wrong"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 CARRIED_FIXED = "fixed; no pair of it takes part"
@@ -137,8 +136,8 @@ class LocateResult(_Placed):
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
         *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
     )
-    reconstruction: "pycolmap.Reconstruction"
-    """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
+    seed: Any
+    """The model in arrays: `files.colmap.seed.SeededModel`, which this room need not know."""
     inputs: Inputs
     options: PlacingOptions
     images: Images
@@ -215,9 +214,20 @@ class LocateResult(_Placed):
     """(n,) images that stand in another model of `map` alone, and are not missing here; None if it is one."""
 
     @cached_property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
+        built: pycolmap.Reconstruction = self.seed.build()
+        return built
+
+    @property
+    def model(self) -> Any:
+        """The reconstruction, which may have been changed, if somebody has asked for it; else the seed."""
+        return vars(self).get("reconstruction", self.seed)
+
+    @cached_property
     def facts(self) -> ModelFacts:
         """What is told of the model: each figure of locate.json, terminal and report."""
-        placement, model, gauge = self.placement, self.reconstruction, self.gauge
+        placement, model, gauge = self.placement, self.model, self.gauge
         solved = [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in (self, *self.further)]
         measures = (float(np.median(self.images.focal_lengths_px)), UNITS[gauge.scale])
         facts = facts_of_placement(placement, self.cameras, solved, measures) | {
@@ -245,7 +255,7 @@ class LocateResult(_Placed):
             num_points_as_nodes=int(np.sum(placement.nodes >= placement.num_cameras)),
             scale=gauge.statement,
             scale_sigma=gauge.scale_sigma,
-            known_distances=told_distances(self.distances, model),
+            known_distances=told_distances(self.distances, self.placed),
             wrong_priors=self._wrong_priors(),
             datum=EarthDatum.of(gauge.datum),
             rigid_groups=GroupFacts.of_placement(placement, self.kept, self.fixed),
@@ -260,8 +270,8 @@ class LocateResult(_Placed):
         )
 
     def _headline(self) -> str:
-        images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
-        return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
+        images = f"{self.model.num_reg_images()} of {len(self.image_names)} images placed"
+        return f"{self.verdict.grade.value}: {images}, {counted(self.model.num_points3D(), 'point')}"
 
     @property
     def told_evidence(self) -> ToldEvidence:

@@ -8,10 +8,9 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
+from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from sfm_shapefit.placement.options import KnownDistance
 
 
@@ -45,13 +44,10 @@ class DistanceFacts(Record):
     found: Annotated[float | None, "Distance in the output; null if one of them is not in it."]
 
 
-def told_distances(
-    known: "Sequence[KnownDistance]", model: "pycolmap.Reconstruction"
-) -> tuple[DistanceFacts, ...]:
+def told_distances(known: "Sequence[KnownDistance]", images: Images) -> tuple[DistanceFacts, ...]:
     """Return the distances that were told, each with what a model has."""
-    named = {name for one in known for name in one[:2]}
-    images = model.images.values() if named else ()
-    centers = {i.name: i.projection_center() for i in images if i.name in named and i.has_pose}
+    posed = np.flatnonzero(images.is_posed).tolist() if known else []
+    centers = {images.names[k]: images.centers[k] for k in posed}
     return tuple(
         DistanceFacts(
             first=first, second=second, known=float(distance), found=_distance(centers, first, second)

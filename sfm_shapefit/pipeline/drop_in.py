@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.facts.options import MapOptions
-from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_in
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.map import map_database, measure_run
@@ -107,4 +107,4 @@ def average_database(
             raise UnsolvableError(next(iter(reasons.values()), "no two images have a relative rotation"))
         _, members, averaging = max(components, key=lambda found: len(found[1]))
         images = run.pose(members, averaging.rotations)
-        return build_seed(run.read.template(images), images, number_points([]))
+        return SeededModel.of(run.read.template(images), images, number_points([]), None).build()

@@ -115,7 +115,7 @@ def tell_group(
         sigma_of=_SIGMA_OF if located else "",
         scale=gauge.statement,
         scale_sigma=gauge.scale_sigma,
-        known_distances=told_distances(told.distances, group.reconstruction),
+        known_distances=told_distances(told.distances, model.images),
         datum=EarthDatum.of(gauge.datum),
         timings_s=clock.seconds,
         warnings=[*seen.warnings, *filter(None, [gauge.warning])],

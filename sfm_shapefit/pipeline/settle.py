@@ -35,7 +35,7 @@ from sfm_shapefit.facts.warnings import (
     trust_warnings,
 )
 from sfm_shapefit.files.colmap.points import ModelPictures
-from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.doubted import confirm_cameras
 from sfm_shapefit.judgement.evidence import ModelEvidence, fit_pairs
@@ -180,11 +180,11 @@ def finish_piece(
             judged = judged.loosened(np.isin(judged.cameras, group.cameras))
     with clock("model"):
         keypoints = source.view.keypoints if source.has_database else None
-        reconstruction = build_seed(given.template, images, seeded.points, keypoints)
+        seed = SeededModel.of(given.template, images, seeded.points, keypoints)
         hand_back_memory()  # freed by the judgement; the files of a model take as much
     turned = None if stand.adjustment is None else turned_deg(before.rotations, source.images.rotations)
     found = LocateResult(
-        reconstruction=reconstruction,
+        seed=seed,
         inputs=given.inputs,
         options=options,
         images=source.images,
@@ -337,7 +337,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     if stand.source.economy.statement:
         limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
         yield f"to stay below {limit}, {stand.source.economy.statement}"
-    if found.reconstruction.num_points3D() == 0:
+    if found.seed.num_points3D() == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"

@@ -86,13 +86,13 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     """Write the files of one placed model or graph."""
     dimension = found.placement.graph.dimension
     if isinstance(found, LocateResult):
-        write_model(found.reconstruction, folder)
+        write_model(found.model, folder)
     for piece in found.further:
         placement = piece.placement if isinstance(piece, LocateResult) else piece
         subfolder = folder / folder_of(placement.piece)
         subfolder.mkdir(parents=True)
         if isinstance(piece, LocateResult):
-            write_model(piece.reconstruction, subfolder)
+            write_model(piece.model, subfolder)
             rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)

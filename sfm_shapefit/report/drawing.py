@@ -22,7 +22,7 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
 
 if TYPE_CHECKING:
-    import pycolmap
+    from sfm_shapefit.files.colmap.seed import PickedPoints
 
 
 MAX_POINTS = 20_000
@@ -207,7 +207,7 @@ def build_drawing(
     pairs: Sequence[PairRow],
     *,
     poses: Poses | None = None,
-    points: "pycolmap.Reconstruction | None" = None,
+    points: "PickedPoints | None" = None,
     certified: FloatArray | None = None,
 ) -> Drawing:
     """Return the drawing of a result's rows; what does not follow from these has its default.
@@ -215,7 +215,7 @@ def build_drawing(
     Args:
         cameras, pairs: rows of the tables.
         poses: rotations in the output's axes, and the input's centers; unknown if None.
-        points: the reconstruction whose 3D points are drawn; none if None.
+        points: of the model, which are drawn; none if None.
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
     """
     poses = _unknown_poses(len(cameras)) if poses is None else poses
@@ -373,26 +373,20 @@ def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatAr
     return angles
 
 
-def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArray) -> DrawnPoints:
-    """Return at most MAX_POINTS points, evenly picked, without those far out that would shrink the rest."""
-    if reconstruction is None or reconstruction.num_points3D() == 0:
+def _points(picked: "PickedPoints | None", cameras: FloatArray) -> DrawnPoints:
+    """Return points without those far out that would shrink the rest."""
+    if picked is None or not len(picked.xyz):
         return DrawnPoints(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
-    points = reconstruction.points3D
-    ids = sorted(points.keys())
-    count = min(len(ids), MAX_POINTS)
-    chosen = [points[ids[k * len(ids) // count]] for k in range(count)]
-    positions = np.array([point.xyz for point in chosen]).reshape(-1, 3)
-    colors = np.array([point.color for point in chosen], dtype=np.int64).reshape(-1, 3)
-    both = np.concatenate([positions, cameras])
+    both = np.concatenate([picked.xyz, cameras])
     middle = np.median(both, axis=0)
     limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
-    near = np.linalg.norm(positions - middle, axis=1) <= limit
+    near = np.linalg.norm(picked.xyz - middle, axis=1) <= limit
     return DrawnPoints(
-        positions=positions[near],
-        colors=colors[near],
-        num_all=len(ids),
-        track_lengths=np.array([point.track.length() for point in chosen], dtype=np.int64),
-        errors_px=np.array([point.error if point.error >= 0.0 else np.nan for point in chosen]),
+        positions=picked.xyz[near],
+        colors=picked.colors[near].astype(np.int64),
+        num_all=picked.num_all,
+        track_lengths=picked.lengths,
+        errors_px=np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan),
     )
 
 

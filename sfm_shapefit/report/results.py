@@ -11,15 +11,19 @@ from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.facts.result import GraphResult, LocateResult
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.seed import pick_points
 from sfm_shapefit.judgement.image_quality import ImageQuality
-from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.report.drawing import MAX_POINTS, CameraColumn, Drawing, build_drawing, poses_of
 
 
 def draw_result(found: LocateResult | GraphResult) -> Drawing:
     """Return the drawing of a placed model or bare graph."""
     placement, poses, points = found.placement, None, None
     if isinstance(found, LocateResult):
-        poses, points = poses_of(found.images, [row.name for row in found.cameras]), found.reconstruction
+        poses, points = (
+            poses_of(found.images, [row.name for row in found.cameras]),
+            pick_points(found.model, MAX_POINTS),
+        )
         if isinstance(found.options, MapOptions):  # a database has no positions, or those of sensors in rigs
             poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
         if found.gauge.axes is not None:
@@ -58,14 +62,17 @@ def draw_model(model: ColmapModel, trust: Mapping[str, float]) -> Drawing:
         CameraRow(name=name, placed=True, center=tuple(center), trust=trust.get(name, math.nan))
         for name, center in zip(images.names, images.centers.tolist(), strict=True)
     ]
-    return build_drawing(rows, [], poses=poses_of(images, images.names), points=model.reconstruction)
+    return build_drawing(
+        rows, [], poses=poses_of(images, images.names), points=pick_points(model.reconstruction, MAX_POINTS)
+    )
 
 
 def _draw_as_it_stands(model: ColmapModel, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Drawing:
     """Return the drawing of a model that is the input itself, so that there is nothing to compare it with."""
     poses = poses_of(model.images, [row.name for row in cameras])
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
-    return build_drawing(cameras, pairs, poses=poses, points=model.reconstruction)
+    points = pick_points(model.reconstruction, MAX_POINTS)
+    return build_drawing(cameras, pairs, poses=poses, points=points)
 
 
 def _columns(quality: ImageQuality, num_cameras: int) -> Iterator[CameraColumn]:

@@ -114,7 +114,7 @@ def test_points_read_and_added_again_are_the_same():
     images = images_of(model)
     points, bare = points_of(model, images), copy_without_points(model)
     assert points.lengths().tolist() == [model.point3D(i).track.length() for i in points.ids.tolist()]
-    add_points(bare, images, points)
+    add_points(bare, images.ids, points, np.zeros((points.num_points, 3), dtype=np.uint8))
     bare = colored(move_model(bare, images, points), model)
     errors = [[p.error for _, p in sorted(one.points3D.items())] for one in (bare, model)]
     np.testing.assert_allclose(*errors, rtol=1e-12)  # sums in the order of tracks

@@ -17,8 +17,9 @@ from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.points import points2d_of, points_of
 from sfm_shapefit.files.colmap.quiet import hear_pycolmap, quiet_stderr
-from sfm_shapefit.files.colmap.seed import build_seed, write_model
+from sfm_shapefit.files.colmap.seed import SeededModel, pick_points, write_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.scene.matches import KeypointMatches
 from sfm_shapefit.scene.points import number_points
@@ -93,9 +94,9 @@ def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=No
     centers = model.images.centers if centers is None else centers
     rows = np.flatnonzero(placed)
     images = model.images.placed(rows, centers[rows])
-    seed = build_seed(
+    seed = SeededModel.of(
         template_of(model), images, number_points([]), None if keypoints is None else keypoints.get
-    )
+    ).build()
     batches = all_matches() if batches is None else batches
     return seed, matches_between(seed, model.images.ids, batches)
 
@@ -552,15 +553,53 @@ def test_what_pycolmap_says_reaches_the_terminal_only_if_wanted(capfd, quiet):
     assert capfd.readouterr().err == "after"
 
 
-def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):
-    original, _ = ring_model()
+def seed_with_points():
+    """A seed with the points and colors of its input; of two images the database has the keypoints."""
+    original, _ = ring_model(noise_px=0.3)
+    model = read_model(original)
+    images, points = (
+        model.images.placed(range(1, NUM_IMAGES), ring_centers()[1:]),
+        points_of(original, model.images),
+    )
+    points = points.taken((points.images > 0) & ((points.images + points.keypoints) % 4 > 0))
+    known = points2d_of(original, images)
+    return SeededModel.of(
+        template_of(model), images, points, lambda k: known(k).astype("f4") if k in (2, 5) else None
+    )
+
+
+def test_a_seed_writes_the_bytes_that_pycolmap_writes_of_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.files.colmap.seed._POINTS_AT_ONCE", 50)
+    seed = seed_with_points()
+    folders = [tmp_path / name for name in ("ours", "theirs")]
+    for folder in folders:
+        folder.mkdir()
+    seed.write(folders[0])
+    built = seed.build()
+    write_model(built, folders[1])
+    for file in folders[1].iterdir():
+        assert (folders[0] / file.name).read_bytes() == file.read_bytes(), file.name
+    assert len(list(folders[0].iterdir())) == 5
+    assert dump(pycolmap.Reconstruction(folders[0])) == dump(pycolmap.Reconstruction(folders[1]))
+    assert built.num_points3D() == seed.num_points3D() == 120
+    assert built.num_reg_images() == seed.num_reg_images() == NUM_IMAGES - 1
+    assert all(point.color.any() for point in built.points3D.values())
+    errors = [one.compute_mean_reprojection_error() for one in (built, seed)]
+    np.testing.assert_allclose(*errors, rtol=1e-12)
+    for ours, theirs in zip(pick_points(seed, 7), pick_points(built, 7), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("limit", [100, 4096, 20000], ids=["no file", "no images", "no points"])
+def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path, limit):
+    seed = seed_with_points()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     # A longer file cannot be written, as on a full disk.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     full = pytest.raises(InputError, match="check the free space")
     try:
         with full, atomic_folder(tmp_path / "out") as partial:
-            write_model(original, partial)
+            seed.write(partial)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []

@@ -82,6 +82,9 @@ def test_results_write_themselves_and_show_at_most_twenty_attributes(tmp_path):
     mapped.write(tmp_path / "models", report=False)
     assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == 8
     assert not (tmp_path / "models/0/report.html").exists()
+    found.reconstruction.deregister_frame(found.reconstruction.image(1).frame_id)
+    found.write(tmp_path / "out", overwrite=True)
+    assert pycolmap.Reconstruction(tmp_path / "out").num_reg_images() == 7
     for name, result in {"found": found, "mapped": mapped, "checked": checked}.items():
         result.report(tmp_path / f"{name}.html")
         assert "report" in (tmp_path / f"{name}.html").read_text(encoding="utf-8")

@@ -19,7 +19,7 @@ from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.listed_poses import read_list
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.seed import build_seed
+from sfm_shapefit.files.colmap.seed import SeededModel
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline import adjustment as adjustment_stage
 from sfm_shapefit.pipeline import doubts as doubts_stage
@@ -93,7 +93,8 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     placed = model.images.frame_of != 4
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
     rows = np.flatnonzero(placed)
-    seed = build_seed(template_of(model), model.images.placed(rows, centers[rows]), number_points([]))
+    images = model.images.placed(rows, centers[rows])
+    seed = SeededModel.of(template_of(model), images, number_points([]), None).build()
     expected = model.images.frame_of != 4
     assert sorted(seed.reg_image_ids()) == model.images.ids[expected].tolist()
     np.testing.assert_allclose(centers_of(seed), centers[expected], atol=1e-12)

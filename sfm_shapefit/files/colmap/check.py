@@ -45,21 +45,20 @@ REQUIRED_FILES = ("cameras", "images", "points3D")
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; a wrong one does not."""
 
-_NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
+NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 _U64 = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")
-_IMAGE = struct.Struct("<I7dI")
+IMAGE = struct.Struct("<I7dI")
 _RIG = struct.Struct("<II")
 _SENSOR = struct.Struct("<iI")
 _HAS_POSE = struct.Struct("<B")
 _POSE = struct.Struct("<7d")
 _FRAME = struct.Struct("<II7dI")
 _FRAME_DATA = struct.Struct("<iIQ")
-_POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
-_POINT3D_BYTES = 51  # bytes of a point; id 8, xyz 24, rgb 3, error 8, track length 8
-_ID_AND_XYZ = np.dtype([("id", "<u8"), ("xyz", "<f8", 3)])
+POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
+POINT3D = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 _PIECE_BYTES = 2**22  # bytes of points3D.bin read at once; checking them takes ten times as much memory
 _IMAGES_AT_ONCE = 256  # images whose points are looked up at once; all 10,000 would take 200 MB
 
@@ -271,8 +270,8 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
     header_of: dict[int, tuple[int, int]] = {}  # camera id, number of points
     names: set[bytes] = set()
     observed: dict[int, tuple[Int32Array, UInt64Array]] = {}
-    for _ in range(file.take_count(_IMAGE.size + 1 + _U64.size, "images")):
-        image_id, *pose, camera_id = file.take(_IMAGE, "an image")
+    for _ in range(file.take_count(IMAGE.size + 1 + _U64.size, "images")):
+        image_id, *pose, camera_id = file.take(IMAGE, "an image")
         label = f"image {image_id}"
         name = file.take_name(f"the name of {label}")
         _refuse_pose(file, label, pose)
@@ -282,13 +281,13 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
             raise file.fault(f"{label} has no name")
         if image_id in header_of or name in names:
             raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
-        count = file.take_count(_POINT2D.itemsize, f"points of {label}")
-        points = np.frombuffer(file.read(count * _POINT2D.itemsize, label), dtype=_POINT2D)
+        count = file.take_count(POINT2D.itemsize, f"points of {label}")
+        points = np.frombuffer(file.read(count * POINT2D.itemsize, label), dtype=POINT2D)
         if not np.isfinite(points["xy"]).all():
             raise file.fault(f"{label} has a point whose coordinates are not finite")
         header_of[int(image_id)] = (int(camera_id), count)
         names.add(name)
-        keypoints = np.flatnonzero(points["point3d_id"] != _NO_POINT).astype(np.int32)
+        keypoints = np.flatnonzero(points["point3d_id"] != NO_POINT).astype(np.int32)
         observed[int(image_id)] = keypoints, points["point3d_id"][keypoints]
     file.finish()
     table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
@@ -297,18 +296,18 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
 
 def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
     """Walk points3D.bin, a piece at a time, and return the point ids, ascending."""
-    count = file.take_count(_POINT3D_BYTES, "3D points")
+    count = file.take_count(POINT3D.itemsize, "3D points")
     ids, done, data = np.empty(count, dtype=np.uint64), 0, b""
     while done < count:
         data += file.read(min(file.left, _PIECE_BYTES), "3D points")
         piece = np.frombuffer(data, dtype=np.uint8)
-        starts = np.empty(min(count - done, len(data) // _POINT3D_BYTES) + 1, dtype=np.int64)
+        starts = np.empty(min(count - done, len(data) // POINT3D.itemsize) + 1, dtype=np.int64)
         complete = int(_walk_points(piece, 0, starts))
         if not file.left and done + complete < count:
             raise file.truncated(f"3D point {done + complete + 1} of {count}")
         begins, end, is_head = starts[:complete, None], starts[complete], np.zeros(len(piece), dtype=np.bool_)
-        is_head[begins + np.arange(_POINT3D_BYTES)] = True
-        heads = piece[begins + np.arange(_ID_AND_XYZ.itemsize)].view(_ID_AND_XYZ)[:, 0]
+        is_head[begins + np.arange(POINT3D.itemsize)] = True
+        heads = piece[begins + np.arange(POINT3D.itemsize)].view(POINT3D)[:, 0]
         elements = piece[:end][~is_head[:end]].view("<u4").reshape(-1, 2)
         is_finite = np.isfinite(heads["xyz"]).all(axis=1)
         if not is_finite.all():

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.points import add_points
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.scene.posed_model import Intrinsics, PosedModelFile, model_of_images
 
 
@@ -45,7 +46,18 @@ def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reco
         rotation = scene.rotations[k]
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ scene.centers[k])
         model.add_image_with_trivial_frame(image, pose)
-    _add_points(model, scene, observed, bounds)
+    order = np.argsort(observed[:, 0], kind="stable")
+    known, lengths = np.unique(observed[:, 0], return_counts=True)
+    points = Points(
+        xyz=scene.points[known],
+        offsets=np.append(0, np.cumsum(lengths)),
+        images=observed[order, 1],
+        keypoints=(np.arange(len(observed)) - bounds[observed[:, 1]])[order],
+        ids=known + 1,
+    )
+    add_points(model, np.arange(1, len(scene.names) + 1), points, scene.colors[known].astype(np.uint8))
+    if len(observed):
+        model.update_point_3d_errors()
     return model
 
 
@@ -92,23 +104,3 @@ def intrinsics_of(camera: pycolmap.Camera) -> Intrinsics:
 def make_camera(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
     """Return a camera of pycolmap's whose focal length is known."""
     return pycolmap.Camera(**intrinsics._asdict(), camera_id=camera_id, has_prior_focal_length=True)
-
-
-def _add_points(
-    model: pycolmap.Reconstruction, scene: PosedModelFile, observed: IntArray, bounds: IntArray
-) -> None:
-    """Add the points, with ids from 1 in their order; `observed` is sorted by image."""
-    keypoints = np.arange(len(observed)) - bounds[observed[:, 1]]
-    order = np.argsort(observed[:, 0], kind="stable")
-    starts = np.searchsorted(observed[order, 0], np.arange(len(scene.points) + 1))
-    for point in np.unique(observed[:, 0]).tolist():
-        rows = order[starts[point] : starts[point + 1]]
-        elements = [
-            pycolmap.TrackElement(image + 1, keypoint)
-            for image, keypoint in zip(observed[rows, 1].tolist(), keypoints[rows].tolist(), strict=True)
-        ]
-        xyz, color = scene.points[point], scene.colors[point].astype(np.uint8)
-        made = pycolmap.Point3D(xyz=xyz, color=color, track=pycolmap.Track(elements))
-        model.add_point3D_with_id(point + 1, made)
-    if len(observed):
-        model.update_point_3d_errors()

@@ -1,7 +1,7 @@
 """The colors of a model's points, kept by the keypoints that see them, so that the points need not be."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
+from sfm_shapefit.base.arrays import FloatArray, Int32Array
 from sfm_shapefit.files.colmap.points import Observed, observed_points, points2d_xy
+from sfm_shapefit.scene.points import Points
 
 
 class SeenColors(NamedTuple):
@@ -47,44 +48,37 @@ def read_colors(source: pycolmap.Reconstruction, observed: Observed) -> PointCol
         keypoints, seen = observed.get(image_id) or observed_points(image)
         if len(keypoints):
             rows = np.searchsorted(ids, seen).astype(np.int32)
-            images[image_id] = SeenColors(_digest(image), keypoints.astype(np.int32), rows)
+            images[image_id] = SeenColors(_digest(points2d_xy(image)), keypoints.astype(np.int32), rows)
     return PointColors(colors=colors, images=images)
 
 
-def color_points(result: pycolmap.Reconstruction, source: PointColors) -> None:
-    """Give points the mean color of the source's points seen at the same points2D; `result` changes.
+def color_points(
+    points: Points, ids: Sequence[int], pixels: Callable[[int], FloatArray], source: PointColors | None
+) -> npt.NDArray[np.uint8]:
+    """Return colors (x, 3) of points: the mean of the source's that are seen at the same points2D, or black.
 
-    Images take part if their points2D are the same in both, in number and coordinates. Points without
-    any common observation keep their color.
+    Images take part if their points2D are the same in both, in number and coordinates.
+
+    Args:
+        points: of images with these ids.
+        ids: of the images.
+        pixels: returns the points2D (k, 2) of an image by its row.
+        source: colors of another model; None if it has no points.
     """
-    if not source.images:
-        return
-    ids = np.array(sorted(result.point3D_ids()), dtype=np.uint64)
-    sums, counts = np.zeros((len(ids), 3)), np.zeros(len(ids), dtype=np.int64)
-    for seen, rows in _common_observations(result, source):
-        points = np.searchsorted(ids, seen)
-        np.add.at(sums, points, source.colors[rows].astype(np.float64))
-        np.add.at(counts, points, 1)
-    is_seen = counts > 0
-    means = np.rint(sums[is_seen] / counts[is_seen, None]).astype(np.uint8)
-    for point_id, mean in zip(ids[is_seen].tolist(), means, strict=True):
-        result.point3D(point_id).color = mean
+    sums, counts = np.zeros((points.num_points, 3)), np.zeros(points.num_points, dtype=np.int64)
+    if source is not None and source.images:
+        point_of = points.points_seen()
+        for image, rows in enumerate(points.rows_of_images(len(ids))):
+            known = source.images.get(ids[image])
+            if known is None or not len(rows) or _digest(pixels(image)) != known.digest:
+                continue
+            both = np.intersect1d(points.keypoints[rows], known.keypoints, True, return_indices=True)
+            seen = point_of[rows[both[1]]]
+            np.add.at(sums, seen, source.colors[known.points[both[2]]].astype(np.float64))
+            np.add.at(counts, seen, 1)
+    return np.rint(sums / np.maximum(counts, 1)[:, None]).astype(np.uint8)
 
 
-def _common_observations(
-    result: pycolmap.Reconstruction, source: PointColors
-) -> Iterator[tuple[UInt64Array, IntArray]]:
-    """Yield what each points2D of an image sees, if it sees a point in both models: its id, and the row."""
-    for image_id in sorted(result.reg_image_ids()):
-        image, known = result.image(image_id), source.images.get(image_id)
-        if known is None or _digest(image) != known.digest:
-            continue
-        keypoints, ids = observed_points(image)
-        _, own, others = np.intersect1d(keypoints, known.keypoints, assume_unique=True, return_indices=True)
-        yield ids[own], known.points[others].astype(np.int64)
-
-
-def _digest(image: pycolmap.Image) -> bytes:
-    """Return what tells the points2D of images apart by their number and coordinates."""
-    xy = points2d_xy(image) + 0.0  # -0 is 0
-    return hashlib.blake2b(xy.tobytes(), digest_size=16).digest()
+def _digest(xy: FloatArray) -> bytes:
+    """Return what tells the points2D (k, 2) of images apart by their number and coordinates."""
+    return hashlib.blake2b((xy + 0.0).tobytes(), digest_size=16).digest()  # -0 is 0

@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, UInt64Array
@@ -98,26 +99,31 @@ def points_of(reconstruction: pycolmap.Reconstruction, images: Images) -> Points
     )
 
 
-def add_points(reconstruction: pycolmap.Reconstruction, images: Images, points: Points) -> None:
-    """Add points to our own `reconstruction`.
+def add_points(
+    model: pycolmap.Reconstruction,
+    image_ids: IntArray,
+    points: Points,
+    colors: npt.NDArray[np.uint8],
+) -> None:
+    """Add points to our own model.
 
     Args:
-        reconstruction: changed in place.
-        images: of it, which the points' observations index.
+        model: changed in place.
+        image_ids: (i,) of its images, which the points' observations index.
         points: with ids that it has not.
+        colors: (x, 3) of the points.
     """
     errors = np.full(points.num_points, -1.0) if points.errors_px is None else points.errors_px
-    given = zip(
-        points.ids.tolist(), itertools.pairwise(points.offsets.tolist()), points.xyz, errors, strict=True
-    )
-    for point_id, (begin, end), xyz, error in given:
+    bounds = itertools.pairwise(points.offsets.tolist())
+    given = zip(points.ids.tolist(), bounds, points.xyz, colors, errors, strict=True)
+    for point_id, (begin, end), xyz, color, error in given:
         track = pycolmap.Track()
-        ids = images.ids[points.images[begin:end]].tolist()
+        ids = image_ids[points.images[begin:end]].tolist()
         for image_id, keypoint in zip(ids, points.keypoints[begin:end].tolist(), strict=True):
             track.add_element(image_id, keypoint)  # a TrackElement for each takes four times as long
-        point = pycolmap.Point3D(xyz=xyz, track=track)
+        point = pycolmap.Point3D(xyz=xyz, track=track, color=color)
         point.error = error
-        reconstruction.add_point3D_with_id(point_id, point)
+        model.add_point3D_with_id(point_id, point)
 
 
 def move_model(
