@@ -18,6 +18,7 @@ import sfm_shapefit
 from sfm_shapefit.cli import app
 from tests.program import run
 from tests.scenes import ROOT
+from tests.test_architecture import tree_of
 
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
@@ -128,7 +129,7 @@ def strings_of(tree: ast.AST) -> list[str]:
 
 def test_messages_that_troubleshooting_quotes_the_program_says():
     sources = (ROOT / "sfm_shapefit").rglob("*.py")
-    said = [text for path in sources for text in strings_of(ast.parse(path.read_text(encoding="utf-8")))]
+    said = [text for path in sources for text in strings_of(tree_of(path))]
     table = TEXTS[ROOT / "docs/troubleshooting.md"].split("| you see |")[1].split("\n\n", 1)[0]
     rows = table.splitlines()[2:]
     assert len(rows) == 15

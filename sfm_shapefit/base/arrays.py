@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -11,7 +12,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-_LARGE_KB = 400_000  # kilobytes of memory, at most; the program alone takes 230,000
+_LARGE_RUN = 170_000_000  # bytes that a run has added to the process; small ones never do
+_began = [230_000_000]  # bytes of the process when its run began; the program alone has as many
 
 AnyArray = TypeVar("AnyArray", bound=npt.NDArray[Any])
 Columns = TypeVar("Columns", bound=NamedTuple)
@@ -48,19 +50,29 @@ def frozen(array: AnyArray) -> AnyArray:
     return view
 
 
+def begin_run() -> None:
+    """Note how much memory the process has before a run."""
+    _began[0] = _resident_bytes()
+
+
 def hand_back_memory() -> None:
-    """Hand back what the C library keeps of freed memory, where it is glibc; elsewhere nothing is done.
+    """Hand back what the C library keeps of freed memory, where it is glibc on Linux and the run is large.
 
     glibc keeps arrays of up to 32 MB in its heap, of which only the end goes back by itself: one object that
-    lives on keeps all below it. After the first placement of 2,500 images that is 345 of 837 MB. A process
-    that was never large keeps it: to be given it again takes a twentieth of a short run.
+    lives on keeps all below it. After the first placement of 2,500 images that is 345 of 837 MB. A small run
+    keeps it: to be given it again takes a twentieth of its time, and where much else lives in the process,
+    in a gigabyte of small objects, to look for it takes as long as the run.
     """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
-    if trim is not None:
-        import resource  # which not every system has
-
-        if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > _LARGE_KB:
+    if _resident_bytes() > _began[0] + _LARGE_RUN:
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # which another C library has not
+        if trim is not None:
             trim(ctypes.c_size_t(0))
+
+
+def _resident_bytes() -> int:
+    """Return how much memory the process has; 0 where the system is not Linux."""
+    told = Path("/proc/self/statm")
+    return int(told.read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE") if told.exists() else 0
 
 
 Int32Array = npt.NDArray[np.int32]

@@ -355,9 +355,10 @@ def conjugate_gradients(
     scale = _norms(r, coupled)
     scale = np.where(scale > 0.0, scale, 1.0)
     rho_before = np.ones_like(scale)
-    k, best, least = 0, x, float(np.max(_norms(r, coupled) / scale, initial=0.0))
+    norms = _norms(r, coupled)
+    k, best, least = 0, x, float(np.max(norms / scale, initial=0.0))
     largest = least
-    while (_norms(r, coupled) > tol * scale).any() and k < max_iterations and largest <= _DIVERGED * least:
+    while (norms > tol * scale).any() and k < max_iterations and largest <= _DIVERGED * least:
         z = _centered(preconditioner.solve(r), count)
         rho = _products(r, z, coupled)
         p = z + (rho / rho_before if k else 0.0) * p
@@ -368,7 +369,8 @@ def conjugate_gradients(
         r = r - alpha * q
         rho_before = np.where(rho > 0.0, rho, 1.0)
         k += 1
-        largest = float(np.max(_norms(r, coupled) / scale, initial=0.0))
+        norms = _norms(r, coupled)
+        largest = float(np.max(norms / scale, initial=0.0))
         if largest < least:
             best, least = x, largest
     return GradientsResult(_centered(best, count), k, least, bool(least <= tol))

@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from sfm_shapefit.base.arrays import hand_back_memory
+from sfm_shapefit.base.arrays import begin_run, hand_back_memory
 from sfm_shapefit.solver.options import IterationInfo, SolverOptions
 
 Progress = Callable[[str, int, int], None]
@@ -30,6 +30,7 @@ class Clock:
         cls, progress: Progress | None, options: SolverOptions, executor: Executor | None = None
     ) -> "Clock":
         """Return the clock of a run whose caller may want to hear of its progress."""
+        begin_run()
         clock = cls(executor=executor, threads=options.num_threads())
         clock.progress = progress or clock.progress
         return clock

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from sfm_shapefit.base.arrays import frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.graph import rigidity
 from sfm_shapefit.graph.rigidity import (
@@ -199,9 +200,9 @@ def test_the_shortcuts_change_nothing(dimension, span, monkeypatch):
 
 
 def random_pairs(rng, n, m):
-    """Return m different pairs of n cameras, each in a random order."""
+    """Return m different pairs of n cameras, each in a random order; read-only, as those of a graph are."""
     pairs = rng.permutation(np.array(all_pairs(n)))[:m]
-    return np.where(rng.random((m, 1)) < 0.5, pairs, pairs[:, ::-1])
+    return frozen(np.where(rng.random((m, 1)) < 0.5, pairs, pairs[:, ::-1]))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -233,7 +234,7 @@ def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
         return rigidity.pieces._grows_from_first_pair(edges, graph.pointers, graph.neighbors)
 
     assert grows(n, edges) == (len(members) == n)
-    fan = np.array([(0, 1), *((i, k) for k in range(2, n) for i in (k - 2, k - 1))])
+    fan = frozen(np.array([(0, 1), *((i, k) for k in range(2, n) for i in (k - 2, k - 1))]))
     assert grows(n, fan)
     assert not grows(n + 1, fan)
 
@@ -387,7 +388,7 @@ def test_a_hundred_thousand_pairs_and_a_late_pendant_are_sorted_out_exactly():
 
 def test_growth_ends_with_the_seed_at_which_its_work_is_used_up(monkeypatch):
     part = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3]])  # a triangle, and a camera joined to it twice
-    edges, body = np.concatenate([part, part + 4]), np.array([0, 0, 0, 1, 2, 3, 3, 3, 4, 5])
+    edges, body = frozen(np.concatenate([part, part + 4])), np.array([0, 0, 0, 1, 2, 3, 3, 3, 4, 5])
     np.testing.assert_array_equal(rigidity.growth.grow_sets(8, edges, body), [0] * 5 + [1] * 5)
     monkeypatch.setattr(rigidity.growth, "_GROWTH_WORK", 0)
     monkeypatch.setattr(rigidity.growth, "_GROWTH_ROUNDS", 1)
