@@ -83,11 +83,13 @@ def _reason(doubts: Doubts, camera: int) -> str:
     kind, others = doubts.kinds[camera], len(doubts.members(camera)) - 1
     together = f", together with {others} other camera{'s' if others > 1 else ''}" if others else ""
     turn = f"a turn by {doubts.angles_deg[camera]:.0f} degrees{together}"
+    is_guessed = doubts.guessed is not None and doubts.guessed[camera]
+    subject = "its rotation, or its guessed focal length," if is_guessed else "its rotation"
     if kind is Doubt.TURNED:
-        return f"its rotation is wrong: {doubts.num_turned[camera]} of its pairs agree on {turn}"
+        return f"{subject} is wrong: {doubts.num_turned[camera]} of its pairs agree on {turn}"
     if kind is Doubt.AMBIGUOUS:
         share = doubts.turned[camera] / (doubts.placed[camera] + doubts.turned[camera])
         return f"repeated structure, or a wrong rotation: {share:.0%} of its evidence is for {turn}"
     if kind is Doubt.UNSUPPORTED:
-        return "none of its pairs agrees with it: its rotation may be wrong"
+        return f"none of its pairs agrees with it: {subject} may be wrong"
     return ""

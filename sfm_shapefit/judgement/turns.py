@@ -107,6 +107,8 @@ class Doubts:
     """(n,) that turn; NaN where there is none."""
     bodies: IntArray
     """(n,) label of the body with which the camera was judged; cameras judged alone have one of their own."""
+    guessed: BoolArray | None = None
+    """(n,) cameras whose focal length is still a guess, which may be what is wrong; none if None."""
 
     def members(self, camera: int) -> IntArray:
         """Return the cameras of a camera's body, ascending."""

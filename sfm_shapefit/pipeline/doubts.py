@@ -21,7 +21,8 @@ from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import RayMatches, is_among
+from sfm_shapefit.scene.lens import Lens, Origin
+from sfm_shapefit.scene.matches import RayMatches, is_among, rows_of_pairs
 
 _LEAST_MATCHES = 8  # matches; a pair of fewer is never sound, see `RelativeRotations.are_sound`
 _POOR = 0.9  # robust weight of a pair as placed; below, its camera is asked whether it is turned
@@ -63,13 +64,13 @@ def ask_pairs(
     if among is not None:
         asked = asked[np.isin(asked, among).all(axis=1)]
     are_many = have_many_pairs(source.images.num_images, len(directions.pairs))
-    return _ask(source, asked, threads, directions if are_many else None)
+    return ask_rotations(source, asked, threads, directions if are_many else None)
 
 
-def _ask(
+def ask_rotations(
     source: MatchSource, asked: IntArray, threads: int, given: PairDirections | None = None
 ) -> RelativeRotations:
-    """Return the relative rotations of the asked pairs (k, 2); the matches of others are not looked at.
+    """Return the relative rotations that the matches of the asked pairs (k, 2) have by themselves.
 
     What pairs say alone, or else the `given` directions, those of many pairs, is tried first.
     """
@@ -100,16 +101,9 @@ def _poses_alone(alone: RelativeRotations | None, pairs: IntArray) -> LikelyPose
     """Return the relative poses that pairs (k, 2) have by themselves, as far as that was asked before."""
     if alone is None or alone.translations is None or not len(alone.pairs):
         return None
-    key = np.array([1 + max(int(alone.pairs.max()), int(pairs.max(initial=0))), 1])
-    known, wanted = alone.pairs @ key, pairs @ key
-    rows = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
-    translations = np.where((known[rows] == wanted)[:, None], alone.translations[rows], np.nan)
+    rows = rows_of_pairs(pairs, alone.pairs)
+    translations = np.where((rows >= 0)[:, None], alone.translations[rows], np.nan)
     return LikelyPoses(alone.rotations[rows], translations, _AS_WELL * alone.weight_shares[rows])
-
-
-def ask_rotations(source: MatchSource, pairs: IntArray, threads: int) -> RelativeRotations:
-    """Return the relative rotations that the matches of some pairs (k, 2) have by themselves."""
-    return _ask(source, pairs, threads)
 
 
 def doubt_cameras(
@@ -137,8 +131,14 @@ def doubt_cameras(
     labels = np.arange(len(placement.cameras))
     if placement.groups is not None:
         _, labels = np.unique(placement.groups.group_of[placement.cameras], return_inverse=True)
-    doubts = find_turned(pairs, labels)
+    guesses = np.array([_is_guess(lens) for lens in images.lenses])[images.lens_of[placement.cameras]]
+    doubts = replace(find_turned(pairs, labels), guessed=guesses)
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
+
+
+def _is_guess(lens: Lens) -> bool:
+    """Return whether nothing but a guess has told the focal length, the first parameter."""
+    return lens.origin is Origin.GUESS and lens.given[:1] in ((), lens.parameters[:1])
 
 
 def confirm_rotations(source: MatchSource, directions: PairDirections, threads: int) -> BoolArray:

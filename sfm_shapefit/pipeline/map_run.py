@@ -142,8 +142,7 @@ class MapRun(NamedTuple):
         of_frames = relative_rotations_of_frames(relative, of_image, sensors)
         gravity = self.known.gravity
         gravity = None if gravity is None else gravity.of_frames(of_image, sensors)
-        is_single = np.array_equal(of_image, np.arange(len(of_image)))  # else frames are those of rigs
-        scores = self.scores if is_single else PairScores()
+        scores = PairScores() if images.has_rigs else self.scores
         averaging = ComponentAveraging(self.options.averaging, self.clock, gravity, scores)
         for frames, averaged in averaging.average(int(of_image.max()) + 1, of_frames, reasons):
             members = np.flatnonzero(np.isin(of_image, frames))

@@ -220,7 +220,8 @@ def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
     if first is None:
         return stand
     centers = first.near.locations[stand.placement.cameras]
-    scale = median_spread(centers) / median_spread(stand.placement.locations)
+    there = np.isfinite(centers).all(axis=1)  # some may have had no place then
+    scale = median_spread(centers[there]) / median_spread(stand.placement.locations[there])
     return stand._replace(estimate=first.adjusted, scale=scale)
 
 

@@ -12,7 +12,7 @@ import sfm_shapefit
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.judgement.doubted import confirm_cameras
+from sfm_shapefit.judgement.doubted import confirm_cameras, weigh_doubts
 from sfm_shapefit.judgement.trust import LOW_TRUST
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs import essential as relative_rotations
@@ -24,6 +24,7 @@ from sfm_shapefit.pipeline.doubts import ask_pairs
 from sfm_shapefit.pipeline.inputs import inputs_from, see_matches
 from sfm_shapefit.pipeline.measure import measure
 from sfm_shapefit.pipeline.relative_rotations import measure_rotations
+from sfm_shapefit.scene.lens import Lens, Origin
 from tests.models import posed
 from tests.problems import turn
 from tests.scenes import COURTYARD, PHOTOGRAPHED
@@ -71,6 +72,39 @@ def test_confirmed_cameras_are_trusted_and_no_reason_counts_them():
     assert np.flatnonzero(found.ambiguous).tolist() == [second]
     believed = confirm_cameras(replace(assessment, doubts=None), sure)
     assert believed.reasons == tuple("" if k == first else r for k, r in enumerate(assessment.reasons))
+
+
+@pytest.mark.parametrize(
+    ("guessed", "subject"), [(True, "its rotation, or its guessed focal length,"), (False, "its rotation")]
+)
+def test_what_a_wrong_lens_explains_as_well_is_not_laid_to_the_rotation_alone(monkeypatch, guessed, subject):
+    monkeypatch.setattr(doubts_stage, "_is_guess", lambda _: guessed)
+    found = sfm_shapefit.locate(PHOTOGRAPHED / "sparse" / "0", adjust="none").placement.assessment
+    assert found.doubts.guessed.tolist() == 16 * [guessed]
+    for kind, said in (
+        (Doubt.TURNED, f"{subject} is wrong: 4 of its pairs agree on a turn by "),
+        (Doubt.UNSUPPORTED, f"none of its pairs agrees with it: {subject} may be wrong"),
+    ):
+        turned, placed = np.ones(16), np.full(16, 0.1)
+        doubts = replace(
+            found.doubts, kinds=(kind,) * 16, num_turned=np.full(16, 4), turned=turned, placed=placed
+        )
+        reasons = weigh_doubts(found, doubts).reasons
+        assert all(reason.startswith(said) for reason in reasons)
+
+
+@pytest.mark.parametrize(
+    ("lens", "expected"),
+    [
+        (Lens("SIMPLE_RADIAL", (9.0, 2.0, 1.0, 0.1), origin=Origin.GUESS, given=(9.0, 2.0, 1.0, 0.0)), True),
+        (Lens("SIMPLE_RADIAL", (8.0, 2.0, 1.0, 0.1), origin=Origin.GUESS, given=(9.0, 2.0, 1.0, 0.0)), False),
+        (Lens("SIMPLE_PINHOLE", (9.0, 2.0, 1.0), origin=Origin.GUESS), True),
+        (Lens("SIMPLE_PINHOLE", (9.0, 2.0, 1.0), origin=Origin.EXIF, given=(9.0, 2.0, 1.0)), False),
+        (Lens("SIMPLE_PINHOLE", (9.0, 2.0, 1.0)), False),
+    ],
+)
+def test_a_guess_is_one_until_something_changes_it(lens, expected):
+    assert doubts_stage._is_guess(lens) == expected
 
 
 def test_every_camera_of_a_clean_scene_is_trusted():
