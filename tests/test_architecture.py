@@ -43,7 +43,7 @@ MOST_LINES = {
     "graph": 1340,
     "judgement": 3430,
     "laplacian": 2080,
-    "pairs": 1540,
+    "pairs": 1595,
     "pipeline": 6680,
     "placement": 2820,
     "refinement": 2160,

@@ -1,11 +1,12 @@
 """Directions of many pairs from their matches, and which to believe."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, frozen
-from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.pairs.kernels import MEASURES, MIN_MATCHES, estimate_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
@@ -22,22 +23,23 @@ def estimate_directions(
     """
     options = options or DirectionOptions()
     k = len(matches.pairs)
-    directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
+    directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 2, 2))
+    settings = (options.inlier_threshold_px, options.num_hypotheses)
+    run_over_pairs(estimate_pairs, matches, threads, *settings, directions, measures, moments)
+    return _judge(matches, directions, measures, moments, options)
+
+
+def run_over_pairs(kernel: Callable[..., None], matches: RayMatches, threads: int, *others: Any) -> None:
+    """Call a kernel with ranges of pairs, the arrays of all, and what else it takes, from several threads."""
     rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
     arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
-    settings = (options.inlier_threshold_px, options.num_hypotheses)
-
-    def run(begin: int, end: int) -> None:
-        estimate_pairs(begin, end, *arrays, *settings, directions, measures, moments)
-
-    if threads <= 1:
+    cuts = [len(matches.pairs) * share // threads for share in range(threads + 1)]
+    if threads == 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
-        run(0, k)
-    else:
-        cuts = [k * share // threads for share in range(threads + 1)]
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, cuts[:-1], cuts[1:]))
-    return _judge(matches, directions, measures, moments, options)
+        kernel(*cuts, *arrays, *others)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(lambda begin, end: kernel(begin, end, *arrays, *others), cuts[:-1], cuts[1:]))
 
 
 def _judge(
@@ -50,7 +52,7 @@ def _judge(
     """Decide which estimates to believe, and give the others their reason."""
     num_matches = np.diff(matches.offsets)
     inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
-    covariance = _tangent_covariance(directions, moments)
+    covariance = _tangent_covariance(moments)
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
     status = first_reasons(
         (num_matches < max(options.min_inliers, MIN_MATCHES), DirectionStatus.TOO_FEW_MATCHES),
@@ -76,14 +78,12 @@ def _judge(
     )
 
 
-def _tangent_covariance(directions: FloatArray, moments: FloatArray) -> FloatArray:
-    """Return A^-1 B A^-1 in each direction's tangent basis, shape (k, 2, 2), from A and B (k, 2, 3, 3).
+def _tangent_covariance(moments: FloatArray) -> FloatArray:
+    """Return A^-1 B A^-1 in each direction's tangent basis, shape (k, 2, 2), from A and B (k, 2, 2, 2).
 
     Where A has no information, and where the variance exceeds (1 rad)^2, it is that, which means: unknown.
     """
-    is_estimated = np.linalg.norm(directions, axis=1, keepdims=True) > 0.0
-    bases = tangent_bases(np.where(is_estimated, directions, [1.0, 0.0, 0.0]))
-    curvature, slope_variance = np.einsum("kab,ksac,kcd->skbd", bases, moments, bases)
+    curvature, slope_variance = moments.transpose(1, 0, 2, 3)
     values, vectors = np.linalg.eigh(curvature)
     inverse = (vectors / np.maximum(values, 1.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     variances, axes = np.linalg.eigh(inverse @ slope_variance @ inverse)

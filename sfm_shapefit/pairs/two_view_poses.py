@@ -32,14 +32,14 @@ Simulated, 100 matches of .5 px: the covariance of the estimates is .93 to .99 o
 translation may be anywhere, and standard deviations are up to three times those that the information says.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.base.jit import inner_kernel, kernel
+from sfm_shapefit.pairs.estimate import run_over_pairs
 from sfm_shapefit.pairs.kernels import fill_basis, median
 from sfm_shapefit.scene.matches import RayMatches
 
@@ -97,26 +97,14 @@ def refine_two_view_poses(
         np.zeros((k, 3, 3)),
         np.zeros(k),
     )
-    rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
-    arrays = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
-
-    def run(begin: int, end: int) -> None:
-        refine_pairs(begin, end, off_rad, *arrays, *poses)
-
-    if threads <= 1:
-        # Where memory is short, Python waits for ever for a thread that could not begin.
-        run(0, k)
-    else:
-        cuts = [k * share // threads for share in range(threads + 1)]
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(run, cuts[:-1], cuts[1:]))
+    run_over_pairs(refine_pairs, matches, threads, off_rad, *poses)
     return poses
 
 
 @kernel
 def refine_pairs(
-    begin: int, end: int, off_rad: float, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray,
-    pixel_angles: FloatArray, rotations: FloatArray, translations: FloatArray, information: FloatArray,
+    begin: int, end: int, offsets: IntArray, rays_i: FloatArray, rays_j: FloatArray, pixel_angles:
+    FloatArray, off_rad: float, rotations: FloatArray, translations: FloatArray, information: FloatArray,
     weight_shares: FloatArray,
 ) -> None:  # fmt: skip
     """Refine rotations and translations of the pairs begin..end-1; fill information and weight shares."""
