@@ -36,7 +36,7 @@ MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only beco
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
     "adjustment": 4970,
-    "base": 2310,
+    "base": 2360,
     "cli": 1800,
     "facts": 3530,
     "files": 4820,
@@ -50,7 +50,7 @@ MOST_LINES = {
     "report": 1690,
     "rotations": 2290,
     "scene": 2100,
-    "solver": 4220,
+    "solver": 4250,
     "synthetic": 2650,
     "synthetic/fixtures": 150,
     "tracks": 1180,
