@@ -7,11 +7,13 @@ as a copy inside another kernel; which copy runs depends on what was compiled an
 C functions of other libraries are called by address. An address changes from process to process, so it must
 not be a constant of compiled code (numba would not cache it): `call_address` takes it as an argument.
 
-What compiling costs. A kernel with eight arrays takes about 0.15 s, and every kernel that calls it compiles a
-copy of it again, so chains of calls are kept short. An assignment of one array to another (`a[:] = b`),
-arithmetic of whole arrays and most functions of numpy bring tens of compilations of their own, where a loop
-brings none. Another type of argument is another compilation: integers are int64 and arrays writable, or
-read-only, wherever a kernel is called; a literal number has a type of its own.
+What compiling costs. A kernel with eight arrays takes about 0.15 s, most of it before LLVM has begun: what
+counts is the number of statements. Every kernel that calls another optimizes a copy of it again, so chains of
+calls are kept short; inner kernels are optimized where they are called, and nowhere else. An assignment of
+one array to another (`a[:] = b`), arithmetic of whole arrays and most functions of numpy bring tens of
+compilations of their own, where a loop brings none. Another type of argument is another compilation: integers
+are int64 and arrays writable, or read-only, wherever a kernel is called; a literal number has a type of its
+own.
 """
 
 import hashlib
@@ -26,9 +28,11 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import install_listener
-from numba.extending import get_cython_function_address, intrinsic, register_jitable
+from numba.core.typing.templates import infer_global
+from numba.extending import get_cython_function_address, intrinsic
 
 from sfm_shapefit.base.kernel_cache import CompileTime, KernelCache, choose_target
+from sfm_shapefit.base.kernel_code import InnerCompiler
 from sfm_shapefit.base.scipy_parts import compiled_module
 
 choose_target()
@@ -50,8 +54,20 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 # What all kernels have in common. Nothing calls them from C.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
+# Functions of numpy that make an array, as far as kernels call them; numba refuses another in a kernel that
+# calls none of these.
+_MAKE_ARRAYS = {"arange", "array", "empty", "empty_like", "full", "ones", "zeros"}
+
+_inner: list[Any] = []
+"""What numba knows inner kernels by; it does not keep them itself."""
+
 # Four float64 or eight float32: what most processors add at once.
 _LANE_BYTES = 32
+
+
+def _options(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return numba's options for a kernel: one that makes no arrays counts no references to them."""
+    return _OPTIONS | {"_nrt": not _MAKE_ARRAYS.isdisjoint(function.__code__.co_names)}
 
 
 def kernel(function: Kernel) -> Kernel:
@@ -62,14 +78,18 @@ def kernel(function: Kernel) -> Kernel:
     """
     if getattr(function, "__closure__", None):
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
-    dispatcher = numba.njit(**_OPTIONS)(function)
+    dispatcher = numba.njit(**_options(function))(function)
     dispatcher._cache = KernelCache(function)
     return cast(Kernel, dispatcher)
 
 
 def inner_kernel(function: Kernel) -> Kernel:
     """Let kernels call a function: it is compiled as a part of them, and for Python stays as it is."""
-    return cast(Kernel, register_jitable(**_OPTIONS)(function))
+    options = _options(function) | {"no_cpython_wrapper": True, "pipeline_class": InnerCompiler}
+    dispatcher = numba.njit(**options)(function)
+    infer_global(function, types.Dispatcher(dispatcher))
+    _inner.append(dispatcher)
+    return function
 
 
 @contextmanager

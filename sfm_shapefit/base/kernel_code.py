@@ -14,8 +14,9 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
-from numba.core.compiler import CompileResult
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.environment import Environment
+from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
@@ -50,6 +51,36 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
             self._shared_module = llvm.parse_bitcode(self._llvm_code)
             self._codegen._engine._load_defined_symbols(self._shared_module)
         return self._shared_module
+
+
+class InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """LLVM code of a function that only kernels call: they take it in, and optimize it with their own."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Leave the code as it is, for the processor's layout of data."""
+        module.data_layout = self._codegen._data_layout
+
+    def finalize(self) -> None:
+        """Take in what the function calls; nothing is made of it but room for the addresses of constants."""
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        room = self._codegen._create_empty_module(f"{self.name}.constants")
+        for variable in self._final_module.global_variables:
+            if variable.name.startswith("_ZN08NumbaEnv"):
+                cpu_target.target_context.declare_env_global(room, variable.name)
+        self._codegen._engine.add_module(llvm.parse_assembly(str(room)))
+        self._finalized = True
+
+
+class InnerCompiler(Compiler):  # type: ignore[misc]
+    """Compiles functions that only kernels call."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Return numba's own steps, whose result is an `InnerLibrary`."""
+        codegen, name = self.state.targetctx.codegen(), self.state.func_id.func_qualname
+        self.state.library = InnerLibrary(codegen, name)
+        return list(super().define_pipelines())
 
 
 class _Reader(pickle.Unpickler):

@@ -115,11 +115,13 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     """Refuse an output that is what the command reads: the arguments are swapped.
 
     Raises:
-        InputError: if OUT is a model that no command of this program wrote, a database or another file.
+        InputError: if OUT is a model that no command of this program wrote, a database or another file; if
+            MODEL is a folder without a model.
     """
     from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
     from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.files.lines import is_database
+    from sfm_shapefit.files.model_folder import model_suffix
 
     if source.exists() and target.exists() and source.samefile(target):
         raise InputError(f"{target} is the input; choose another folder for OUT")
@@ -131,6 +133,8 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
         what = "holds a model" if is_model else "is a file"
         first = "" if order.startswith("MODEL") and not is_model else f", so give {target} first"
         raise InputError(f"{target} {what}, but OUT is a folder to be made; the order is {order}{first}")
+    if order == "MODEL OUT" and source.is_dir():
+        model_suffix(source)  # now, before all that reads models is loaded
 
 
 @contextmanager

@@ -35,9 +35,9 @@ Tell = Callable[[int, int], None]
 
 NEEDED = (
     "solve_dense",
-    "start_by_lud",
-    "measure_pairs",
     "adjust_bundle",
+    "measure_pairs",
+    "start_by_lud",
     "judge_placement",
     "find_pieces",
     "refine_in_angles",
@@ -49,22 +49,25 @@ Parts come first, so that no two processes compile the same kernels, and of them
 the whole.
 """
 FURTHER = (
+    "average_graphs",
     "place_flat_graph",
     "place_graph",
-    "solve_sparse",
     "solve_by_splitting",
+    "solve_sparse",
     "locate_rigs",
-    "solve_iteratively",
     "adjust_sparsely",
-    "place_long_graph",
     "locate_from_tracks",
     "locate_around_fixed",
-    "average_graphs",
+    "draw_images",
+    "place_long_graph",
+    "solve_iteratively",
     "map_matches",
     "relate_images",
-    "draw_images",
 )
-"""Examples of the rest; that which takes longest first, or it would be waited for."""
+"""Examples of the rest; that which takes longest first, or it would be waited for.
+
+Two that need the same kernels stand apart: what runs at the same time compiles them in both processes.
+"""
 
 # Kernels of these rooms are compiled by further examples only, all but one.
 _ROOMS_OF_FURTHER = ("rotations", "synthetic")

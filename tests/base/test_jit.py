@@ -6,8 +6,11 @@ from collections import Counter
 import numba
 import numpy as np
 import pytest
+from numba.core.event import install_listener
 
-from sfm_shapefit.base.jit import kernel, multiply_in_lanes, on_compilation
+from sfm_shapefit.base import jit
+from sfm_shapefit.base.jit import inner_kernel, kernel, multiply_in_lanes, on_compilation
+from sfm_shapefit.base.kernel_cache import CompileTime
 from tests.program import run_python
 from tests.scenes import ROOT
 
@@ -70,6 +73,32 @@ def test_compilations_are_told_once_and_only_where_there_are_any():
     with on_compilation(lambda: told.append("again")):
         assert fresh(2) == 3
     assert told == ["compiling"]
+
+
+@inner_kernel
+def reciprocal(x):
+    if x == 0:
+        raise ValueError("no reciprocal")
+    return 1.0 / x
+
+
+def test_an_inner_kernel_is_compiled_once_and_only_as_a_part_of_others():
+    compiled = []
+    names = CompileTime()
+    names.on_start = lambda event: compiled.append(event.data["dispatcher"].py_func.__name__)
+    with install_listener("numba:compile", names):
+        for callee in (
+            numba.njit(lambda x: 2 * reciprocal(x)),
+            numba.njit(lambda x: np.full(3, reciprocal(x))),
+        ):
+            assert np.all(callee(0.5) == callee.py_func(0.5))
+            with pytest.raises(ValueError, match="no reciprocal"):
+                callee(0.0)
+    assert compiled.count("reciprocal") == 1
+    (known,) = (d for d in jit._inner if d.py_func is reciprocal)
+    (overload,) = known.overloads.values()
+    name = overload.fndesc.mangled_name
+    assert not overload.library.codegen._engine.is_symbol_defined(name)  # there is no machine code of it
 
 
 def test_a_kernel_that_closes_over_a_value_is_refused():
@@ -193,6 +222,46 @@ def test_no_kernel_writes_an_array_to_a_slice_or_a_row():
     """Numba compiles the words of its error with it, for 3 s; a loop over the entries takes no time."""
     texts = (path.read_text(encoding="utf-8") for path in (ROOT / "sfm_shapefit").rglob("*.py"))
     assert [s for text in texts if "kernel" in text for s in arrays_in_slices(text)] == []
+
+
+def makes_arrays(expression):
+    return any(
+        isinstance(n, ast.Call) and ast.unparse(n.func).removeprefix("np.") in jit._MAKE_ARRAYS
+        for n in ast.walk(expression)
+    )
+
+
+def returns_an_array(function):
+    """Return whether a kernel returns what it has from a function of numpy that makes arrays."""
+    made = {
+        name.id
+        for n in ast.walk(function)
+        if isinstance(n, ast.Assign) and makes_arrays(n.value)
+        for target in n.targets
+        for name in ast.walk(target)
+        if isinstance(name, ast.Name)
+    }
+    returned = [n.value for n in ast.walk(function) if isinstance(n, ast.Return) and n.value]
+    parts = [part for value in returned for part in getattr(value, "elts", [value])]
+    return any(makes_arrays(part) or ast.unparse(part) in made for part in parts)
+
+
+def leaks(sources):
+    """Yield each kernel that makes no array but has one from another: nobody counts who still uses it."""
+    nodes = [n for source in sources for n in ast.walk(ast.parse(source))]
+    kernels = [n for n in nodes if isinstance(n, ast.FunctionDef) and is_kernel(n)]
+    giving = {function.name for function in kernels if returns_an_array(function)}
+    for function in kernels:
+        called = {ast.unparse(n.func) for n in ast.walk(function) if isinstance(n, ast.Call)}
+        if called & giving and not makes_arrays(function):
+            yield function.name
+
+
+def test_a_kernel_that_has_an_array_from_another_counts_references():
+    paths = (ROOT / "sfm_shapefit").rglob("*.py")
+    assert list(leaks(path.read_text(encoding="utf-8") for path in paths)) == []
+    sin = "@kernel\ndef f(n):\n    a, b = np.empty(n), 1\n    return a, b\n@kernel\ndef g(): return f(3)[1]"
+    assert list(leaks([sin])) == ["g"]
 
 
 INTERRUPTED = """

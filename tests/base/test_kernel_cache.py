@@ -230,7 +230,7 @@ from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.synthetic import random_graph_problem
 graph = random_graph_problem(60, 0.3, sigma=0.02, q=0.1, seed=1).view_graph
-problem, iterate, _, step = steps.allocate(graph)
+problem, iterate, _, step = steps.allocate(graph, 3)
 assert approach(problem, iterate, step)
 print(hashlib.sha256(iterate.t.tobytes() + iterate.y.tobytes()).hexdigest())
 """

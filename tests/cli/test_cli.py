@@ -588,6 +588,15 @@ def test_a_list_of_poses_is_inspected_as_it_is_located_and_a_graph_stays_one(tmp
     assert "40 nodes" in run("inspect", BUNDLED / "graph40.txt", code=0).output
 
 
+def test_a_folder_without_a_model_is_refused_before_what_reads_models_is_loaded(tmp_path):
+    arguments = ["locate", str(COURTYARD / "sparse"), str(tmp_path / "out")]
+    done = run_python("-X", "importtime", "-m", "sfm_shapefit", *arguments)
+    *loaded, said = done.stderr.splitlines()
+    assert done.returncode == 3
+    assert said.endswith(f"but {COURTYARD}/sparse/0 does; give that folder")
+    assert not {"numba", "pycolmap", "scipy"} & {line.split("|")[-1].strip() for line in loaded}
+
+
 def test_a_file_in_the_place_of_out_is_only_swapped_where_the_command_takes_files(ring_run, tmp_path):
     path = tmp_path / "transforms.json"
     path.write_text("{}\n")

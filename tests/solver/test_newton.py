@@ -10,7 +10,7 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
+from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, sparse, steps
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
@@ -85,6 +85,18 @@ def test_noiseless_graphs_are_recovered_to_rounding(d, solver):
 
 
 @SOLVERS
+def test_a_plane_graph_is_solved_by_the_kernels_of_space(solver):
+    kernels = dense._newton, dense._start, dense.approach, steps.take_step, sparse._set_blocks
+    solved(draw_graph(7)[0], solver)
+    known = [len(k.signatures) for k in kernels]
+    t, y = solved(draw_graph(7, d=2)[0], solver)
+    assert [len(k.signatures) for k in kernels] == known
+    assert t.shape[1] == y.shape[1] == 2
+    assert t.flags.c_contiguous
+    assert y.flags.c_contiguous
+
+
+@SOLVERS
 def test_exact_directions_give_the_truth_and_a_zero_dual(solver):
     graph, truth = draw_graph(7, q=0.0)
     t, y = solved(graph, solver, 1e-12)
@@ -156,7 +168,7 @@ def test_corrupted_graphs_of_all_kinds_are_solved(solver):
 
 def test_bound_and_objective_before_the_first_step_are_those_of_the_formulas():
     graph, _ = draw_graph(7, sigma=0.1)
-    problem, iterate, _, _ = steps.allocate(graph)
+    problem, iterate, _, _ = steps.allocate(graph, graph.dimension)
     rng = np.random.default_rng(7)
     iterate.r[:], iterate.feasible[:] = rng.standard_normal((2, *iterate.r.shape))
     progress = steps.NewtonProgress(*steps.measure_gap(problem, iterate))
@@ -239,7 +251,7 @@ def lengths(x):
 @pytest.mark.parametrize("is_dense", [False, True])
 def test_both_starts_take_their_dual_from_the_residuals_where_they_begin(is_dense):
     graph, _ = draw_graph(3, n=30, sigma=0.05, weighted=True)
-    problem, iterate, _, step = steps.allocate(graph)
+    problem, iterate, _, step = steps.allocate(graph, graph.dimension)
     started = approach(problem, iterate, step) if is_dense else steps.start_from(problem, problem.c, iterate)
     assert started
     residuals = across(differences(iterate.t, graph.edges), graph.directions)
@@ -263,7 +275,7 @@ def test_what_is_within_a_bound_has_no_larger_entry_and_no_nan():
 @pytest.mark.parametrize("weighted", [False, True])
 def test_on_a_dense_graph_the_start_is_near_the_optimum(weighted):
     graph, _ = draw_graph(5, n=40, p=0.5, q=0.25, weighted=weighted)
-    problem, iterate, linearization, step = steps.allocate(graph)
+    problem, iterate, linearization, step = steps.allocate(graph, graph.dimension)
     assert approach(problem, iterate, step)
     assert np.vdot(problem.c, iterate.t) == pytest.approx(problem.kappa, rel=1e-12)
     assert np.linalg.norm(iterate.y, axis=1).max() < problem.w.max()
@@ -280,6 +292,6 @@ def test_where_gradients_do_not_converge_the_start_is_that_of_least_squares():
     truth = np.cumsum(np.random.default_rng(2).uniform(0.5, 1.5, (n, 3)), axis=0)
     edges = np.array([(i, i + k) for i in range(n) for k in (1, 2) if i + k < n])
     graph = ViewGraph(n, edges, normalized(differences(truth, edges)))
-    problem, iterate, _, step = steps.allocate(graph)
+    problem, iterate, _, step = steps.allocate(graph, graph.dimension)
     assert not approach(problem, iterate, step)
     np.testing.assert_allclose(shape(solved(graph)[0]), shape(truth), atol=1e-6)

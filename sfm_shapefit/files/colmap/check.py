@@ -19,7 +19,6 @@ it refuses the rest itself.
 Source: https://colmap.github.io/format.html, "Sparse reconstruction".
 """
 
-import itertools
 import math
 import os
 import struct
@@ -38,9 +37,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.files.colmap.points import Observed
-from sfm_shapefit.files.lines import refuse_database
-
-REQUIRED_FILES = ("cameras", "images", "points3D")
+from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; a wrong one does not."""
@@ -89,46 +86,6 @@ def check_model_files(folder: Path) -> Observed:
     _check_image_lines(folder / "images.txt")
     _check_point_lines(folder / "points3D.txt")
     return {}
-
-
-def model_suffix(folder: Path) -> str:
-    """Return ".bin" or ".txt": the format in which pycolmap would read the model in `folder`.
-
-    Raises:
-        InputError: if `folder` is not a readable folder with a complete model in one of the two formats.
-    """
-    try:
-        if folder.exists() and not folder.is_dir():
-            refuse_database(folder)
-            raise InputError(
-                f"{folder} is a file; give the folder that holds cameras, images and points3D "
-                "(`convert` makes one of OpenSfM's reconstruction.json; `locate` takes transforms.json)"
-            )
-        present = {entry.name for entry in folder.iterdir()}
-    except FileNotFoundError:
-        raise InputError(f"the model folder {folder} does not exist") from None
-    except OSError as error:
-        raise InputError(f"the model folder {folder} cannot be read: {error.strerror}") from None
-
-    for suffix in (".bin", ".txt"):
-        if all(name + suffix in present for name in REQUIRED_FILES):
-            return suffix
-    raise InputError(_missing_files_message(folder, present))
-
-
-def _missing_files_message(folder: Path, present: set[str]) -> str:
-    """Return the sentence about a folder without a complete model, with the likely folder if there is one."""
-    for suffix in (".bin", ".txt"):
-        missing = [name + suffix for name in REQUIRED_FILES if name + suffix not in present]
-        if len(missing) < len(REQUIRED_FILES):
-            return (
-                f"{folder} lacks {' and '.join(missing)}; a COLMAP model needs cameras, images and points3D, "
-                "all .bin or all .txt"
-            )
-    for inner, suffix in itertools.product(("0", "sparse/0", "sparse"), (".bin", ".txt")):
-        if all((folder / inner / (name + suffix)).is_file() for name in REQUIRED_FILES):
-            return f"{folder} holds no COLMAP model, but {folder / inner} does; give that folder"
-    return f"{folder} holds no COLMAP model; give the folder with cameras, images and points3D (.bin or .txt)"
 
 
 @cache

@@ -20,10 +20,11 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
+from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
+from sfm_shapefit.files.model_folder import model_suffix
 from sfm_shapefit.scene.images import Images
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)

@@ -35,6 +35,7 @@ from sfm_shapefit.solver.newton.steps import (
     smoothing,
     start_from,
     take_step,
+    working_dimension,
 )
 from sfm_shapefit.solver.options import OnIteration
 
@@ -82,7 +83,7 @@ def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve as `solve_newton_sparse` with a dense factor of nd x nd, for n up to about a thousand."""
-    problem, iterate, linearization, step = allocate(graph)
+    problem, iterate, linearization, step = allocate(graph, working_dimension(graph))
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
     factor = _allocate_factor(n, d, np.float32 if single else np.float64)
@@ -103,7 +104,7 @@ def solve_newton_dense(
                 break
             if single and stalled >= factor.patience:
                 single, factor, stalled = False, _allocate_factor(n, d, np.float64), 0
-    return *answer(problem, iterate, progress, tol), count
+    return *answer(problem, iterate, progress, tol, graph.dimension), count
 
 
 def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseNewtonFactor:

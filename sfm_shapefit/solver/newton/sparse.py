@@ -53,7 +53,7 @@ def solve_newton_sparse(
     if plan is None:
         neighbors = adjacency(graph.num_nodes, graph.edges)
         plan = plan_factorization(neighbors, graph.edges, graph.elimination_tree())
-    reduction = Reduction(allocate_factor(plan, graph.dimension))
+    reduction = Reduction(allocate_factor(plan, steps.working_dimension(graph)))
     return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
 
 
@@ -66,7 +66,7 @@ def solve_newton_reduced(
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program over the unknowns of a reduction; all else is as in `solve_newton_sparse`."""
-    work = steps.allocate(graph)
+    work = steps.allocate(graph, reduction.factor.block)
     problem, iterate = work.problem, work.iterate
     if start is None:
         system = _factorize(problem, work.linearization, reduction, int(np.argmax(problem.w)))
@@ -83,15 +83,16 @@ def solve_newton_reduced(
         count += 1
         if steps.is_cancelled(on_iteration, count, progress):
             break
-    return *steps.answer(problem, iterate, progress, tol), count
+    return *steps.answer(problem, iterate, progress, tol, graph.dimension), count
 
 
 def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate: Iterate) -> None:
     """Take over locations and a feasible dual."""
-    centered = locations - locations.mean(axis=0)
+    d = problem.c.shape[1]
+    centered = steps.padded(locations - locations.mean(axis=0), d)
     iterate.t[:] = (problem.kappa / steps.dot(problem.c, centered)) * centered
     steps.set_residuals(problem, iterate.t, iterate.r)
-    iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
+    iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, steps.padded(dual, d))
 
 
 def _cycle(work: Work, reduction: Reduction, progress: NewtonProgress, tol: float) -> NewtonProgress:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, frozen
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -132,9 +132,26 @@ class Work(NamedTuple):
     step: Step
 
 
-def allocate(graph: ViewGraph) -> Work:
-    """Return the problem as arrays, and room for the iteration; UnsolvableError if c is 0 up to rounding."""
-    n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
+def working_dimension(graph: ViewGraph) -> int:
+    """Return the dimension that a graph is solved in: a plane one in space, whose kernels are there already.
+
+    No step leaves the plane: third coordinates have equations of their own, whose right-hand sides are 0.
+    """
+    return max(graph.dimension, 3)
+
+
+def padded(x: FloatArray, dimension: int) -> FloatArray:
+    """Return vectors, one a row, with coordinates of 0 after their own."""
+    missing = dimension - x.shape[1]
+    return np.pad(x, ((0, 0), (0, missing))) if missing else x
+
+
+def allocate(graph: ViewGraph, d: int) -> Work:
+    """Return the problem as arrays in d dimensions, and room for the iteration.
+
+    UnsolvableError if c is 0 up to rounding.
+    """
+    n, m = graph.num_nodes, graph.num_edges
 
     def at_nodes() -> FloatArray:
         return np.empty((n, d))
@@ -142,10 +159,12 @@ def allocate(graph: ViewGraph) -> Work:
     def at_edges() -> FloatArray:
         return np.empty((m, d - 1))
 
-    v, w, basis, tilt = graph.directions, graph.weights, np.empty((m, d, d - 1)), np.empty(m)
+    v, w = frozen(padded(graph.directions, d)), graph.weights
+    basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
     linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), at_nodes())
     set_up(v, w, basis, tilt, linearization.s)
-    edges, c, kappa, axes = graph.edges.astype(np.uint32), scale_functional(graph), float(w.sum()), range(d)
+    edges, c, kappa = graph.edges.astype(np.uint32), padded(scale_functional(graph), d), float(w.sum())
+    axes = range(d)
     problem = Problem(edges, v, basis, tilt, w, c, kappa, tuple(axes), tuple(axes[:-1]))
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
@@ -197,14 +216,14 @@ def start_from(problem: Any, a: Any, iterate: Any) -> bool:
 
 
 def answer(
-    problem: Problem, iterate: Iterate, progress: NewtonProgress, tol: float
+    problem: Problem, iterate: Iterate, progress: NewtonProgress, tol: float, dimension: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
+    """Return locations and dual of a graph; at an objective of 0, up to the tolerance, y = 0 proves it."""
     if progress.objective <= tol:
         iterate.feasible[:] = 0.0
     dual = np.empty_like(problem.v)
     _set_dual(problem.basis, iterate.feasible, dual)
-    return iterate.t, dual
+    return np.ascontiguousarray(iterate.t[:, :dimension]), np.ascontiguousarray(dual[:, :dimension])
 
 
 @kernel

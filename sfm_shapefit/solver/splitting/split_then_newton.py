@@ -17,6 +17,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.newton.steps import working_dimension
 from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.splitting.engine import Goal, Stop
@@ -143,7 +144,7 @@ def _newton(
     on_iteration: OnIteration | None,
 ) -> HybridResult:
     """Go on from the best certified point by Newton steps, if their factor fits."""
-    d, factor = graph.dimension, resources.factor
+    d, factor = working_dimension(graph), resources.factor
     plan = factor.symbolic if isinstance(factor, CholeskyFactor) else None
     fits = plan is not None and plan.num_bytes(d, np.float64) <= resources.memory_bytes
     if factor is None or plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:

@@ -1,0 +1,47 @@
+"""What a folder must have to be a COLMAP model; to ask that takes none of the libraries that read one."""
+
+import itertools
+from pathlib import Path
+
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.lines import refuse_database
+
+REQUIRED_FILES = ("cameras", "images", "points3D")
+
+
+def model_suffix(folder: Path) -> str:
+    """Return ".bin" or ".txt": the format in which pycolmap would read the model in `folder`.
+
+    Raises:
+        InputError: if `folder` is not a readable folder with a complete model in one of the two formats.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            refuse_database(folder)
+            raise InputError(
+                f"{folder} is a file; give the folder that holds cameras, images and points3D "
+                "(`convert` makes one of OpenSfM's reconstruction.json; `locate` takes transforms.json)"
+            )
+        present = {entry.name for entry in folder.iterdir()}
+    except FileNotFoundError:
+        raise InputError(f"the model folder {folder} does not exist") from None
+    except OSError as error:
+        raise InputError(f"the model folder {folder} cannot be read: {error.strerror}") from None
+
+    for suffix in (".bin", ".txt"):
+        if all(name + suffix in present for name in REQUIRED_FILES):
+            return suffix
+    raise InputError(_missing_files_message(folder, present))
+
+
+def _missing_files_message(folder: Path, present: set[str]) -> str:
+    """Return the sentence about a folder without a complete model, with the likely folder if there is one."""
+    for suffix in (".bin", ".txt"):
+        missing = [name + suffix for name in REQUIRED_FILES if name + suffix not in present]
+        if len(missing) < len(REQUIRED_FILES):
+            needs = "a COLMAP model needs cameras, images and points3D, all .bin or all .txt"
+            return f"{folder} lacks {' and '.join(missing)}; {needs}"
+    for inner, suffix in itertools.product(("0", "sparse/0", "sparse"), (".bin", ".txt")):
+        if all((folder / inner / (name + suffix)).is_file() for name in REQUIRED_FILES):
+            return f"{folder} holds no COLMAP model, but {folder / inner} does; give that folder"
+    return f"{folder} holds no COLMAP model; give the folder with cameras, images and points3D (.bin or .txt)"
