@@ -101,9 +101,9 @@ def adjust_thinly(
         if by_all and run.frees_more_than_poses:
             run, _, last = steps.solve_by_all_points(run, lenses_judged=True)
         return run.estimate(last, judged=not only_lenses)
-    problem = None if len(images.frames.ids) < _MANY_FRAMES else steps.problem_of_fine_poses(run)
+    problem, coarse = steps.problem_of_poses(run) if len(images.frames.ids) >= _MANY_FRAMES else (None, None)
     if problem is None:
-        run, last = steps.solve_coarsely(run)
+        run, last = steps.solve_coarsely(run, coarse)
         problem = steps.fine_problem(run)
     if problem is not None:
         run = replace(run, links=None)  # all matches, at the peak of the memory

@@ -60,10 +60,7 @@ class ReducedFactor(Protocol):
 def choose_factor(
     layout: Layout, options: AdjustmentOptions, dtype: npt.DTypeLike = np.float64
 ) -> ReducedFactor:
-    """Return an empty factor of the kind that the options ask for; `dtype` is that of a sparse one.
-
-    Without unknowns, where only points move, it is dense: a sparse one has no blocks then.
-    """
+    """Return an empty factor as the options ask, dense without unknowns; `dtype` is that of a sparse one."""
     dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
     dense = layout.num_unknowns <= dense_up_to
     return DenseFactor.plan(layout) if dense else SparseFactor.plan(layout, options.threads, dtype)

@@ -231,10 +231,9 @@ class AdjustmentRun:
             sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
         except UnsolvableError:
             sigmas = np.full(len(lenses), np.inf)
-        is_open = free.lenses.copy()
-        for k in np.flatnonzero(free.lenses).tolist():
-            is_open[k] = not lenses[k].is_credible(float(sigmas[k]))
-        return self._knowing(sigmas), is_open
+        of_lens = zip(lenses, free.lenses.tolist(), sigmas.tolist(), strict=True)
+        is_open = [is_free and not lens.is_credible(sigma) for lens, is_free, sigma in of_lens]
+        return self._knowing(sigmas), np.array(is_open, dtype=np.bool_)
 
     def _knowing(self, sigmas: FloatArray) -> "AdjustmentRun":
         """Return the run with how well the focal lengths that move are known, by sigmas (l,) of all."""
@@ -350,9 +349,10 @@ def begin(
     )
 
 
-def solve_coarsely(run: AdjustmentRun) -> Solved:
-    """Return the run at the optimum of few points at the wide limit; for coarse poses."""
-    return run.solve(run.thin_problem(*run.triangulate(_THIN_LIMIT, checked=True)), _THIN_FALL, _THIN_SCALE)
+def solve_coarsely(run: AdjustmentRun, coarse: AdjustmentProblem | None = None) -> Solved:
+    """Return the run at the optimum of few points at the wide limit, which may be known; for coarse poses."""
+    coarse = coarse or run.thin_problem(*run.triangulate(_THIN_LIMIT, checked=True))
+    return run.solve(coarse, _THIN_FALL, _THIN_SCALE)
 
 
 def fine_problem(run: AdjustmentRun) -> AdjustmentProblem | None:
@@ -366,18 +366,20 @@ def solve_finely(run: AdjustmentRun, problem: AdjustmentProblem, *, near: bool =
     return run.solve(problem, _THIN_FALL, first_damping=_NEAR_DAMPING if near else _FIRST_DAMPING)
 
 
-def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Solved:
+def solve_twice_thinly(
+    run: AdjustmentRun, coarse: AdjustmentProblem | None = None, *, lenses_known: bool = False
+) -> Solved:
     """Return the run after coarse frames were moved at the wide limit, then finely at the threshold.
 
     Finely: by more points, with the loss that their errors call for. All tracks are given back before either
     is solved.
 
     Args:
-        run: at poses that may be coarse.
+        run, coarse: as of `solve_coarsely`.
         lenses_known: whether the first solve holds them; it then takes a tenth of the time if there are many.
     """
     free = run.freedom
-    run, last = solve_coarsely(replace(run, freedom=free.without_lenses()) if lenses_known else run)
+    run, last = solve_coarsely(replace(run, freedom=free.without_lenses()) if lenses_known else run, coarse)
     run = replace(run, freedom=free)
     problem = fine_problem(run)
     if problem is None:
@@ -388,17 +390,18 @@ def solve_twice_thinly(run: AdjustmentRun, *, lenses_known: bool = False) -> Sol
 
 def solve_thinly_again(run: AdjustmentRun) -> Solved:
     """Return the run after a fine solve, where poses are fine but for a few, else after two as at first."""
-    problem = problem_of_fine_poses(run)
-    return solve_twice_thinly(run) if problem is None else solve_finely(run, problem)
+    fine, coarse = problem_of_poses(run)
+    return solve_twice_thinly(run, coarse) if fine is None else solve_finely(run, fine)
 
 
-def problem_of_fine_poses(run: AdjustmentRun) -> AdjustmentProblem | None:
-    """Return the fine problem; None where the poses are coarse, by the points that they let be found."""
+def problem_of_poses(run: AdjustmentRun) -> tuple[AdjustmentProblem | None, AdjustmentProblem | None]:
+    """Return the fine problem; None where the points found say that poses are coarse, and the coarse one."""
     joined, found = run.triangulate(1.0)
     checked = found.of_length(run.checked_length)
     problem = run.thin_problem(joined, found, times=_FINE_TIMES) if len(checked.points) else None
     del joined, found  # whose arrays have all matches
-    return problem if _coarse_points(run, checked) is None else None
+    coarse = _coarse_points(run, checked)
+    return (None, run.thin_problem(*coarse)) if coarse else (problem, None)
 
 
 def _coarse_points(

@@ -7,7 +7,7 @@ _NAMED = 3  # names; a longer list is counted, so that a sentence stays one
 
 def first_of(names: Sequence[str]) -> str:
     """Return the first three names and how many more there are."""
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
     return f"{', '.join(names[:_NAMED])}{more}"
 
 

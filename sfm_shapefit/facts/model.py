@@ -397,8 +397,7 @@ class CheckedFacts(FactsOfModel):
         if second is not None and second.wrong:
             command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
             return NextStep("Next: take the model that map makes of the database; pairs support it.", command)
-        nothing_said = not self.inputs.database or self.figures.pair_error_deg is None
-        if nothing_said or self.verdict.doubts_database:
+        if not (self.inputs.database and self.num_pairs) or self.verdict.doubts_database:
             text = "Next: check it against the database that it was made from."
             return NextStep(text, f"sfm-shapefit check {path} --database ITS_DATABASE")
         text = "Next: place the cameras anew from their rotations and matches, and compare."

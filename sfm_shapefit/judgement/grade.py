@@ -87,11 +87,10 @@ class ModelVerdict(Record):
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:
             return "good"
-        what = self.grade.value
         if self.grade is Grade.LOOK and self.cameras:
-            noun = "camera" if len(self.cameras) == 1 else "cameras"
-            what = f"look at {len(self.cameras)} {noun} ({first_of(self.cameras)})"
-        return "; ".join([what, *self.reasons]) if self.cameras else f"{what}: {'; '.join(self.reasons)}"
+            what = f"look at {counted(len(self.cameras), 'camera')} ({first_of(self.cameras)})"
+            return "; ".join([what, *self.reasons])
+        return f"{self.grade.value}: {'; '.join(self.reasons)}"
 
 
 class Shares(NamedTuple):
@@ -139,13 +138,15 @@ def weigh_evidence(evidence: ModelEvidence, images: Images) -> Against:
     suspicions: list[str] = []
     reasons: list[str] = []
     if apart:
-        clause = f"{len(apart)} of {counted(count, 'camera')} stand apart from the rest"
+        some = f"{len(apart)} of {counted(count, 'camera')} stand"
+        are_loose = len(loose) == len(groups)
+        clause = f"nothing says how {some} to the rest" if are_loose else f"{some} apart from the rest"
         (reasons if len(set(apart) - confirmed) > FEW * count else suspicions).append(clause)
     if len(loose) < len(evidence.untied):
         suspicions.append("nothing checks how groups of cameras stand to one another")
     if evidence.num_held is not None and evidence.num_held < HALF * count:
         reasons.append(f"the pairs that agree hold only {evidence.num_held} of {counted(count, 'camera')}")
-    if len(named.keys() - confirmed) > MANY * count:
+    if len(named.keys() - confirmed) > MANY * count and len(named) > len(apart):
         reasons.append(f"evidence speaks against {len(named)} of {counted(count, 'camera')}")
     if second is not None and second.has_nothing_in_common:
         suspicions.append("the model that map makes of the same database has another shape")

@@ -5,7 +5,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from sfm_shapefit.base.wording import counted, rounded
+from sfm_shapefit.base.wording import counted, first_of, rounded
 from sfm_shapefit.facts.model import CheckedFacts, FactsOfModel, JoinedFacts, ModelFacts
 from sfm_shapefit.facts.placed import IN_MEMORY, Facts, GraphFacts, scope_of
 from sfm_shapefit.judgement.grade import Grade
@@ -14,7 +14,6 @@ from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
 
 # Folders of these names say nothing of the scene.
 _NAMELESS = {"sparse", "dense", "model", "models", "colmap", "text", "triangulated", "database", "."}
-_NAMED = 3  # cameras that the banner names; the table has all
 
 
 def scene_name(facts: Facts) -> str:
@@ -82,10 +81,12 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
     if facts.verdict.grade is not Grade.LOOK or not facts.verdict.cameras:
         return f"{reasons}." if reasons else ""
     placed = set(np.array(drawing.cameras.names)[drawing.cameras.placed].tolist())
+    reason_of = dict(zip(drawing.cameras.names, drawing.cameras.reasons, strict=True))
     doubted = [name for name in facts.verdict.cameras if name in placed]
     left_out = [name for name in facts.verdict.cameras if name not in placed]
-    weak = "is weak" if len(doubted) == 1 else "are weak"
-    parts = [f"{_named(doubted)} {weak if is_checked else 'may be wrong'}"] if doubted else []
+    is_weak = is_checked and all(reason_of[name] for name in doubted)
+    weak = f"{'is' if len(doubted) == 1 else 'are'} weak" if is_weak else "may be wrong"
+    parts = [f"{_named(doubted)} {weak}"] if doubted else []
     if left_out:
         parts.append(f"{_named(left_out)} {'is' if len(left_out) == 1 else 'are'} left out")
     if reasons:
@@ -96,9 +97,8 @@ def _sentence(drawing: Drawing, facts: Facts) -> str:
 
 
 def _named(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
-    more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
-    return f"{', '.join(shorten(name, 60) for name in names[:_NAMED])}{more}"
+    """Return the first names, and how many more there are; the table has all."""
+    return first_of([shorten(name, 60) for name in names])
 
 
 # --- the tiles -------------------------------------------------------------------------------------

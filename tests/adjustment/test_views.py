@@ -268,8 +268,13 @@ def test_points_at_the_wide_limit_are_looked_for_only_where_poses_may_be_coarse(
     truth = scene()
     images, links = posed_images(disturbed(truth, size=size)), links_of(truth, matches_of(truth))
     run = adjustment_run.begin(images, links, StructureOptions(), Freedom(), GivenPoses())
-    assert (adjustment_run.problem_of_fine_poses(run) is None) == (size > 0.0)
+    fine, coarse = adjustment_run.problem_of_poses(run)
+    assert (fine is None, coarse is None) == (size > 0.0, size == 0.0)
     assert found == limits
+    _, last = adjustment_run.solve_thinly_again(run)
+    assert found == [*limits, *limits, *[1.0] * (size > 0.0)]  # what is known to be coarse is not found anew
+    if size > 0.0:  # and the answer is the same
+        np.testing.assert_array_equal(last.centers, adjustment_run.solve_twice_thinly(run)[1].centers)
 
 
 def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in_the_second(monkeypatch):

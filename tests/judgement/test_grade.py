@@ -159,12 +159,15 @@ def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(fo
     verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.DO_NOT_USE, (names[1], names[2]))
     assert verdict.reasons == ("2 of 8 cameras stand apart from the rest",)
+    assert verdict.statement == "do not use: 2 of 8 cameras stand apart from the rest"
+    verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2, 3]),))).verdict
+    assert verdict.reasons == ("3 of 8 cameras stand apart from the rest",)  # and that is said once
 
 
 def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
     names = found.images.names
     for is_loose, grade, reason in (
-        (True, Grade.DO_NOT_USE, "2 of 8 cameras stand apart from the rest"),
+        (True, Grade.DO_NOT_USE, "nothing says how 2 of 8 cameras stand to the rest"),
         (False, Grade.LOOK, "nothing checks how groups of cameras stand to one another"),
     ):
         group = Untied(np.array([1, 2]), 1, 2, 0, is_loose)

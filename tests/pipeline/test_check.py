@@ -116,6 +116,7 @@ def test_what_map_doubts_check_does_not_call_good():
             in found.facts.evidence.second.statement
         )
         assert "image_undistorter" in found.facts.next_step.command  # it would be placed there again
+        assert banner(found.drawing, found.facts)["sentence"].startswith("0004.jpg, 0005.jpg may be wrong")
         evidence = found.facts.evidence
         unlike = replace(evidence, second=replace(evidence.second, has_nothing_in_common=True))
         assert "image_undistorter" not in replace(found.facts, evidence=unlike).next_step.command
@@ -205,6 +206,12 @@ def test_pairs_that_leave_everything_open_do_not_contradict_a_model(monkeypatch)
     monkeypatch.setattr(checked, "gather_evidence", lambda *_: ModelEvidence())
     told = check(RING / "sparse/0", RING / "database.db", second_opinion=False).verdict
     assert told.grade == "good"
+
+
+def test_cameras_at_one_place_are_to_be_located_as_the_verdict_says():
+    facts = check(COURTYARD / "sparse/0", second_opinion=False).facts
+    assert facts.verdict.statement.endswith("at the same place; place them with sfm-shapefit locate")
+    assert facts.next_step.command.startswith(f"sfm-shapefit locate {COURTYARD / 'sparse/0'} located --data")
 
 
 def test_a_database_that_lacks_an_image_of_the_model_is_doubted(tmp_path):
