@@ -24,7 +24,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
@@ -86,16 +86,23 @@ def estimate_relative_rotations(
         likely: poses of the batch's pairs. Where the matches fit near one, that is the answer; the trials,
             nine tenths of the time, are for the others.
     """
-    firsts = range(0, len(batch.pairs), _PAIRS_PER_SLICE)
+    parts, places, others = [], [], np.arange(len(batch.pairs))
+    if likely is not None:
+        tried = np.flatnonzero(np.isfinite(likely.translations).all(axis=1))
+        start = likely.rotations[tried], likely.translations[tried]
+        near = _refine(batch.rays_of(tried), *start, threads)
+        fits = near.weight_shares >= likely.least_weights[tried]
+        parts, places, others = [near.subset(fits)], [tried[fits]], np.delete(others, tried[fits])
+    slices = [others[k : k + _PAIRS_PER_SLICE] for k in range(0, len(others), _PAIRS_PER_SLICE)]
     with ExitStack() as stack:
         # Where memory is short, Python waits for ever for a thread that could not begin.
         share_out = map if threads <= 1 else stack.enter_context(ThreadPoolExecutor(threads)).map
-        parts = []
-        for part in share_out(partial(_estimate_slice, batch, are_many, likely), firsts):
+        for part, has_pose in share_out(partial(_estimate_slice, batch, are_many), slices):
+            places.append(slices[len(parts) - (likely is not None)][has_pose])
             parts.append(part)
             if advance is not None:
-                advance(min(len(parts) * _PAIRS_PER_SLICE, len(batch.pairs)))
-    return concatenate_rotations(parts)
+                advance(sum(map(len, places)))
+    return concatenate_rotations(parts).subset(np.argsort(np.concatenate([*places, others[:0]])))
 
 
 def refine_rough_rotations(
@@ -167,24 +174,12 @@ def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotatio
 
 
 def _estimate_slice(
-    batch: RayMatches, are_many: bool, likely: LikelyPoses | None, first: int
-) -> RelativeRotations:
-    """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
-    pairs = np.arange(first, min(first + _PAIRS_PER_SLICE, len(batch.pairs)))
-    estimates, places = [], []
-    if likely is not None:
-        likely_pairs = pairs[np.isfinite(likely.translations[pairs]).all(axis=1)]
-        near = _refine(
-            batch.rays_of(likely_pairs), likely.rotations[likely_pairs], likely.translations[likely_pairs]
-        )
-        fits = near.weight_shares >= likely.least_weights[likely_pairs]
-        estimates, places = [near.subset(fits)], [likely_pairs[fits]]
-        pairs = np.setdiff1d(pairs, likely_pairs[fits])
+    batch: RayMatches, are_many: bool, pairs: IntArray
+) -> tuple[RelativeRotations, BoolArray]:
+    """Return the relative rotations of some pairs by trials, and which of them got one."""
     matches = batch.rays_of(pairs)
     has_pose, rotations, translations = _start_by_trials(matches, are_many)
-    estimates.append(_refine(matches, rotations, translations).subset(has_pose))
-    places.append(pairs[has_pose])
-    return concatenate_rotations(estimates).subset(np.argsort(np.concatenate(places)))
+    return _refine(matches, rotations, translations).subset(has_pose), has_pose
 
 
 def _refine(

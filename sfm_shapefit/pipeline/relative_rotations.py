@@ -1,5 +1,6 @@
 """`relative_rotations`: those of all pairs of a database's images, by threads or by an executor's workers."""
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import closing
@@ -33,7 +34,7 @@ from sfm_shapefit.scene.matches import RayMatches, View
 from sfm_shapefit.solver.options import SolverOptions
 
 # Pairs of each image that are tried for by themselves where there are very many: all lie near their average.
-_FIRST_PAIRS = 6
+_FIRST_PAIRS = 5
 _NEAR = DirectionOptions(inlier_threshold_px=8.0, num_hypotheses=50)
 """What a baseline must show by rotations that are tenths of a degree off."""
 _LIKELY = 0.5  # mean robust weight; no other pose can have more of the matches
@@ -149,18 +150,20 @@ def estimate_near(
 
     Trials are for the others, nine tenths of whose time they take, and for images whose rotation is NaN.
     """
-    (i, j), known = batch.pairs.T, np.nan_to_num(rotations)
-    turns = np.repeat(known[batch.pairs], np.diff(batch.offsets), axis=0)
-    u, v = (np.einsum("mba,mb->ma", turns[:, k], own) for k, own in enumerate((batch.rays_i, batch.rays_j)))
-    in_world = RayMatches(
-        pairs=batch.pairs, offsets=batch.offsets, rays_i=u, rays_j=v, pixel_angles=batch.pixel_angles
+    i, j = batch.pairs.T
+    turns = np.nan_to_num(rotations[j] @ rotations[i].transpose(0, 2, 1))
+    rays_i, own = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
+    for (first, last), turn in zip(own, turns.transpose(0, 2, 1), strict=True):
+        np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
+    in_axes_of_j = RayMatches(
+        pairs=batch.pairs,
+        offsets=batch.offsets,
+        rays_i=rays_i,
+        rays_j=batch.rays_j,
+        pixel_angles=batch.pixel_angles,
     )
-    baselines = estimate_directions(in_world, _NEAR, threads).directions
-    likely = LikelyPoses(
-        known[j] @ known[i].transpose(0, 2, 1),
-        np.einsum("kab,kb->ka", rotations[j], baselines),
-        np.full(len(batch.pairs), _LIKELY),
-    )
+    baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
+    likely = LikelyPoses(turns, baselines, np.full(len(batch.pairs), _LIKELY))
     return estimate_relative_rotations(batch, threads, advance, are_many=are_many, likely=likely)
 
 
