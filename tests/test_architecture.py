@@ -39,7 +39,7 @@ MOST_LINES = {
     "base": 2310,
     "cli": 1800,
     "facts": 3530,
-    "files": 4970,
+    "files": 4980,
     "graph": 1340,
     "judgement": 3440,
     "laplacian": 2080,
