@@ -71,17 +71,17 @@ EDITS = {
 
 # Command line: passes, solves, assessments, openings, conversions.
 COUNTS = {
-    "locate COURTYARD/sparse/0 OUT": Counts(5, 1, 1, 1, 2),
-    "locate COURTYARD/sparse/0 OUT --adjust full": Counts(5, 1, 1, 1, 2),
+    "locate COURTYARD/sparse/0 OUT": Counts(4, 1, 1, 1, 2),
+    "locate COURTYARD/sparse/0 OUT --adjust full": Counts(4, 1, 1, 1, 2),
     "locate RING/sparse/0 OUT --config TRACKS": Counts(2, 1, 1, 0, 2),
-    "locate RIGS/sparse/0 OUT": Counts(4, 1, 1, 1, 2),
-    "locate HINGED/sparse/0 OUT --points never": Counts(5, 2, 2, 1, 3),
-    "map PHOTOGRAPHED/database.db OUT": Counts(8, 1, 1, 1, 2),
-    "map GUESSED/database.db OUT": Counts(9, 1, 1, 1, 2),
-    "map APART/database.db OUT": Counts(7, 2, 2, 1, 3),
+    "locate RIGS/sparse/0 OUT": Counts(3, 1, 1, 1, 2),
+    "locate HINGED/sparse/0 OUT --points never": Counts(4, 2, 2, 1, 3),
+    "map PHOTOGRAPHED/database.db OUT": Counts(7, 1, 1, 1, 2),
+    "map GUESSED/database.db OUT": Counts(8, 1, 1, 1, 2),
+    "map APART/database.db OUT": Counts(6, 2, 2, 1, 3),
     "place GRAPH OUT": Counts(0, 1, 1, 0, 0),
     "inspect COURTYARD/sparse/0": Counts(2, 0, 0, 1, 1),
-    "check COURTYARD/truth --report OUT": Counts(9, 1, 1, 1, 3),
+    "check COURTYARD/truth --report OUT": Counts(8, 1, 1, 1, 3),
     "check COURTYARD/truth --report OUT --no-second-opinion": Counts(2, 0, 0, 1, 1),
 }
 

@@ -1,19 +1,20 @@
 """What a model's points say of its images: which see too few, and what share of the matches agrees."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.judgement.limits import CHECKED_BY, FEWEST_POINTS, OUTNUMBERED, RARE, SMALLEST_SHAPE
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.scene.points import Points
-from sfm_shapefit.tracks.joining import sampson_px
+from sfm_shapefit.tracks.joining import sampson_px, write_ray
+from sfm_shapefit.tracks.links import CameraPoses, MatchedKeypoints
+
+_MATCHES_A_SLICE = 4_000_000  # matches between which Python can be interrupted: about 0.2 s
 
 
 def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
@@ -70,48 +71,56 @@ class ObservationCounts:
         return ObservationShares(*(int(part) / total for part in both))
 
 
-def count_observations(
-    points: Points,
-    images: Images,
-    num_keypoints: IntArray,
-    batches: Iterable[MatchBatch],
-    rotations: FloatArray,
-    max_error_px: float,
-) -> ObservationCounts:
-    """Return how many observations of each image agree with the cameras, and how many contradict them.
+class PartnerCounts:
+    """For each keypoint of posed images, in how many others it is matched, and how often that contradicts."""
 
-    The others are merely without a point: seen under too small an angle, in too short a track, or along an
-    epipolar line and yet not where another image has them.
+    def __init__(
+        self, images: Images, num_keypoints: IntArray, max_error_px: float, fixed: BoolArray | None = None
+    ) -> None:
+        """Begin to count.
 
-    Args:
-        points: triangulated from these matches.
-        images: some of them posed.
-        num_keypoints: (i,)
-        batches: matches of all pairs of posed images, and maybe of others.
-        rotations: (i, 3, 3) cam_from_world by which the rays of the matches are in world axes.
-        max_error_px: distance from the epipolar line (of both images together, to first order) from which a
-            match contradicts.
-    """
-    posed = images.is_posed
-    sizes = np.where(posed, num_keypoints, 0)
-    begins, image_of = np.append(0, np.cumsum(sizes)), np.repeat(np.arange(len(sizes)), sizes)
-    counts = np.zeros((len(image_of), 3), dtype=np.int32)
-    centers = np.where(posed[:, None], images.centers, 0.0)
-    turns = np.where(posed[:, None, None], images.rotations.transpose(0, 2, 1) @ rotations, np.eye(3))
-    for batch in batches:
-        baselines = centers[batch.pairs[:, 1]] - centers[batch.pairs[:, 0]]
-        lengths = np.maximum(np.linalg.norm(baselines, axis=1), np.finfo(np.float64).tiny)
-        _count_misses(
-            batch.pairs, batch.offsets, batch.keypoints, np.ascontiguousarray(batch.rays_i),
-            np.ascontiguousarray(batch.rays_j), turns, baselines / lengths[:, None], batch.pixel_angles,
-            max_error_px, posed, begins, counts,
+        Args:
+            images: some of them posed.
+            num_keypoints: (i,)
+            max_error_px: distance from the epipolar line (of both images together, to first order) from
+                which a match contradicts.
+            fixed: (i,) images whose matches among themselves have no part; none if None.
+        """
+        self._given = num_keypoints, max_error_px, fixed
+        self._posed, self._max_error_px = images.is_posed, max_error_px
+        self._free = np.ones_like(self._posed) if fixed is None else ~fixed
+        self._sizes = np.where(self._posed, num_keypoints, 0)
+        self._begins = np.append(0, np.cumsum(self._sizes))
+        self._counts = np.zeros((self._begins[-1], 2), dtype=np.int32)
+
+    def anew(self, images: Images) -> "PartnerCounts":
+        """Return counts of nothing yet for images others of which are posed."""
+        return PartnerCounts(images, *self._given)
+
+    def add(self, matched: MatchedKeypoints, poses: CameraPoses) -> None:
+        """Count the matches of further pairs; `poses` are of their cameras, with the rows of all images."""
+        counts = np.zeros((len(matched.cameras), 3), dtype=np.int32)
+        given = (
+            matched.on_plane, matched.cameras, poses.rotations, poses.centers, poses.focal_lengths_px,
+            poses.images, self._posed, self._free, self._max_error_px, counts,
         )  # fmt: skip
-    checked, sees = counts[:, 0] >= CHECKED_BY, np.zeros(len(image_of), dtype=np.bool_)
-    sees[begins[points.images] + points.keypoints] = True
-    misses = 2 * counts[:, 1] > counts[:, 0]
-    parts = (checked, checked & sees, checked & ~sees & misses)
-    columns = (np.bincount(image_of[part], minlength=len(sizes)).astype(np.int64) for part in parts)
-    return ObservationCounts(**dict(zip(("checked", "agreeing", "contradicting"), columns, strict=True)))
+        for first in range(0, len(matched.matches), _MATCHES_A_SLICE):
+            _count_misses(matched.matches[first : first + _MATCHES_A_SLICE], *given)
+        self._counts[self._begins[poses.images[matched.cameras]] + matched.keypoints] += counts[:, :2]
+
+    def compare(self, points: Points) -> ObservationCounts:
+        """Return how many observations of each image agree with the cameras, and how many contradict them.
+
+        The others are merely without a point: seen under too small an angle, in too short a track, or along
+        an epipolar line and yet not where another image has them. The `points` are made of the matches.
+        """
+        partners, misses = self._counts.T
+        checked, sees = partners >= CHECKED_BY, np.zeros(len(partners), dtype=np.bool_)
+        sees[self._begins[points.images] + points.keypoints] = True
+        parts = (checked, checked & sees, checked & ~sees & (2 * misses > partners))
+        image_of = np.repeat(np.arange(len(self._sizes)), self._sizes)
+        columns = (np.bincount(image_of[part], minlength=len(self._sizes)).astype(np.int64) for part in parts)
+        return ObservationCounts(**dict(zip(("checked", "agreeing", "contradicting"), columns, strict=True)))
 
 
 def images_without_support(counts: ObservationCounts, images: Images, fixed: BoolArray) -> BoolArray:
@@ -136,30 +145,33 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
 
 @kernel
 def _count_misses(
-    pairs: Any, offsets: Any, keypoints: Any, rays_i: Any, rays_j: Any, turns: Any, baselines: Any,
-    pixel_angles: Any, max_error_px: float, registered: Any, begins: Any, counts: Any,
+    matches: Any, on_plane: Any, cameras: Any, rotations: Any, centers: Any, focal_lengths_px: Any,
+    images: Any, posed: Any, free: Any, max_error_px: float, counts: Any,
 ) -> None:  # fmt: skip
-    """Count the partners of each keypoint of all images, and those of them that miss their epipolar lines.
+    """Count the partners of each keypoint in other images, and those of them that miss their epipolar lines.
 
-    The third column of `counts` has the image last counted, by its number from 1 on. `turns` (n, 3, 3) take
-    the rays to the cameras' axes. Two images in one place, whose baseline is 0, contradict nothing.
+    The third column of `counts` has the image last counted, by its number from 1 on. Two images in one place,
+    whose baseline is 0, contradict nothing.
     """
-    u, v = np.empty(3), np.empty(3)
-    for p in range(len(pairs)):
-        i, j = pairs[p, 0], pairs[p, 1]
-        if not (registered[i] and registered[j]):
+    u, v, d = np.empty((3, 3))
+    for m in range(len(matches)):
+        i, j = cameras[matches[m, 0]], cameras[matches[m, 1]]
+        first, second = images[i], images[j]
+        if not (posed[first] and posed[second] and (free[first] or free[second])):
             continue
-        for m in range(offsets[p], offsets[p + 1]):
-            for c in range(3):
-                u[c] = v[c] = 0.0
-                for a in range(3):
-                    u[c] += turns[i, c, a] * rays_i[m, a]
-                    v[c] += turns[j, c, a] * rays_j[m, a]
-            misses = sampson_px(u, v, baselines[p], pixel_angles[p]) > max_error_px
-            for side in range(2):
-                own = counts[begins[pairs[p, side]] + keypoints[m, side]]
-                other = 1 + pairs[p, 1 - side]
-                if own[2] != other:  # a keypoint may be matched twice with one image
-                    own[0] += 1
-                    own[1] += misses
-                    own[2] = other
+        square = 0.0
+        for c in range(3):
+            d[c] = centers[j, c] - centers[i, c]
+            square += d[c] * d[c]
+        length = max(np.sqrt(square), 1e-300)
+        for c in range(3):
+            d[c] /= length
+        write_ray(on_plane[matches[m, 0]], rotations[i], u)
+        write_ray(on_plane[matches[m, 1]], rotations[j], v)
+        misses = sampson_px(u, v, d, 1.0 / min(focal_lengths_px[i], focal_lengths_px[j])) > max_error_px
+        for side in range(2):
+            own, other = counts[matches[m, side]], 1 + (second if side == 0 else first)
+            if own[2] != other:  # a keypoint may be matched twice with one image
+                own[0] += 1
+                own[1] += misses
+                own[2] = other

@@ -98,7 +98,7 @@ def ask_pixels(source: MatchSource, structure: Structure, doubted: BoolArray) ->
     view = source.view
     if not (doubted.any() and _has_keypoints(view, structure)):
         return np.zeros_like(doubted)
-    links = list(view.links(without=view.pairs[~doubted[view.pairs].any(axis=1)]))
+    links = list(view.links(chosen=np.asarray(doubted[view.pairs].any(axis=1))))
     return are_confirmed(points, images, pictures, doubted, (view.num_keypoints, links))
 
 
@@ -152,7 +152,7 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
     point_of, fitting = np.full(begins[-1], -1), np.zeros(begins[-1], dtype=np.bool_)
     seen = begins[points.images] + points.keypoints
     point_of[seen], fitting[seen] = points.points_seen(), fits
-    for batch in view.links(without=view.pairs[~across]):
+    for batch in view.links(chosen=across):
         pair = np.repeat(np.arange(len(batch.pairs)), np.diff(batch.offsets))
         seen_by, keypoints = batch.pairs[pair], begins[batch.pairs[pair]] + batch.keypoints
         ends = point_of[keypoints]

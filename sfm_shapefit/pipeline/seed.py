@@ -8,14 +8,16 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_seed
 from sfm_shapefit.adjustment.estimate import Estimate
+from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.structure import triangulate
+from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
     ObservationShares,
-    count_observations,
+    PartnerCounts,
     images_of_few_points,
     images_without_support,
 )
@@ -27,6 +29,7 @@ from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.filter import filter_points
+from sfm_shapefit.tracks.links import MatchedKeypoints
 
 _FEWEST_KEPT = 3  # trusted cameras; fewer are no result, so that all are kept then
 
@@ -84,8 +87,8 @@ def seed_points(
         sure: (i,) images that the pixels confirm, so that half of the points suffice; none if None.
     """
     source, fixed = stand.source, stand.given.fixed_frames
-    images, points, adjusted = _make_points(stand, kept, options, clock)
-    hand_back_memory()  # the links are gone, and their matches are read again
+    images, points, adjusted, partners = _make_points(stand, kept, options, clock)
+    hand_back_memory()  # the links are gone
     least = np.full(len(fixed), options.structure.min_points_per_image)
     if sure is not None:
         least[images.frame_of[sure]] = (least[images.frame_of[sure]] + 1) // 2
@@ -93,11 +96,11 @@ def seed_points(
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:
-        limit_px, rotations = options.structure.max_reprojection_error_px, source.images.rotations
-        view, without = source.view, source.pairs_of_fixed
-        batches = view.batches(without=without, among=stand.among)
-        counts = count_observations(points, images, view.num_keypoints, batches, rotations, limit_px)
-        view.give_back()
+        posed, advance = posed_part(images), clock.advance
+        if (seen >= 0).any():  # which were partners of others
+            partners = _count(stand.read_links(posed, advance), images, partners.anew(images))
+        partners = _count(stand.read_links(posed, advance, rejected=True), images, partners)
+        counts = partners.compare(points)
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:
             seen = np.where(unsupported, points.count_seen(len(seen)), seen)
@@ -112,10 +115,11 @@ def seed_points(
 
 def _make_points(
     stand: Stand, kept: BoolArray, options: PlacingOptions, clock: Clock
-) -> tuple[Images, Points, Estimate | None]:
-    """Return the images with points, filtered, and how bundle adjustment went, if asked for."""
+) -> tuple[Images, Points, Estimate | None, PartnerCounts]:
+    """Return the images with points, filtered, how bundle adjustment went, if asked for, and partners."""
     adjusted, advance = None, clock.advance
-    images = stand.place(kept)
+    images, num_keypoints = stand.place(kept), stand.source.view.num_keypoints
+    limit_px = options.structure.max_reprojection_error_px
     posed = posed_part(images)
     adjusts = options.freedom.adjust == "full"
     with clock("structure"):
@@ -127,12 +131,22 @@ def _make_points(
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         else:
             points = triangulate(posed.images, links, options.structure, advance, clock.executor)
+        partners = _count(links, images, PartnerCounts(images, num_keypoints, limit_px, stand.source.fixed))
         del links
         points = filter_points(points, posed.images, stand.pictures(posed), options.structure)
     if adjusted is not None:
         assert points.errors_px is not None
         adjusted = replace(adjusted, final_error_px=float(points.errors_px.mean()))
-    return images, replace(points, images=posed.rows[points.images]), adjusted
+    return images, replace(points, images=posed.rows[points.images]), adjusted, partners
+
+
+def _count(links: Links, images: Images, partners: PartnerCounts) -> PartnerCounts:
+    """Count matches between all posed ones of some images."""
+    if isinstance(links, MatchedKeypoints):
+        posed = posed_part(images)
+        poses = views_of(posed.images).poses(posed.images)
+        partners.add(links, replace(poses, images=posed.rows[poses.images]))
+    return partners
 
 
 def _leave_out(gone: BoolArray, images: Images, points: Points) -> tuple[Images, Points]:

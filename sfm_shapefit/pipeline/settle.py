@@ -272,7 +272,7 @@ def _ask_pixels(stand: Stand, judged: Judged, kept: BoolArray, seeded: Seeded) -
     if not (doubted.any() and source.has_database):
         return np.zeros_like(doubted)
     images = _place_all(stand, seeded.images)
-    pictures = ModelPictures(images, source.view.keypoints)
+    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
     return ask_pixels(source, Structure(seeded.points, images, pictures), doubted)
 
 
@@ -287,7 +287,7 @@ def _question(stand: Stand, kept: BoolArray, seeded: Seeded, clock: Clock) -> Mo
         images = _place_all(stand, images)
     if (others := images.is_posed & ~among).any():
         points = points.seen_by(others, source.view.num_keypoints, source.view.links())
-    pictures = ModelPictures(images, source.view.keypoints)
+    pictures = ModelPictures(images, source.view.keypoints, source.view.num_keypoints)
     asked = None if source.fixed is None else ~source.fixed
     structure = Structure(points, images, pictures, among, asked)
     source = replace(source, tied=_tied_by_priors(stand, images))

@@ -20,6 +20,7 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.matches import is_among
 
 
 class PosedPart(NamedTuple):
@@ -103,18 +104,21 @@ class Stand(NamedTuple):
     def pictures(self, posed: PosedPart) -> ModelPictures:
         """Return the keypoints of placed images and their lenses."""
         rows, view = posed.rows.tolist(), self.source.view
-        return ModelPictures(posed.images, lambda k: view.keypoints(rows[k]))
+        counts = view.num_keypoints[posed.rows]
+        return ModelPictures(posed.images, lambda k: view.keypoints(rows[k]), counts)
 
-    def read_links(self, posed: PosedPart, advance: Advance) -> Links:
-        """Return what joins the keypoints of placed images; all rays are forgotten.
+    def read_links(self, posed: PosedPart, advance: Advance, *, rejected: bool = False) -> Links:
+        """Return what joins the keypoints of placed images, or matches of rejected pairs; rays are forgotten.
 
         From here to the end of a triangulation, or an adjustment, most memory is needed.
         """
         view, pictures = self.source.view, self.pictures(posed)
         if isinstance(self.source.matches, TrackMatches):  # the model has its tracks already
             return collect_tracks(posed.images, pictures, self.source.matches.points_of(posed.images))
-        without = self.placement.rejected_pairs
-        links = view.links(without=without, among=self.among, advance=advance, consume=True)
+        wanted = is_among(view.pairs, self.placement.rejected_pairs) == rejected
+        if self.among is not None:
+            wanted &= np.isin(view.pairs, self.among).all(axis=1)
+        links = view.links(chosen=wanted, advance=advance, consume=True)
         place = np.full(self.source.images.num_images, -1)
         place[posed.rows] = np.arange(len(posed.rows))
         return collect_matches(posed.images, pictures, place, links, view.num_matches)

@@ -251,36 +251,32 @@ class View:
         return self.matches.keypoints(self.images.names[image])
 
     def batches(
-        self,
-        min_matches: int = 1,
-        without: IntArray | None = None,
-        among: IntArray | None = None,
-        advance: Advance = nobody,
+        self, min_matches: int = 1, without: IntArray | None = None, advance: Advance = nobody
     ) -> Iterator[MatchBatch]:
         """Yield the matches with rays in world axes, in batches; few matches are kept with these.
 
         Args:
             min_matches: pairs with fewer are left out.
             without: (m, 2) pairs that are left out, too, whatever the order of their images.
-            among: only pairs of these images.
             advance: hears of the pairs that are done, while batches are consumed, and of their number.
 
         Raises:
             InputError: as `Matches.read`.
         """
-        are_all = without is None and among is None
-        if min_matches in self._kept and are_all:
+        if min_matches in self._kept and without is None:
             return self._tell(iter(self._kept[min_matches]), advance)
-        found = self._batches(self._choose(min_matches, without, among), min_matches)
-        if self.reading.keeps and self.num_matches <= KEPT_MATCHES and are_all:
+        wanted = self._counts >= min_matches
+        if without is not None:
+            wanted &= ~is_among(self.pairs, without)
+        found = self._batches(np.flatnonzero(wanted), min_matches)
+        if self.reading.keeps and self.num_matches <= KEPT_MATCHES and without is None:
             found = iter(self._kept.setdefault(min_matches, list(found)))
         return self._tell(found, advance)
 
     def links(
         self,
         min_matches: int = 1,
-        without: IntArray | None = None,
-        among: IntArray | None = None,
+        chosen: BoolArray | None = None,
         advance: Advance = nobody,
         *,
         consume: bool = False,
@@ -289,8 +285,7 @@ class View:
 
         Args:
             min_matches: as in `batches`.
-            without: as in `batches`.
-            among: as in `batches`.
+            chosen: (k,) which of the pairs; None: all.
             advance: as in `batches`.
             consume: give back the memory of rays, at once and in the end, and then that of very many matches:
                 to make tracks of them takes more memory than anything else.
@@ -298,7 +293,10 @@ class View:
         Raises:
             InputError: as `Matches.read`.
         """
-        found = self._tell(self._links(self._choose(min_matches, without, among), min_matches), advance)
+        wanted = self._counts >= min_matches
+        if chosen is not None:
+            wanted &= chosen
+        found = self._tell(self._links(np.flatnonzero(wanted), min_matches), advance)
         if not consume:
             return found
         self._forget_rays()
@@ -326,17 +324,6 @@ class View:
         bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
         bounds[-1] = len(totals) - 1
         return self.matches.parts(self, [slice(*ends) for ends in itertools.pairwise(bounds.tolist())])
-
-    def _choose(
-        self, min_matches: int, without: IntArray | None = None, among: IntArray | None = None
-    ) -> IntArray:
-        """Return the pairs that `links` is asked for, by their position."""
-        chosen = self._counts >= min_matches
-        if without is not None:
-            chosen &= ~is_among(self.pairs, without)
-        if among is not None:
-            chosen &= np.isin(self.pairs, among).all(axis=1)
-        return np.flatnonzero(chosen)
 
     def _tell(self, batches: Iterator[AnyMatches], advance: Advance) -> Iterator[AnyMatches]:
         """Yield batches, and report the pairs as they are consumed."""

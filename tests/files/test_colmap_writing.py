@@ -17,6 +17,7 @@ from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import fit_similarity_l1
 from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.point_colors import read_colors
 from sfm_shapefit.files.colmap.points import points2d_of, points_of
 from sfm_shapefit.files.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.files.colmap.seed import SeededModel, pick_points, write_model
@@ -26,7 +27,14 @@ from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.tracks.options import StructureOptions
 from tests.models import centers_of
 from tests.problems import all_pairs
-from tests.structures import bundle_adjusted, colored, filtered, matches_between, triangulated
+from tests.structures import (
+    bundle_adjusted,
+    colored,
+    copy_without_points,
+    filtered,
+    matches_between,
+    triangulated,
+)
 
 NUM_IMAGES = 8
 RADIUS = 6.0
@@ -401,6 +409,20 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
     for point in structure.points3D.values():
         # means 15, 20 and 31.5; a half is rounded to even
         np.testing.assert_array_equal(point.color, [15, 20, 32])
+
+
+@pytest.mark.parametrize("step", [1, 10**12], ids=["few gaps", "wide gaps"])
+def test_colors_are_those_of_the_points_that_are_seen_whatever_their_ids(step):
+    original, _ = ring_model()
+    model = copy_without_points(original)
+    for point_id, point in original.points3D.items():
+        model.add_point3D_with_id(7 + step * point_id, pycolmap.Point3D(point.todict()))
+    found = read_colors(model, {})
+    for image_id, seen in found.images.items():
+        points2d = original.image(image_id).points2D
+        expected = [original.point3D(points2d[k].point3D_id).color for k in seen.keypoints.tolist()]
+        np.testing.assert_array_equal(found.colors[seen.points], expected)
+    assert len(found.images) == NUM_IMAGES
 
 
 def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_there_are_any():

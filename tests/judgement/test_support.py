@@ -6,19 +6,24 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions
+from sfm_shapefit.adjustment.sources import collect_matches
+from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.model import read_model
-from sfm_shapefit.files.colmap.points import points_of
+from sfm_shapefit.files.colmap.points import ModelPictures, points_of
 from sfm_shapefit.judgement.grade import Grade
 from sfm_shapefit.judgement.support import (
     ObservationCounts,
-    count_observations,
+    PartnerCounts,
     images_of_few_points,
     images_without_support,
 )
 from sfm_shapefit.pipeline import seed
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
+from sfm_shapefit.scene.matches import is_among
 from tests.scenes import RING
+
+NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
 @pytest.fixture(scope="module")
@@ -26,16 +31,21 @@ def found():
     return sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
 
 
-def judge(images, points):
+def counted_at(images, points, apart=NO_PAIRS):
     model, options = read_model(RING / "sparse" / "0"), LocateOptions()
     inputs = choose_inputs(RING / "sparse" / "0", RING / "database.db", "auto")
     with open_source(model, inputs, options) as source:
-        view = source.view
-        limit_px = options.structure.max_reprojection_error_px
-        counts = count_observations(
-            points, images, view.num_keypoints, view.batches(), model.images.rotations, limit_px
-        )
-    return counts.shares(images.is_posed)
+        view, every, poses = source.view, np.arange(images.num_images), views_of(images).poses(images)
+        counted = PartnerCounts(images, view.num_keypoints, options.structure.max_reprojection_error_px)
+        is_apart = is_among(view.pairs, apart)
+        for batches in (view.links(chosen=is_apart), view.links(chosen=~is_apart)):
+            pictures = ModelPictures(images, view.keypoints)
+            counted.add(collect_matches(images, pictures, every, batches, view.num_matches), poses)
+    return counted.compare(points)
+
+
+def judge(images, points, apart=NO_PAIRS):
+    return counted_at(images, points, apart).shares(images.is_posed)
 
 
 def arrays_of(found):
@@ -47,6 +57,24 @@ def test_observations_of_right_cameras_agree(found):
     shares = judge(*arrays_of(found))
     assert shares.agreeing == found.agreeing_observations > 0.9
     assert shares.contradicting == found.contradicting_observations < 0.01
+    assert judge(*arrays_of(found), apart=np.array([[1, 0], [2, 3]])) == shares
+
+
+def test_partners_that_leave_are_not_counted(found, monkeypatch):
+    def leave(points, *_):
+        return np.where(np.arange(8) == 3, points.count_seen(8), -1)
+
+    monkeypatch.setattr(seed, "images_of_few_points", leave)
+    told = []
+    monkeypatch.setattr(
+        seed, "images_without_support", lambda counts, *_: told.append(counts) or np.zeros(8, bool)
+    )
+    fewer = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
+    assert fewer.reconstruction.num_reg_images() == 7
+    expected = counted_at(*arrays_of(fewer))
+    np.testing.assert_array_equal(told[-1].checked, expected.checked)
+    np.testing.assert_array_equal(told[-1].agreeing, expected.agreeing)
+    assert expected.checked.sum() < counted_at(*arrays_of(found)).checked.sum()
 
 
 def test_observations_without_a_point_contradict_only_cameras_that_are_wrong(found):
@@ -96,12 +124,13 @@ def test_images_of_few_points_take_theirs_along_and_three_frames_stay(found):
 
 
 def test_it_is_named_and_can_be_kept(monkeypatch):
-    def count(*given):
-        counts = count_observations(*given)
-        counts.agreeing[2] = 0
-        return counts
+    class Misled(PartnerCounts):
+        def compare(self, points):
+            counts = super().compare(points)
+            counts.agreeing[2] = 0
+            return counts
 
-    monkeypatch.setattr(seed, "count_observations", count)
+    monkeypatch.setattr(seed, "PartnerCounts", Misled)
     found = sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
     name = found.images.names[2]
     row = next(row for row in found.cameras if row.name == name)

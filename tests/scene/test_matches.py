@@ -77,18 +77,18 @@ def test_neither_memory_nor_the_order_of_reading_changes_a_bit(matches, model, r
     expected = columns(matches.at(model.images).batches())
     enough = expected["counts"] >= np.median(expected["counts"])
     least = int(expected["counts"][enough].min())
-    without = expected["pairs"][::3, ::-1]
+    without, others = expected["pairs"][::3, ::-1], np.arange(len(enough)) % 3 > 0
+    few = np.isin(expected["pairs"], np.arange(4)).all(axis=1)
     labels = np.arange(model.images.num_images) % 3 - 1
-    ends, few = labels[expected["pairs"]], np.isin(expected["pairs"], np.arange(4)).all(axis=1)
+    ends = labels[expected["pairs"]]
     asked = {
         "all": (lambda view: view.batches(), np.ones_like(enough)),
         "thick": (lambda view: view.batches(least), enough),
-        "others": (lambda view: view.batches(without=without), np.arange(len(enough)) % 3 > 0),
+        "others": (lambda view: view.batches(without=without), others),
         "links": (lambda view: view.links(), np.ones_like(enough)),
-        "thick links": (lambda view: view.links(least, without), enough & (np.arange(len(enough)) % 3 > 0)),
+        "thick links": (lambda view: view.links(least, others), enough & others),
         "consumed": (lambda view: view.links(consume=True), np.ones_like(enough)),
-        "few": (lambda view: view.batches(among=np.arange(4)), few),
-        "few links": (lambda view: view.links(among=np.arange(4)), few),
+        "few": (lambda view: view.links(chosen=few), few),
         "between": (lambda view: view.between(labels), (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])),
     }
     rng = np.random.default_rng(0)

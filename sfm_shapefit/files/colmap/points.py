@@ -44,14 +44,14 @@ def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
 class ModelPictures:
     """Keypoints seen through the lenses of `images`."""
 
-    def __init__(self, images: Images, keypoints: Keypoints) -> None:
+    def __init__(self, images: Images, keypoints: Keypoints, counts: IntArray | None = None) -> None:
         self._lenses, self._lens_of = images.lenses, images.lens_of.tolist()
         self._cameras = [camera_of(lens) for lens in images.lenses]
-        self._keypoints = keypoints
+        self._keypoints, self._counts = keypoints, counts  # (i,), where they are known
 
     def count(self, image: int) -> int:
         """Return how many keypoints an image has."""
-        return len(self._pixels(image))
+        return len(self._pixels(image)) if self._counts is None else int(self._counts[image])
 
     def pixels(self, image: int, keypoints: IntArray | Int32Array) -> FloatArray:
         """Return where keypoints are, (k, 2)."""
