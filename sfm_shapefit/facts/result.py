@@ -213,16 +213,15 @@ class LocateResult(_Placed):
     elsewhere: BoolArray | None = None
     """(n,) images that stand in another model of `map` alone, and are not missing here; None if it is one."""
 
-    @cached_property
+    @property
     def reconstruction(self) -> "pycolmap.Reconstruction":
         """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
-        built: pycolmap.Reconstruction = self.seed.build()
-        return built
+        return self.seed.reconstruction
 
     @property
-    def model(self) -> Any:
+    def model(self) -> "SeededModel | pycolmap.Reconstruction":
         """The reconstruction, which may have been changed, if somebody has asked for it; else the seed."""
-        return vars(self).get("reconstruction", self.seed)
+        return self.seed.as_it_is
 
     @cached_property
     def facts(self) -> ModelFacts:
