@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -79,6 +79,18 @@ CARRIED_FIXED = "fixed; no pair of it takes part"
 CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
 
 
+class ModelInArrays(Protocol):
+    """A model that writes itself, and becomes a reconstruction once somebody asks for that."""
+
+    @property
+    def reconstruction(self) -> "pycolmap.Reconstruction":
+        """The reconstruction, made once."""
+
+    @property
+    def as_it_is(self) -> Any:
+        """The reconstruction, which may have been changed, if it is made; else the model itself."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:
     """What `locate` worked from."""
@@ -136,8 +148,7 @@ class LocateResult(_Placed):
         *("reconstruction", "cameras", "pairs", "table", "warnings", "database", "options", "timings_s"),
         *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
     )
-    seed: Any
-    """The model in arrays: `files.colmap.seed.SeededModel`, which this room need not know."""
+    seed: ModelInArrays
     inputs: Inputs
     options: PlacingOptions
     images: Images
@@ -219,8 +230,8 @@ class LocateResult(_Placed):
         return self.seed.reconstruction
 
     @property
-    def model(self) -> "SeededModel | pycolmap.Reconstruction":
-        """The reconstruction, which may have been changed, if somebody has asked for it; else the seed."""
+    def model(self) -> Any:
+        """What tells how many images and points there are, and is written."""
         return self.seed.as_it_is
 
     @cached_property

@@ -107,4 +107,4 @@ def average_database(
             raise UnsolvableError(next(iter(reasons.values()), "no two images have a relative rotation"))
         _, members, averaging = max(components, key=lambda found: len(found[1]))
         images = run.pose(members, averaging.rotations)
-        return SeededModel.of(run.read.template(images), images, number_points([]), None).build()
+        return SeededModel.of(run.read.template(images), images, number_points([]), None).reconstruction

@@ -338,7 +338,7 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     if stand.source.economy.statement:
         limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
         yield f"to stay below {limit}, {stand.source.economy.statement}"
-    if found.seed.num_points3D() == 0:
+    if found.model.num_points3D() == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if names := stand.source.matches.missing_names:
         yield f"the database lacks {counted(len(names), 'image')} of the model: {first_of(names)}"

@@ -104,7 +104,7 @@ def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=No
     images = model.images.placed(rows, centers[rows])
     seed = SeededModel.of(
         template_of(model), images, number_points([]), None if keypoints is None else keypoints.get
-    ).build()
+    ).reconstruction
     batches = all_matches() if batches is None else batches
     return seed, matches_between(seed, model.images.ids, batches)
 
@@ -597,7 +597,7 @@ def test_a_seed_writes_the_bytes_that_pycolmap_writes_of_it(tmp_path, monkeypatc
     for folder in folders:
         folder.mkdir()
     seed.write(folders[0])
-    built = seed.build()
+    built = seed.reconstruction
     write_model(built, folders[1])
     for file in folders[1].iterdir():
         assert (folders[0] / file.name).read_bytes() == file.read_bytes(), file.name

@@ -94,7 +94,7 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
     rows = np.flatnonzero(placed)
     images = model.images.placed(rows, centers[rows])
-    seed = SeededModel.of(template_of(model), images, number_points([]), None).build()
+    seed = SeededModel.of(template_of(model), images, number_points([]), None).reconstruction
     expected = model.images.frame_of != 4
     assert sorted(seed.reg_image_ids()) == model.images.ids[expected].tolist()
     np.testing.assert_allclose(centers_of(seed), centers[expected], atol=1e-12)

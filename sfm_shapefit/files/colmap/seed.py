@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -41,7 +42,7 @@ class PickedPoints(NamedTuple):
     """Number of points that the model has."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class SeededModel:
     """A model in arrays, which writes itself: as a reconstruction it takes ten times as long.
 
@@ -93,8 +94,14 @@ class SeededModel:
         errors_px = self.points.errors_px
         return 0.0 if errors_px is None or not len(errors_px) else float(errors_px.mean())
 
-    def build(self) -> pycolmap.Reconstruction:
-        """Return a new reconstruction; the input is not touched."""
+    @property
+    def as_it_is(self) -> Self | pycolmap.Reconstruction:
+        """The reconstruction, which may have been changed, if somebody asked for it; else these arrays."""
+        return self.reconstruction if "reconstruction" in vars(self) else self
+
+    @cached_property
+    def reconstruction(self) -> pycolmap.Reconstruction:
+        """A new reconstruction; the input is not touched."""
         model = self._without_points()
         for image_id, xy in zip(self.images.ids.tolist(), self.keypoints, strict=True):
             if len(xy):
@@ -105,7 +112,7 @@ class SeededModel:
         return model
 
     def write(self, folder: Path) -> None:
-        """Write what `build` makes into an existing folder, in the same bytes.
+        """Write what `reconstruction` is into an existing folder, in the same bytes.
 
         Raises:
             InputError, OSError: if the files cannot be written, or not completely.
