@@ -35,7 +35,7 @@ MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4970,
+    "adjustment": 4980,
     "base": 2370,
     "cli": 1800,
     "facts": 3550,

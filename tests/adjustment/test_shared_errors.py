@@ -62,6 +62,16 @@ def test_errors_under_known_noise_are_as_large_as_stated(case):
     assert 0.75 < rms(np.concatenate(found)) < 1.25
 
 
+def test_priors_known_equally_well_along_all_axes_err_alike_whatever_rounding_takes_for_axes():
+    problem, found = ring_problem(np.random.default_rng(0), 12, 400, share=0.4), []
+    for seed in range(2):
+        rounding = np.random.default_rng(seed).uniform(-1e-7, 1e-7, (12, 3, 3))  # of 2.5e5
+        information = isotropic_information(np.full(12, 2e-3)) + rounding + rounding.transpose(0, 2, 1)
+        prior = RotationPrior(rotations=problem.rotations, information=information)
+        found.append(estimate_center_errors(replace(problem, rotation_prior=prior), OPTIONS).covariances)
+    np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-6 * np.abs(found[0]).max())
+
+
 @pytest.mark.parametrize(("offset", "is_metric"), [(0.3, True), (3e-5, False)])
 def test_the_scale_of_a_rig_is_as_well_known_as_stated(offset, is_metric):
     """Noise of 0.5 of 500 px at a distance of 4 is 4e-3: offsets must be more than that."""
