@@ -32,7 +32,7 @@ from sfm_shapefit.solver.splitting.linear import predict_factor
 LARGEST = 10_000
 MOST_S, MOST_MB = 600.0, 4000.0
 """Limits of the largest scene."""
-FORECAST_FACTOR = 1.5
+FORECAST_FACTOR = 1.3
 """By which the forecast of memory may be off, either way."""
 POINTS_PER_IMAGE = 33
 SCENE_FLAGS = (

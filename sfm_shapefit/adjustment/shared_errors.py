@@ -169,7 +169,7 @@ def _add_errors_of_priors(
         nodes = layout.node_of_frame[frames]
         moves = nodes >= 0
         values, axes = np.linalg.eigh(information)
-        # The symmetric root: axes of equal values are any, by rounding, and draws along others would be others.
+        # The symmetric root: axes of equal values are any, by rounding, and draws along others are others.
         roots = (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
         draws = rng.standard_normal((len(frames), 3, by_sample.shape[2]))
         by_sample[nodes[moves], slots] += options.noise_px**2 / kappa * (roots @ draws)[moves]

@@ -3,7 +3,7 @@
 The peak is that of the worst stage, for memory is handed back between stages. Every stage is linear in what
 it works on: keypoints, matches, pairs, edges of the graph, and entries of the factor, which the symbolic
 analysis knows beforehand. The bytes per item below were fitted to runs on seven sets of 25 to 10,000 images:
-forecasts are 0.96 to 1.4 times the peaks, and 0.86 times at 10,000 images with a limit of 1,500 MB.
+forecasts are 1.04 to 1.2 times the peaks, and 0.86 times at 10,000 images with a limit of 1,500 MB.
 
 The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
 known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.
@@ -33,7 +33,7 @@ _READ_BYTES, _MODEL_BYTES, _COLOR_BYTES = 75.0, 55.0, 8.0
 _SAMPLES = 96  # samples of each direction's error; two numbers each, see `judgement.correlated_errors`
 _BLOCK = 9  # entries of a block of the factor; three coordinates by three
 _OBSERVATIONS_OF_A_MATCH = 0.7  # observations for a match, if keypoints are more; .45 to .66 measured
-_OBSERVATION_BYTES = 620.0  # bytes of an observation; its track, and its part of the normal equations
+_OBSERVATION_BYTES = 420.0  # bytes of an observation; its track, and its part of the normal equations
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000  # unknowns of an adjusted camera; up to as many, their system is dense
 
 _FRUGAL = Reading(batch=50_000, rays_bytes=50_000_000, keeps=False)
