@@ -12,6 +12,7 @@ from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
+from sfm_shapefit.base.executors import nobody
 from sfm_shapefit.base.geometry import Similarity
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.judgement.judged import Judged
@@ -96,10 +97,10 @@ def seed_points(
     images, points = _leave_out(seen >= 0, images, points)
     unsupported, shares = np.zeros(len(seen), dtype=np.bool_), ObservationShares(math.nan, math.nan)
     if source.has_database:
-        posed, advance = posed_part(images), clock.advance
+        posed = posed_part(images)
         if (seen >= 0).any():  # which were partners of others
-            partners = _count(stand.read_links(posed, advance), images, partners.anew(images))
-        partners = _count(stand.read_links(posed, advance, rejected=True), images, partners)
+            partners = _count(stand.read_links(posed, nobody), images, partners.anew(images))
+        partners = _count(stand.read_links(posed, nobody, rejected=True), images, partners)
         counts = partners.compare(points)
         unsupported = images_without_support(counts, images, fixed)
         if options.trust.min_trust > 0.0:

@@ -257,15 +257,15 @@ def test_stages_are_added_up_and_have_an_exponent_forecasts_a_factor_and_the_lar
     assert "| 1.50 |" in endtoend.BENCHMARK.section([located(100, 2.0), located(400, 16.0)])
     short = endtoend.BENCHMARK.section([located(100, 0.2), located(400, 1.6)])
     assert "| - |" in short  # too short to tell
-    beside = endtoend.judge({**located(100, 1.0).cells}, 140.0, located(100, 1.0)["stages"], {"solve": 0.25})
+    beside = endtoend.judge({**located(100, 1.0).cells}, 120.0, located(100, 1.0)["stages"], {"solve": 0.25})
     assert "| solve | 1.00 / 0.25 = 4x |" in endtoend.BENCHMARK.section([beside])
     assert "a scalar product" not in short
     assert missed(located(100, 1.0)) == []
-    assert missed(located(100, 1.0, forecast_mb=62.5)) == ["forecast off by"]
+    assert missed(located(100, 1.0, forecast_mb=72.5)) == ["forecast off by"]
     assert [check.name for check in located(endtoend.LARGEST, 1.0).checks] == ["forecast off by", "s", "MB"]
 
 
-def located(size, cpu_s, forecast_mb=140.0):
+def located(size, cpu_s, forecast_mb=120.0):
     cells = {"scene": f"facade{size}", "images": size, "matches": 3000 * size}
     used = endtoend.Usage(wall_s=1.0, cpu_s=cpu_s, peak_mb=100.0)
     return endtoend.judge(cells, forecast_mb, {"solve": used})
