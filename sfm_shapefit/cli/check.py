@@ -65,6 +65,9 @@ def check_command(
     """
     source = one_path(model, input_path, "MODEL")
     with report_errors():
+        from sfm_shapefit.files.model_folder import refuse_no_model
+
+        refuse_no_model(source)
         from sfm_shapefit.files.colmap.model import read_model
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check

@@ -115,13 +115,11 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
     """Refuse an output that is what the command reads: the arguments are swapped.
 
     Raises:
-        InputError: if OUT is a model that no command of this program wrote, a database or another file; if
-            MODEL is a folder without a model.
+        InputError: if OUT is a model that no command of this program wrote, a database or another file.
     """
     from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER
     from sfm_shapefit.base.errors import InputError
     from sfm_shapefit.files.lines import is_database
-    from sfm_shapefit.files.model_folder import model_suffix
 
     if source.exists() and target.exists() and source.samefile(target):
         raise InputError(f"{target} is the input; choose another folder for OUT")
@@ -133,8 +131,6 @@ def refuse_swapped(source: Path, target: Path, order: str) -> None:
         what = "holds a model" if is_model else "is a file"
         first = "" if order.startswith("MODEL") and not is_model else f", so give {target} first"
         raise InputError(f"{target} {what}, but OUT is a folder to be made; the order is {order}{first}")
-    if order == "MODEL OUT" and source.is_dir():
-        model_suffix(source)  # now, before all that reads models is loaded
 
 
 @contextmanager
@@ -153,6 +149,7 @@ def command_run(
     started = time.perf_counter()
     with report_errors(target):
         from sfm_shapefit.base.atomic_folder import claimed_output
+        from sfm_shapefit.files.model_folder import refuse_no_model
 
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
@@ -168,6 +165,8 @@ def command_run(
         run = Run(options=options, flags=flags, protect=protect, started=started)
         if inputs[0] is not None:
             refuse_swapped(inputs[0], target, order)
+        if order.startswith("MODEL"):
+            refuse_no_model(*inputs)
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap

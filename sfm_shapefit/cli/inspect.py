@@ -46,7 +46,10 @@ def inspect_command(
     """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
     source = one_path(model, input_path, "MODEL")
     with report_errors():
+        from sfm_shapefit.files.model_folder import refuse_no_model
+
         options = read_options(InspectOptions, given, config)
+        refuse_no_model(source)
 
         from sfm_shapefit.pipeline.inspect import inspect as inspect_model
 

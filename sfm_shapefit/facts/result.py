@@ -149,6 +149,7 @@ class LocateResult(_Placed):
         *("gauge", "intrinsics", "rigs", "control_points", "further", "certified", "adjustment"),
     )
     seed: ModelInArrays
+    """The output, as `reconstruction` and `write` have it."""
     inputs: Inputs
     options: PlacingOptions
     images: Images

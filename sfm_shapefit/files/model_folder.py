@@ -9,6 +9,17 @@ from sfm_shapefit.files.lines import refuse_database
 REQUIRED_FILES = ("cameras", "images", "points3D")
 
 
+def refuse_no_model(*paths: Path | None) -> None:
+    """Refuse folders without a model, before what reads models is loaded; other paths pass.
+
+    Raises:
+        InputError: as `model_suffix`.
+    """
+    for path in paths:
+        if path is not None and path.is_dir():
+            model_suffix(path)
+
+
 def model_suffix(folder: Path) -> str:
     """Return ".bin" or ".txt": the format in which pycolmap would read the model in `folder`.
 

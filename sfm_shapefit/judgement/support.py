@@ -86,8 +86,8 @@ class PartnerCounts:
                 which a match contradicts.
             fixed: (i,) images whose matches among themselves have no part; none if None.
         """
-        self._given = num_keypoints, max_error_px, fixed
-        self._posed, self._max_error_px = images.is_posed, max_error_px
+        self._num_keypoints, self._max_error_px, self._fixed = num_keypoints, max_error_px, fixed
+        self._posed = images.is_posed
         self._free = np.ones_like(self._posed) if fixed is None else ~fixed
         self._sizes = np.where(self._posed, num_keypoints, 0)
         self._begins = np.append(0, np.cumsum(self._sizes))
@@ -95,18 +95,18 @@ class PartnerCounts:
 
     def anew(self, images: Images) -> "PartnerCounts":
         """Return counts of nothing yet for images others of which are posed."""
-        return PartnerCounts(images, *self._given)
+        return PartnerCounts(images, self._num_keypoints, self._max_error_px, self._fixed)
 
     def add(self, matched: MatchedKeypoints, poses: CameraPoses) -> None:
         """Count the matches of further pairs; `poses` are of their cameras, with the rows of all images."""
-        counts = np.zeros((len(matched.cameras), 3), dtype=np.int32)
+        last = np.full(len(matched.cameras), -1, dtype=np.int32)
         given = (
-            matched.on_plane, matched.cameras, poses.rotations, poses.centers, poses.focal_lengths_px,
-            poses.images, self._posed, self._free, self._max_error_px, counts,
+            matched.on_plane, matched.cameras, matched.keypoints, poses.rotations, poses.centers,
+            poses.focal_lengths_px, poses.images, self._posed, self._free, self._max_error_px, self._begins,
+            last, self._counts,
         )  # fmt: skip
         for first in range(0, len(matched.matches), _MATCHES_A_SLICE):
             _count_misses(matched.matches[first : first + _MATCHES_A_SLICE], *given)
-        self._counts[self._begins[poses.images[matched.cameras]] + matched.keypoints] += counts[:, :2]
 
     def compare(self, points: Points) -> ObservationCounts:
         """Return how many observations of each image agree with the cameras, and how many contradict them.
@@ -145,13 +145,14 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
 
 @kernel
 def _count_misses(
-    matches: Any, on_plane: Any, cameras: Any, rotations: Any, centers: Any, focal_lengths_px: Any,
-    images: Any, posed: Any, free: Any, max_error_px: float, counts: Any,
+    matches: Any, on_plane: Any, cameras: Any, keypoints: Any, rotations: Any, centers: Any,
+    focal_lengths_px: Any, images: Any, posed: Any, free: Any, max_error_px: float, begins: Any, last: Any,
+    counts: Any,
 ) -> None:  # fmt: skip
     """Count the partners of each keypoint in other images, and those of them that miss their epipolar lines.
 
-    The third column of `counts` has the image last counted, by its number from 1 on. Two images in one place,
-    whose baseline is 0, contradict nothing.
+    `last` has the image that was counted last for each matched keypoint, `begins` where the keypoints of each
+    image begin in `counts`. Two images in one place, whose baseline is 0, contradict nothing.
     """
     u, v, d = np.empty((3, 3))
     for m in range(len(matches)):
@@ -170,8 +171,9 @@ def _count_misses(
         write_ray(on_plane[matches[m, 1]], rotations[j], v)
         misses = sampson_px(u, v, d, 1.0 / min(focal_lengths_px[i], focal_lengths_px[j])) > max_error_px
         for side in range(2):
-            own, other = counts[matches[m, side]], 1 + (second if side == 0 else first)
-            if own[2] != other:  # a keypoint may be matched twice with one image
+            row, image, other = matches[m, side], second if side else first, first if side else second
+            if last[row] != other:  # a keypoint may be matched twice with one image
+                own = counts[begins[image] + keypoints[row]]
                 own[0] += 1
                 own[1] += misses
-                own[2] = other
+                last[row] = other
