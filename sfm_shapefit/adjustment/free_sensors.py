@@ -42,7 +42,6 @@ def judge_sensors(
     found = np.full((len(free), 2), np.nan)
     if not free.any():
         return found
-    assert adjusted.rig is not None
     try:
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:

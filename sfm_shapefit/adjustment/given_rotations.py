@@ -160,7 +160,7 @@ def _draw_halves(problem: AdjustmentProblem, options: AdjustmentOptions, seed: i
     halves = [problem.of_points(half) for half in (is_first, ~is_first)]
     ends = [adjust(half, options).problem for half in halves]
     seen = np.min([_count_observations(half) for half in halves], axis=0)
-    known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
+    known = (seen >= _FEWEST_POINTS) & ~problem.fixed
     errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
     agreement, chance = np.zeros(problem.num_frames), np.zeros(problem.num_frames)
     if known.any():
@@ -173,7 +173,7 @@ def _draw_halves(problem: AdjustmentProblem, options: AdjustmentOptions, seed: i
 def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
     """Return by which vectors (n, 3) the frames turned; without fixed frames, their common turn taken off."""
     given = problem.rotations
-    if not problem.is_fixed().any():
+    if not problem.fixed.any():
         given = given @ mean_rotation_l1(given.transpose(0, 2, 1) @ rotations)
     return rotation_vectors(rotations @ given.transpose(0, 2, 1))
 

@@ -20,7 +20,7 @@ _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
 
 def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> float:
     """Return the cost of all priors in px^2; those of fixed frames are constants and left out."""
-    moves = ~problem.is_fixed()
+    moves = ~problem.fixed
     total = 0.0
     if problem.rotation_prior is not None:
         d = _turns(problem, values)

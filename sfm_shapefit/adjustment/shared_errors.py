@@ -129,7 +129,7 @@ def estimate_center_errors(
         axis=2,
     )
     moves, scale_sigma = system.solve(moved)[:, :3], None
-    if not (system.free[6].any() or problem.is_fixed().any()):
+    if not (system.free[6].any() or problem.fixed.any()):
         scale_sigma, same_scale = _split_scale(problem, system, moves)
         moves = same_scale if scale_sigma > METRIC_SIGMA else moves
     return CenterErrors(

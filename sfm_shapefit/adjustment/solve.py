@@ -18,7 +18,7 @@ from sfm_shapefit.adjustment.priors import (
     add_rotation_prior,
     sum_priors,
 )
-from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
@@ -139,22 +139,15 @@ def adjust(
     if run.layout.scale_sensor >= 0:
         values = restore_baselines(problem, values)
     lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
+    rig = replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
+    poses = {"rotations": values.rotations, "centers": values.centers}
     return Adjusted(
-        problem=problem.with_values(
-            values.rotations, values.centers, values.points, lenses, _rig(problem, values)
-        ),
+        problem=replace(problem, **poses, points=values.points, lenses=lenses, rig=rig),
         costs=np.array(run.costs),
         gradient_norm=run.gradient_norm,
         iterations=run.iterations,
         ending=ending,
     )
-
-
-def _rig(problem: AdjustmentProblem, values: Values) -> Rig | None:
-    """Return the rig of a problem with the poses of its sensors at other values."""
-    if problem.rig is None:
-        return None
-    return replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
 
 
 def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
@@ -222,19 +215,13 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
 
 def values_of(problem: AdjustmentProblem) -> Values:
     """Return the numbers of a problem that an adjustment changes."""
-    if problem.rig is None:
-        sensor_rotations = np.tile(np.eye(3), (problem.num_cameras, 1, 1))
-        sensor_translations = np.zeros((problem.num_cameras, 3))
-    else:
-        sensor_rotations = np.ascontiguousarray(problem.rig.rotations, dtype=np.float64)
-        sensor_translations = np.ascontiguousarray(problem.rig.translations, dtype=np.float64)
     return Values(
         rotations=problem.rotations,
         centers=problem.centers,
         points=problem.points,
         lenses=np.array([lens.values() for lens in problem.lenses]).reshape(-1, 8),
-        sensor_rotations=sensor_rotations,
-        sensor_translations=sensor_translations,
+        sensor_rotations=np.ascontiguousarray(problem.rig.rotations, dtype=np.float64),
+        sensor_translations=np.ascontiguousarray(problem.rig.translations, dtype=np.float64),
     )
 
 

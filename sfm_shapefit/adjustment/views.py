@@ -62,8 +62,6 @@ class Views:
         used = np.flatnonzero(found.points_seen >= 0)
         rotations, translations = self._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
-        is_plain = np.array_equal(frames, np.arange(len(images.frames.ids))) and not translations.any()
-        is_plain = is_plain and bool((rotations == np.eye(3)).all())
         rig = Rig(
             frame_of_camera=frames,
             rotations=rotations,
@@ -79,7 +77,7 @@ class Views:
             pixels=tracks.pixels[used],
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
-            rig=None if is_plain else rig,
+            rig=rig,
             fixed=np.zeros(0, np.bool_) if given.fixed is None else given.fixed,
             center_prior=given.centers,
         )
@@ -91,11 +89,9 @@ class Views:
             for lens, found in zip(images.lenses, solved.lenses, strict=True)
         ]
         moved = images.posed(solved.rotations, solved.centers).with_lenses(lenses)
-        free = solved.free_sensors()
-        if not (free >= 0).any():
+        cameras = np.flatnonzero(solved.rig.free_sensor_of_camera >= 0)
+        if not len(cameras):
             return moved
-        assert solved.rig is not None
-        cameras = np.flatnonzero(free >= 0)
         own, back = solved.lens_of_camera[cameras], self.rotations[cameras].transpose(0, 2, 1)
         rotations, translations = images.sensors.rotations.copy(), images.sensors.translations.copy()
         rotations[own] = back @ solved.rig.rotations[cameras]

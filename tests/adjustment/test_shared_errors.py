@@ -30,7 +30,7 @@ def ratios(truth, options, *, start=None, turn_sigma_rad=0.0, align=True):
         free = not options.hold_rotations and truth.rotation_prior is None
         centers = fit_similarity_l1(centers, truth.centers, rotate=free).apply(centers)
     squares = np.sum((centers - truth.centers) ** 2, axis=1)
-    moves = ~truth.is_fixed()
+    moves = ~truth.fixed
     variances = np.einsum("naa->n", found.covariances)
     return np.sqrt(squares[moves] / variances[moves]), found
 
