@@ -6,11 +6,11 @@ from functools import partial
 
 import numpy as np
 
-from sfm_shapefit.adjustment import AdjustmentOptions
 from sfm_shapefit.adjustment import run as steps
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
+from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.run import FIRST_FALL, LAST_FALL, MOST_FRAMES
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.scene.images import Images

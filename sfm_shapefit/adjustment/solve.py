@@ -140,9 +140,15 @@ def adjust(
         values = restore_baselines(problem, values)
     lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
     rig = replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
-    poses = {"rotations": values.rotations, "centers": values.centers}
     return Adjusted(
-        problem=replace(problem, **poses, points=values.points, lenses=lenses, rig=rig),
+        problem=replace(
+            problem,
+            rotations=values.rotations,
+            centers=values.centers,
+            points=values.points,
+            lenses=lenses,
+            rig=rig,
+        ),
         costs=np.array(run.costs),
         gradient_norm=run.gradient_norm,
         iterations=run.iterations,

@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    AdjustmentProblem,
-    Lens,
-    adjust,
-    estimate_covariances,
-)
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
@@ -41,7 +38,9 @@ from sfm_shapefit.rotations.average import average_relative_rotations, check_pai
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud

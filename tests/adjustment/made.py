@@ -6,11 +6,12 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.solve import values_of
+from sfm_shapefit.scene.lens import Lens
 
 LENSES = {
     "SIMPLE_PINHOLE": (500.0, 320.0, 240.0),

@@ -9,33 +9,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    AdjustmentProblem,
-    Ending,
-    Lens,
-    LensPrior,
-    RotationPrior,
-    adjust,
-    estimate_covariances,
-    frames_not_gained,
-    isotropic_information,
-    reduced_factor,
-    reprojection_errors_px,
-)
+from sfm_shapefit.adjustment import reduced_factor
 from sfm_shapefit.adjustment import solve as adjustment_solve
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, LensPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.run import _without_lone_frames
+from sfm_shapefit.adjustment.solve import Ending, adjust, frames_not_gained, reprojection_errors_px, values_of
 from sfm_shapefit.adjustment.solve import linearize_all as every
-from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.adjustment.made import LENSES, disturb, look_at, observed, ring_problem
 

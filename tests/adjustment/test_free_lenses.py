@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust
 from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_sigmas
 from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.solve import adjust
+from sfm_shapefit.scene.lens import Lens
 from tests.adjustment.made import disturb, look_at, ring_problem
 from tests.structures import in_doubt
 

@@ -7,14 +7,11 @@ import pytest
 from numpy.polynomial import Legendre
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    RotationPrior,
-    adjust,
-    isotropic_information,
-    shared_errors,
-)
+from sfm_shapefit.adjustment import shared_errors
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.geometry import METRIC_SIGMA, fit_similarity_l1
 from tests.adjustment.made import observed, ring_problem
 

@@ -8,7 +8,8 @@ import pytest
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.solve import solve

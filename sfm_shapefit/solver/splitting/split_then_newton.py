@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.solver.certificate import Certificate, certify_in_place
-from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.newton.steps import working_dimension
 from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
