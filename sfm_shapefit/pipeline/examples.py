@@ -31,7 +31,7 @@ from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-from sfm_shapefit.refinement.angular import Metric, allocate_normal, plan_refinement, refine_angles
+from sfm_shapefit.refinement.angular import allocate_normal, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
@@ -93,7 +93,7 @@ def refine_in_angles(_folder: Path) -> None:
     plan = plan_refinement(graph)
     assert plan is not None
     for solver in (plan, IterativeNormal(graph, laplacian_factor(graph))):
-        refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, np.int64)), solver)
+        refine_angles(MeasuredGraph(graph), problem.locations, solver)
 
 
 def measure_pairs(folder: Path) -> None:

@@ -84,7 +84,7 @@ def residual_angles(graph: ViewGraph, locations: FloatArray) -> FloatArray:
 
 def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixture:
     """Fit share and level of the right pairs of each class to the residuals at locations (n, d)."""
-    graph, classes, own = measured.graph, measured.classes, _own_variances(measured)
+    graph, classes, own = measured.graph, measured.classes, own_variances(measured)
     angles, d, count = residual_angles(graph, locations), graph.dimension, int(classes.max()) + 1
     numbers = np.maximum(np.bincount(classes, minlength=count), 1)
     shares = np.full(count, 0.5)
@@ -113,7 +113,7 @@ def fit_mixture(measured: MeasuredGraph, locations: FloatArray) -> ResidualMixtu
     )
 
 
-def _own_variances(measured: MeasuredGraph) -> FloatArray:
+def own_variances(measured: MeasuredGraph) -> FloatArray:
     """Return the variance per axis that each direction states itself, (m,); 0 where it states none."""
     if measured.covariance is None:
         return np.zeros(measured.graph.num_edges)

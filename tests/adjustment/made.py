@@ -144,7 +144,8 @@ def rig_problem_of(reconstruction):
         translations=np.einsum("cab,cb->ca", plain.rotations, arms),
         free_sensor_of_camera=np.full(len(images), -1),
     )
-    return replace(plain, rotations=rotations, centers=centers, rig=rig), frames
+    fixed = np.zeros(len(frames), np.bool_)
+    return replace(plain, rotations=rotations, centers=centers, rig=rig, fixed=fixed), frames
 
 
 def _lens(camera):
