@@ -211,7 +211,7 @@ def average_graphs(_folder: Path) -> None:
     edges = np.ascontiguousarray(_random_graph().edges)
     problem = rotation_problem(20, edges)
     average_relative_rotations(20, problem.relative, threads=2)
-    given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
+    given = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
     for is_expander in (False, True):
         system = replace(
             plan_system(20, given.pairs, given.supports, 1),

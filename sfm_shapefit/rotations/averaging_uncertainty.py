@@ -35,7 +35,6 @@ from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
-from sfm_shapefit.rotations.averaging_kernels import sum_blocks
 from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
 
 _LOSS_FACTOR = 0.823  # c of the header; for Geman and McClure's loss at three medians
@@ -124,9 +123,7 @@ def _sampled(
     """Return the same from samples; the leverages are their mean."""
     n, k = system.num_nodes, len(system.pairs)
     rng = np.random.default_rng(_SEED)
-    diagonal = np.zeros((n, 3, 3))
-    sum_blocks(system.pairs, last.blocks, diagonal)
-    own = np.linalg.inv(diagonal)
+    own = np.linalg.inv(system.sum_at_nodes(last.blocks))
     apply = system.block_operator(last.blocks)
     share = references / references.sum()
     total, right = np.zeros(n), np.empty((n, 3))
