@@ -49,8 +49,6 @@ class FrameCovariances:
     """(n, 3, 3) in squared units of the world, world axes; 0 for fixed frames, NaN where no point is seen."""
     rotations: FloatArray
     """(n, 3, 3) in rad^2, axes of the camera (the rig); 0 also for held rotations."""
-    free_similarities: int
-    """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
     deciding: BoolArray
     """(n,) frames relative to whose similarity these covariances are."""
     lens_sigmas: FloatArray
@@ -91,7 +89,14 @@ def estimate_covariances(
             nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", regauged(dual)[:, :3, :3]))
         blocks = regauged(_dual(system.motions, nodes))
     blocks *= options.noise_px**2
-    return _by_frame(system.layout, blocks, system.unseen, system.free.shape[1], nodes)
+    layout = system.layout
+    return FrameCovariances(
+        centers=system.by_frame(blocks[:, :3, :3]),
+        rotations=system.by_frame(blocks[:, 3:, 3:]),
+        deciding=np.isin(layout.node_of_frame, nodes),
+        lens_sigmas=_by_lens(layout, blocks),
+        sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -245,44 +250,11 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
     return read
 
 
-def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
-    """Return the standard deviation of each lens's focal length as a share of it, (l,); 0 for what is held.
-
-    Args:
-        problem: at its minimum, with its priors.
-        options: as it was adjusted with.
-
-    Raises:
-        UnsolvableError: if the observations leave more open than a similarity.
-    """
-    return focal_shares(problem, estimate_covariances(problem, options))
-
-
 def focal_shares(problem: AdjustmentProblem, known: FrameCovariances) -> FloatArray:
     """Return the standard deviations (l,) of focal lengths as shares of them; 0 for what is held."""
     sigmas = known.lens_sigmas[:, FOCAL_LENGTHS]
     values = np.array([lens.values()[FOCAL_LENGTHS] for lens in problem.lenses])
     return np.asarray((sigmas / values).max(axis=1))
-
-
-def _by_frame(
-    layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int, deciding: IntArray
-) -> FrameCovariances:
-    """Put the blocks of the nodes in the places of their frames."""
-    n = len(layout.node_of_frame)
-    centers, rotations = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    moves = layout.node_of_frame >= 0
-    own = blocks[layout.node_of_frame[moves]]
-    centers[moves], rotations[moves] = own[:, :3, :3], own[:, 3:, 3:]
-    centers[unseen], rotations[unseen] = np.nan, np.nan
-    return FrameCovariances(
-        centers=centers,
-        rotations=rotations,
-        free_similarities=num_free,
-        deciding=np.isin(layout.node_of_frame, deciding),
-        lens_sigmas=_by_lens(layout, blocks),
-        sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
-    )
 
 
 def _by_lens(layout: Layout, blocks: FloatArray) -> FloatArray:

@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment.covariance import focal_sigmas
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
@@ -228,7 +228,8 @@ class AdjustmentRun:
         if not free.lenses.any():
             return self, free.lenses
         try:
-            sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
+            known = estimate_covariances(last, self.options_at_optimum(), **free.overrides())
+            sigmas = focal_shares(last, known)
         except UnsolvableError:
             sigmas = np.full(len(lenses), np.inf)
         of_lens = zip(lenses, free.lenses.tolist(), sigmas.tolist(), strict=True)
@@ -282,7 +283,7 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
-            lens_errors=None if known is None else known.lens_errors(),
+            lens_errors=None if known is None else known.lens_errors,
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=run.focal_sigmas,
             undetermined=self.undetermined,

@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
-from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnStep
+from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import (
     add_center_prior,
     add_lens_prior,
@@ -56,7 +56,6 @@ class Ending(enum.Enum):
     GRADIENT = "the gradient is zero to its tolerance"
     STALLED = "no step lowers the cost any more, though the gradient is not zero; start closer"
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen cost_tolerance"
-    CANCELLED = "on_iteration cancelled the adjustment; these are the best values so far"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -105,18 +104,13 @@ class Adjusted(Displayed):
 
 
 def adjust(
-    problem: AdjustmentProblem,
-    options: AdjustmentOptions | None = None,
-    *,
-    on_iteration: OnStep | None = None,
-    **overrides: Any,
+    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
 ) -> Adjusted:
     """Minimize the reprojection errors over centers, points and what the options free.
 
     Args:
         problem: the start; it is not changed.
         options: settings, see `help(AdjustmentOptions)`; defaults if None.
-        on_iteration: called after each iteration; returning False cancels and returns the best values.
         **overrides: single options by name: `adjust(problem, hold_rotations=True)`.
 
     Returns:
@@ -131,7 +125,7 @@ def adjust(
         raise InputError("there is no observation, so there is nothing to adjust")
     run = _Run(problem, options)
     try:
-        ending = run.iterate(on_iteration)
+        ending = run.iterate()
         run.linearize()
     finally:
         run.workers.close()
@@ -275,14 +269,14 @@ class _Run:
         priors = sum_priors(self.problem, values, self.options.noise_px)
         return replace(values, points=points), cost + priors
 
-    def iterate(self, on_iteration: OnStep | None) -> Ending:
+    def iterate(self) -> Ending:
         """Take steps until a reason to stop."""
         while True:
             normal = self.linearize()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
-            ending = self.lower(normal, on_iteration)
+            ending = self.lower(normal)
             if ending is not None:
                 return ending
             # The next equations would else be held beside these.
@@ -295,7 +289,7 @@ class _Run:
         self.gradient_norm = _gradient_norm(normal, self.costs[-1])
         return normal
 
-    def lower(self, normal: NormalEquations, on_iteration: OnStep | None) -> Ending | None:
+    def lower(self, normal: NormalEquations) -> Ending | None:
         """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
         while True:
             if self.iterations >= self.options.max_iterations:
@@ -304,10 +298,6 @@ class _Run:
             predicted, accepted = self.attempt(normal)
             if not accepted and predicted <= _ROUNDING * before:
                 return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
-            step = AdjustmentStep(self.iterations, self.costs[-1], self.damping, accepted)
-            answer = None if on_iteration is None else on_iteration(step)
-            if answer is not None and not answer:  # a numpy False cancels too
-                return Ending.CANCELLED
             if accepted:
                 small = before - self.costs[-1] <= self.options.cost_tolerance * before
                 return Ending.COST if small else None

@@ -342,22 +342,13 @@ def test_points_of_one_view_do_no_harm():
     np.testing.assert_allclose(found.centers, expected.centers, atol=1e-6)
 
 
-def test_cancelling_keeps_the_best_values_so_far():
+def test_a_limit_of_iterations_keeps_the_best_values_so_far():
     _, start = make_start()
-    seen = []
-
-    def watch(step):
-        seen.append(step)
-        return np.bool_(len(seen) < 3)
-
-    found = adjust(start, TIGHT, on_iteration=watch)
-    assert found.ending is Ending.CANCELLED
-    assert not found.converged
-    assert found.iterations == len(seen) == 3
-    assert found.cost == seen[-1].cost < found.costs[0]
     limited = adjust(start, replace(TIGHT, max_iterations=3))
     assert limited.ending is Ending.MAX_ITERATIONS
-    np.testing.assert_array_equal(limited.problem.centers, found.problem.centers)
+    assert not limited.converged
+    assert limited.iterations == 3
+    assert limited.cost < limited.costs[0]
 
 
 def make_bent_row(num_cameras, bend):
@@ -433,26 +424,23 @@ def test_no_step_of_a_point_by_itself_raises_its_loss():
     assert (after <= before * (1.0 + 1e-12)).all()
 
 
-def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
+def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows(monkeypatch):
     truth, _ = make_start()
     start = disturb(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
-    steps = []
-    found = adjust(start, replace(TIGHT, loss_scale_px=None), on_iteration=steps.append)
-    refused = [k for k, step in enumerate(steps) if not step.accepted]
+    attempt, steps = adjustment_solve._Run.attempt, []
+
+    def watched(run, normal):
+        before, (predicted, accepted) = run.damping, attempt(run, normal)
+        steps.append((accepted, run.damping / before))
+        return predicted, accepted
+
+    monkeypatch.setattr(adjustment_solve._Run, "attempt", watched)
+    found = adjust(start, replace(TIGHT, loss_scale_px=None))
+    refused = [growth for accepted, growth in steps if not accepted]
     assert len(refused) > 5
-    assert all(steps[k].damping > steps[k - 1].damping for k in refused)
-    assert (np.diff([found.costs[0], *(step.cost for step in steps)]) <= 0.0).all()
+    assert min(refused) > 1.0
+    assert (np.diff(found.costs) < 0.0).all()
     assert found.ending is Ending.STALLED or found.gradient_norm < 1e-6
-
-
-def test_what_the_callback_raises_comes_through():
-    _, start = make_start()
-
-    def fail(step):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        adjust(start, TIGHT, on_iteration=fail)
 
 
 def test_no_observation_is_said():
