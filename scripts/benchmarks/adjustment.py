@@ -28,8 +28,10 @@ from benchmarks.real import SCENES
 from harness.driver import ROOT, Benchmark, Case, on_sets, positive
 from harness.process import peak_memory_mb, time_call
 from harness.record import Row, at_least, at_most, median, ratio, times
-from sfm_shapefit.adjustment import AdjustmentProblem, Lens, adjust
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.base.geometry import fit_similarity
+from sfm_shapefit.scene.lens import Lens
 
 LOSS_PX = 1.0
 TIMED_FALL = 1e-6

@@ -32,6 +32,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.scipy_parts import dgeqp3
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.laplacian.selected import regauged
 from sfm_shapefit.scene.lens import FOCAL_LENGTHS
 
 # Shares added to the diagonal, tried in turn; what nothing holds becomes large, not singular.
@@ -49,8 +50,6 @@ class FrameCovariances:
     """(n, 3, 3) in squared units of the world, world axes; 0 for fixed frames, NaN where no point is seen."""
     rotations: FloatArray
     """(n, 3, 3) in rad^2, axes of the camera (the rig); 0 also for held rotations."""
-    free_similarities: int
-    """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
     deciding: BoolArray
     """(n,) frames relative to whose similarity these covariances are."""
     lens_sigmas: FloatArray
@@ -86,12 +85,19 @@ def estimate_covariances(
     blocks = system.factor.inverse_blocks()
     nodes = system.seen_nodes() if deciding is None else system.layout.node_of_frame[deciding]
     if system.free.size:
-        regauged = partial(_transform, blocks, system.factor, system.motions)
+        moved_to = partial(regauged, blocks, system.factor.solve, system.motions)
         if deciding is None:
-            nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", regauged(dual)[:, :3, :3]))
-        blocks = regauged(_dual(system.motions, nodes))
+            nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", moved_to(dual)[:, :3, :3]))
+        blocks = moved_to(_dual(system.motions, nodes))
     blocks *= options.noise_px**2
-    return _by_frame(system.layout, blocks, system.unseen, system.free.shape[1], nodes)
+    layout = system.layout
+    return FrameCovariances(
+        centers=system.by_frame(blocks[:, :3, :3]),
+        rotations=system.by_frame(blocks[:, 3:, 3:]),
+        deciding=np.isin(layout.node_of_frame, nodes),
+        lens_sigmas=_by_lens(layout, blocks),
+        sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,9 +120,9 @@ class GroundedSystem:
         moved = self.factor.solve(np.ascontiguousarray(right))
         if not (gauge and self.free.size):
             return moved
-        regauged = partial(self._regauge, moved)
-        nodes = self.steady_nodes(lambda dual: np.sum(regauged(dual)[:, :3] ** 2, axis=(1, 2)))
-        return regauged(_dual(self.motions, nodes))
+        moved_to = partial(self._regauge, moved)
+        nodes = self.steady_nodes(lambda dual: np.sum(moved_to(dual)[:, :3] ** 2, axis=(1, 2)))
+        return moved_to(_dual(self.motions, nodes))
 
     def _regauge(self, moved: FloatArray, dual: FloatArray) -> FloatArray:
         """Return moves (N, 6, r) less the motions that a dual reads off them."""
@@ -220,19 +226,6 @@ def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
                 raise
 
 
-def _transform(
-    blocks: FloatArray, factor: ReducedFactor, motions: FloatArray, dual: FloatArray
-) -> FloatArray:
-    """Return the diagonal blocks of Z K^-1 Z^T."""
-    solved = factor.solve(dual)
-    middle = np.einsum("nai,naj->ij", dual, solved)
-    cross = motions @ solved.transpose(0, 2, 1)
-    transformed: FloatArray = (
-        blocks - cross - cross.transpose(0, 2, 1) + motions @ middle @ motions.transpose(0, 2, 1)
-    )
-    return transformed
-
-
 def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
     """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers of some nodes."""
     dual, own = np.zeros_like(motions), motions[nodes]
@@ -245,44 +238,11 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
     return read
 
 
-def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
-    """Return the standard deviation of each lens's focal length as a share of it, (l,); 0 for what is held.
-
-    Args:
-        problem: at its minimum, with its priors.
-        options: as it was adjusted with.
-
-    Raises:
-        UnsolvableError: if the observations leave more open than a similarity.
-    """
-    return focal_shares(problem, estimate_covariances(problem, options))
-
-
 def focal_shares(problem: AdjustmentProblem, known: FrameCovariances) -> FloatArray:
     """Return the standard deviations (l,) of focal lengths as shares of them; 0 for what is held."""
     sigmas = known.lens_sigmas[:, FOCAL_LENGTHS]
     values = np.array([lens.values()[FOCAL_LENGTHS] for lens in problem.lenses])
     return np.asarray((sigmas / values).max(axis=1))
-
-
-def _by_frame(
-    layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int, deciding: IntArray
-) -> FrameCovariances:
-    """Put the blocks of the nodes in the places of their frames."""
-    n = len(layout.node_of_frame)
-    centers, rotations = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    moves = layout.node_of_frame >= 0
-    own = blocks[layout.node_of_frame[moves]]
-    centers[moves], rotations[moves] = own[:, :3, :3], own[:, 3:, 3:]
-    centers[unseen], rotations[unseen] = np.nan, np.nan
-    return FrameCovariances(
-        centers=centers,
-        rotations=rotations,
-        free_similarities=num_free,
-        deciding=np.isin(layout.node_of_frame, deciding),
-        lens_sigmas=_by_lens(layout, blocks),
-        sensor_sigmas=np.sqrt(np.einsum("saa->sa", blocks[layout.node_of_sensor])),
-    )
 
 
 def _by_lens(layout: Layout, blocks: FloatArray) -> FloatArray:

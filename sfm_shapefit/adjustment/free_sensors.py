@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem
 from sfm_shapefit.adjustment.covariance import estimate_covariances
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.base.geometry import METRIC_SIGMA
@@ -42,7 +43,6 @@ def judge_sensors(
     found = np.full((len(free), 2), np.nan)
     if not free.any():
         return found
-    assert adjusted.rig is not None
     try:
         sigmas = estimate_covariances(adjusted, options).sensor_sigmas
     except UnsolvableError as error:

@@ -47,11 +47,9 @@ def free_similarities(problem: AdjustmentProblem, options: AdjustmentOptions) ->
     scale = np.repeat([1.0, 1.0 / spread, 1.0 / spread], [3, 3, 1])
     moves = small_similarities(problem.rotations, problem.centers, origin) * scale
     moves[:, 3:] *= spread
-    may_turn, may_scale = not options.hold_rotations, True
-    if problem.rig is not None:
-        may_scale = not np.any(problem.rig.translations)
+    may_turn, may_scale = not options.hold_rotations, not np.any(problem.rig.translations)
     basis = np.eye(_DIMENSION)[:, np.repeat([True, may_turn, may_scale], [3, 3, 1])]
-    basis = basis @ _null_space((moves[problem.is_fixed()] @ basis).reshape(-1, basis.shape[1]))
+    basis = basis @ _null_space((moves[problem.fixed] @ basis).reshape(-1, basis.shape[1]))
     for frames, given, slots in problem.priors_of_poses():
         size = np.einsum("naa->n", given)
         information = given / np.where(size > 0.0, size, 1.0)[:, None, None]
@@ -72,12 +70,9 @@ def _null_space(matrix: FloatArray) -> FloatArray:
 
 @one_blas_thread()  # matrices this small keep other threads waiting for hundreds of times as long
 def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) -> Values:
-    """Return the values moved by the free similarity that brings their centers closest to the problem's.
+    """Return the values moved by that similarity of the `free_similarities` that brings centers nearest.
 
-    Args:
-        problem: the start.
-        values: an adjustment's answer.
-        free: from `free_similarities`.
+    It is to the centers of the problem, the start.
     """
     if free.shape[1] == _DIMENSION:
         motion = _best_similarity(problem, values)
@@ -146,8 +141,8 @@ def _exponential(generator: FloatArray) -> FloatArray:
 def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, turned: bool) -> Values:
     """Return the values after a similarity of the world; fixed frames stay, rotations if not `turned`."""
     size = np.cbrt(np.linalg.det(motion[:3, :3]))
-    moves = ~problem.is_fixed()
-    centers, rotations, sensors = values.centers.copy(), values.rotations, values.sensor_translations
+    moves = ~problem.fixed
+    centers, rotations = values.centers.copy(), values.rotations
     centers[moves] = _moved(values.centers[moves], motion)
     if turned:
         rotations = rotations.copy()
@@ -157,7 +152,7 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
         rotations=rotations,
         centers=centers,
         points=_moved(values.points, motion),
-        sensor_translations=sensors if problem.rig is None else problem.rig.resized(sensors, size),
+        sensor_translations=problem.rig.resized(values.sensor_translations, size),
     )
 
 
@@ -166,9 +161,8 @@ def restore_baselines(problem: AdjustmentProblem, values: Values) -> Values:
 
     The longest alone had kept its length. All of them together are known better than any one.
     """
-    assert problem.rig is not None
     before, now = map(problem.rig.mean_baseline, (problem.rig.translations, values.sensor_translations))
-    size, fixed = before / now, problem.is_fixed()
+    size, fixed = before / now, problem.fixed
     origin = values.centers[fixed if fixed.any() else slice(None)].mean(axis=0)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = size * np.eye(3), (1.0 - size) * origin

@@ -111,10 +111,8 @@ class Layout:
 
 def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
     """Return the structure of an adjustment."""
-    frame_of_camera = np.arange(problem.num_frames)
-    if problem.rig is not None:
-        frame_of_camera = np.asarray(problem.rig.frame_of_camera, dtype=np.int64)
-    sensor_of_camera, scale_sensor = problem.free_sensors(), find_scale_sensor(problem)
+    frame_of_camera, sensor_of_camera = problem.rig.frame_of_camera, problem.rig.free_sensor_of_camera
+    scale_sensor = find_scale_sensor(problem)
     node_of_frame, node_of_lens, node_of_sensor, active, lens_slots = _nodes(problem, options, scale_sensor)
     order = np.argsort(problem.points_seen, kind="stable")
     point, camera, pixels = problem.points_seen, problem.cameras_seeing, problem.pixels
@@ -167,11 +165,9 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
 
 def find_scale_sensor(problem: AdjustmentProblem) -> int:
     """Return the free sensor farthest from the origin of its rig if nothing else sets the scale, or -1."""
-    if problem.rig is None:
-        return -1
-    free, sizes = problem.rig.free_sensors(), np.linalg.norm(problem.rig.translations, axis=1)
+    free, sizes = problem.rig.free_sensor_of_camera, np.linalg.norm(problem.rig.translations, axis=1)
     priors = 0 if problem.center_prior is None else len(problem.center_prior.indices)
-    known = sizes[free < 0].any() or max(int(problem.is_fixed().sum()), priors) > 1
+    known = sizes[free < 0].any() or max(int(problem.fixed.sum()), priors) > 1
     seeing = np.zeros(len(free), np.bool_)
     seeing[problem.cameras_seeing] = True  # a sensor that sees nothing says nothing of any scale
     sizes = np.where(seeing & (free >= 0), sizes, 0.0)
@@ -180,10 +176,9 @@ def find_scale_sensor(problem: AdjustmentProblem) -> int:
 
 def _sensor_bases(problem: AdjustmentProblem, scale_sensor: int) -> FloatArray:
     """Return the directions in which the center of each free sensor moves, (s, 3, 3)."""
-    free = problem.free_sensors()
+    free = problem.rig.free_sensor_of_camera
     bases = np.tile(np.eye(3), (int(free.max(initial=-1)) + 1, 1, 1))
     if scale_sensor >= 0:
-        assert problem.rig is not None
         center = problem.rig.sensor_centers()[np.argmax(free == scale_sensor)]
         bases[scale_sensor, :, :2] = tangent_bases(normalized(center)[None])[0]
         bases[scale_sensor, :, 2] = 0.0
@@ -194,7 +189,7 @@ def _nodes(
     problem: AdjustmentProblem, options: AdjustmentOptions, scale_sensor: int
 ) -> tuple[IntArray, IntArray, IntArray, BoolArray, IntArray]:
     """Number the nodes; return node_of_frame, node_of_lens, node_of_sensor, active and lens_slots."""
-    moves = ~problem.is_fixed()
+    moves = ~problem.fixed
     node_of_frame = np.where(moves, np.cumsum(moves) - 1, -1)
     free = {"focal_lengths": options.free_focal_lengths, "distortion": options.free_distortion}
     lens_slots = np.array([lens.slots(**free) for lens in problem.lenses]).reshape(-1, NUM_VALUES)
@@ -203,7 +198,7 @@ def _nodes(
     lens_slots = np.where(lens_slots >= 0, lens_slots + first_slots[:, None], -1)
     node_of_lens = np.where(packs >= 0, int(moves.sum()) + packs, -1)
     size_of_pack = np.bincount(packs[packs >= 0], sizes[packs >= 0]).astype(np.int64)
-    num_sensors = int(problem.free_sensors().max(initial=-1)) + 1
+    num_sensors = int(problem.rig.free_sensor_of_camera.max(initial=-1)) + 1
     node_of_sensor = int(moves.sum()) + len(size_of_pack) + np.arange(num_sensors)
     size_of_frame = 3 if options.hold_rotations else SLOTS
     of_frames, of_sensors = np.full(int(moves.sum()), size_of_frame), np.full(num_sensors, SLOTS)
@@ -218,11 +213,7 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     """Return the pack of each lens (l,), -1 if it is held, and the first of its slots there.
 
     Each lens takes in those that share most points with it, as long as there is room and these are a tenth of
-    its own: what is apart would else meet in a block.
-
-    Args:
-        problem: the observations.
-        sizes: (l,) number of unknowns of each lens.
+    its own: what is apart would else meet in a block. `sizes` (l,) are the lenses' numbers of unknowns.
     """
     packs, first_slots = np.full(len(sizes), -1), np.zeros(len(sizes), np.int64)
     small = np.flatnonzero((sizes > 0) & (2 * sizes <= SLOTS))
@@ -266,9 +257,7 @@ def _entries(point: IntArray, nodes: IntArray, num_nodes: int) -> tuple[IntArray
 def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     """Return the nodes that an observation ties, and the places of each camera's three ties (3, c), or -1.
 
-    Args:
-        nodes: (3, c) of each camera's frame, lens and sensor.
-        camera: of each observation.
+    The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
     """
     sees = np.zeros(nodes.shape[1], np.bool_)
     sees[camera] = True

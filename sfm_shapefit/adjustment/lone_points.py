@@ -120,21 +120,15 @@ def _equations_of(p: int, given: Any, points: Any, out: Any) -> float:
             a0, a1, a2, b0, b1, b2 = differentiate_by_point(views, camera, u, v, inverse)
             p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
             q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
-            v00, v01, v02 = (
-                v00 + w * (p0 * p0 + q0 * q0),
-                v01 + w * (p0 * p1 + q0 * q1),
-                v02 + w * (p0 * p2 + q0 * q2),
-            )
-            v11, v12, v22 = (
-                v11 + w * (p1 * p1 + q1 * q1),
-                v12 + w * (p1 * p2 + q1 * q2),
-                v22 + w * (p2 * p2 + q2 * q2),
-            )
-            g0, g1, g2 = (
-                g0 + w * (p0 * rx + q0 * ry),
-                g1 + w * (p1 * rx + q1 * ry),
-                g2 + w * (p2 * rx + q2 * ry),
-            )
+            v00 += w * (p0 * p0 + q0 * q0)
+            v01 += w * (p0 * p1 + q0 * q1)
+            v02 += w * (p0 * p2 + q0 * q2)
+            v11 += w * (p1 * p1 + q1 * q1)
+            v12 += w * (p1 * p2 + q1 * q2)
+            v22 += w * (p2 * p2 + q2 * q2)
+            g0 += w * (p0 * rx + q0 * ry)
+            g1 += w * (p1 * rx + q1 * ry)
+            g2 += w * (p2 * rx + q2 * ry)
         s = square * inverse_scale
         if scale == np.inf:
             sum_of_small += square

@@ -1,31 +1,12 @@
-"""Settings of an adjustment, and what it reports while it runs. Pure data, cheap to import."""
+"""Settings of an adjustment. Pure data, cheap to import."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from sfm_shapefit.base.settings import Settings, explained, option
 
 LinearSolver = Literal["auto", "dense", "sparse"]
-
-
-@dataclass(frozen=True, slots=True)
-class AdjustmentStep:
-    """What an adjustment reports to its `on_iteration` callback after each iteration."""
-
-    iteration: int
-    """Number of iterations done, from 1."""
-    cost: float
-    """The least cost so far, px^2."""
-    damping: float
-    """Levenberg-Marquardt damping of the next step, relative to the diagonal."""
-    accepted: bool
-    """Whether this iteration lowered the cost."""
-
-
-OnStep = Callable[[AdjustmentStep], bool | None]
-"""Called after each iteration; returning False, or raising, cancels the adjustment."""
 
 
 @explained

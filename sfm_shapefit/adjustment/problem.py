@@ -44,23 +44,27 @@ class Rig:
     """Rotations (c, 3, 3) of sensor_from_rig."""
     translations: FloatArray
     """Translations (c, 3) of sensor_from_rig, in units of the world."""
-    free_sensor_of_camera: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    free_sensor_of_camera: IntArray
     """(c,) number of the sensor that each camera is, from 0, if its pose in the rig is unknown; -1 if it
-    stays, as that of a reference has to. Empty: all stay."""
+    stays, as that of a reference has to."""
 
-    def free_sensors(self) -> IntArray:
-        """Return the number of each camera's sensor, (c,); -1 for those that stay."""
-        if len(self.free_sensor_of_camera):
-            return self.free_sensor_of_camera
-        return np.full(len(self.frame_of_camera), -1)
+    @classmethod
+    def of_single_cameras(cls, count: int) -> "Rig":
+        """Return frames of one camera each."""
+        return cls(
+            frame_of_camera=np.arange(count),
+            rotations=np.tile(np.eye(3), (count, 1, 1)),
+            translations=np.zeros((count, 3)),
+            free_sensor_of_camera=np.full(count, -1),
+        )
 
     def resized(self, translations: FloatArray, size: float) -> FloatArray:
         """Return translations (c, 3) of all sensors, those of free ones longer by a factor."""
-        return np.where(self.free_sensors()[:, None] >= 0, size * translations, translations)
+        return np.where(self.free_sensor_of_camera[:, None] >= 0, size * translations, translations)
 
     def mean_baseline(self, translations: FloatArray) -> float:
         """Return the free sensors' mean distance from the origins of their rigs, by translations (c, 3)."""
-        numbers, chosen = np.unique(self.free_sensors(), return_index=True)
+        numbers, chosen = np.unique(self.free_sensor_of_camera, return_index=True)
         return float(np.linalg.norm(translations[chosen[numbers >= 0]], axis=1).mean())
 
     def sensor_centers(self) -> FloatArray:
@@ -122,10 +126,10 @@ class AdjustmentProblem:
     """What cameras look through."""
     lens_of_camera: IntArray
     """(c,)"""
-    rig: Rig | None = None
-    """None if each frame is one camera: c = n."""
+    rig: Rig = field(default_factory=lambda: Rig.of_single_cameras(0))
+    """Each frame is one camera, c = n, if it has none."""
     fixed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
-    """(n,) frames whose pose stays what it is, to the last bit; none if empty."""
+    """(n,) frames whose pose stays what it is, to the last bit; none where it is made without."""
     rotation_prior: RotationPrior | None = None
     """Weighs rotations that are not held."""
     center_prior: KnownPositions | None = None
@@ -136,12 +140,16 @@ class AdjustmentProblem:
     def __post_init__(self) -> None:
         """Bring every array to its type and check it."""
         n = len(self.centers)
+        if not len(self.rig.frame_of_camera):
+            object.__setattr__(self, "rig", Rig.of_single_cameras(n))
+        if not len(self.fixed):
+            object.__setattr__(self, "fixed", np.zeros(n, np.bool_))
         self._take("centers", np.float64, (n, 3))
         self._take("rotations", np.float64, (n, 3, 3))
         self._take("points", np.float64, (len(self.points), 3))
         self._take("pixels", np.float64, (len(self.pixels), 2))
         self._take("lens_of_camera", np.int64, (len(self.lens_of_camera),))
-        self._take("fixed", np.bool_, (n if len(self.fixed) else 0,))
+        self._take("fixed", np.bool_, (n,))
         for name in ("cameras_seeing", "points_seen"):
             self._take(name, np.int64, (len(self.pixels),))
         _check_rotations(self.rotations, "rotation")
@@ -173,14 +181,9 @@ class AdjustmentProblem:
         """Number of observations, m."""
         return len(self.pixels)
 
-    def is_fixed(self) -> BoolArray:
-        """Return which frames are fixed, (n,)."""
-        return self.fixed if len(self.fixed) else np.zeros(self.num_frames, np.bool_)
-
     def frames_seeing(self) -> IntArray:
         """Return the frame of each observation, (m,)."""
-        cameras = self.cameras_seeing
-        return cameras if self.rig is None else self.rig.frame_of_camera[cameras]
+        return self.rig.frame_of_camera[self.cameras_seeing]
 
     def priors_of_poses(self) -> Iterator[tuple[IntArray, FloatArray, slice]]:
         """Yield frames, information of their centers or rotations, and its slots among their unknowns."""
@@ -188,22 +191,6 @@ class AdjustmentProblem:
             yield self.center_prior.indices, self.center_prior.information, slice(0, 3)
         if self.rotation_prior is not None:
             yield np.arange(self.num_frames), self.rotation_prior.information, slice(3, 6)
-
-    def with_values(
-        self,
-        rotations: FloatArray,
-        centers: FloatArray,
-        points: FloatArray,
-        lenses: Sequence[Lens],
-        rig: Rig | None = None,
-    ) -> Self:
-        """Return the problem with the same observations at other values; the rig stays if it is None."""
-        rig = self.rig if rig is None else rig
-        return replace(self, rotations=rotations, centers=centers, points=points, lenses=lenses, rig=rig)
-
-    def free_sensors(self) -> IntArray:
-        """Return the number of each camera's free sensor, (c,); -1 for those that stay."""
-        return np.full(self.num_cameras, -1) if self.rig is None else self.rig.free_sensors()
 
     def of_points(self, chosen: BoolArray) -> Self:
         """Return the problem of some points (k,) and what sees them; frames and cameras stay."""
@@ -226,10 +213,6 @@ class AdjustmentProblem:
         object.__setattr__(self, name, array)
 
     def _check_rig(self) -> None:
-        if self.rig is None:
-            if self.num_cameras != self.num_frames:
-                raise InputError(f"{self.num_cameras} cameras have {self.num_frames} poses; give a rig")
-            return
         c = self.num_cameras
         shapes = (self.rig.frame_of_camera.shape, self.rig.rotations.shape, self.rig.translations.shape)
         if shapes != ((c,), (c, 3, 3), (c, 3)):
@@ -237,11 +220,6 @@ class AdjustmentProblem:
                 f"the rig's arrays have shapes {shapes}, they must be ({c},), ({c}, 3, 3), ({c}, 3)"
             )
         _check_range(self.rig.frame_of_camera, self.num_frames, "frame")
-        free = self.rig.free_sensors()
-        if free.shape != (c,) or not np.array_equal(
-            np.unique(free[free >= 0]), np.arange(free.max(initial=-1) + 1)
-        ):
-            raise InputError(f"free sensors must be {c} numbers from 0 without gaps, -1 for those that stay")
         _check_rotations(self.rig.rotations, "rotation of a sensor in its rig")
         if not np.isfinite(self.rig.translations).all():
             raise InputError("a translation of a sensor in its rig is not finite")

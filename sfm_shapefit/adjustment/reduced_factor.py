@@ -9,7 +9,7 @@ on 10,000 images. Where that does not lead there, the factor gets 64 bits, and k
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,25 +41,9 @@ _RESIDUAL, _MOST_PRODUCTS = 1e-11, 40
 _RIDGE = 1e-7
 
 
-class ReducedFactor(Protocol):
-    """Factors reduced systems of one structure, one after the other."""
-
-    def refactor(self, system: ReducedSystem) -> None:
-        """Factor a system; raise UnsolvableError if it is not positive definite to working precision."""
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solutions (N, 6, r) for right-hand sides (N, 6, r); 0 for what is no unknown."""
-
-    def inverse_blocks(self) -> FloatArray:
-        """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
-
-    def give_back(self) -> None:
-        """Give back the memory of a large factor until the next system."""
-
-
 def choose_factor(
     layout: Layout, options: AdjustmentOptions, dtype: npt.DTypeLike = np.float64
-) -> ReducedFactor:
+) -> "ReducedFactor":
     """Return an empty factor as the options ask, dense without unknowns; `dtype` is that of a sparse one."""
     dense_up_to = {"auto": _DENSE_LIMIT, "dense": np.inf, "sparse": 0}[options.linear_solver]
     dense = layout.num_unknowns <= dense_up_to
@@ -68,7 +52,7 @@ def choose_factor(
 
 @dataclass(slots=True, eq=False)
 class DenseFactor:
-    """One dense matrix, its lower triangle."""
+    """Factors reduced systems of one structure, one after the other: one dense matrix, its lower triangle."""
 
     rows: IntArray
     """(N, 6) row of each slot, -1 if it is no unknown."""
@@ -85,7 +69,7 @@ class DenseFactor:
         return cls(rows, layout.pairs, np.empty((size, size), order="F"))
 
     def refactor(self, system: ReducedSystem) -> None:
-        """Factor a system."""
+        """Factor a system; raise UnsolvableError if it is not positive definite to working precision."""
         self.matrix[:] = 0.0
         _fill(self.rows, self.pair_nodes, system.diagonal, system.pairs, self.matrix.T)
         before = np.diag(self.matrix).copy()
@@ -94,7 +78,7 @@ class DenseFactor:
         _refuse_singular(bool(info), np.diag(self.matrix) ** 2 / before if not info else before)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Solve for right-hand sides (N, 6, r)."""
+        """Return the solutions (N, 6, r) for right-hand sides (N, 6, r); 0 for what is no unknown."""
         unknown = self.rows >= 0
         out = np.zeros(right.shape)
         if unknown.any():
@@ -103,7 +87,7 @@ class DenseFactor:
         return out
 
     def inverse_blocks(self) -> FloatArray:
-        """Invert the whole matrix and take its diagonal blocks."""
+        """Return the diagonal blocks of the inverse, (N, 6, 6); 0 for what is no unknown."""
         out = np.zeros((*self.rows.shape, SLOTS))
         if not (self.rows >= 0).any():
             return out
@@ -200,6 +184,9 @@ class SparseFactor:
         out = np.zeros((*self.unknown.shape, SLOTS))
         out[:, :b, :b] = selected_inverse(self.factor, self.pair_nodes).nodes
         return out * self.unknown[:, :, None] * self.unknown[:, None, :]
+
+
+ReducedFactor = DenseFactor | SparseFactor
 
 
 def _refuse_singular(failed: bool, pivots: FloatArray) -> None:

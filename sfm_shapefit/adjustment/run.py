@@ -32,21 +32,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    AdjustmentProblem,
-    adjust,
-    choose_loss_scale_px,
-    frames_not_gained,
-    reprojection_errors_px,
-)
-from sfm_shapefit.adjustment.covariance import focal_sigmas
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.given_rotations import RotationErrors
 from sfm_shapefit.adjustment.lens_doubts import covariances_of_open_lenses, errors_of_free_lenses
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.shared_errors import CenterErrors, estimate_center_errors
+from sfm_shapefit.adjustment.solve import (
+    adjust,
+    choose_loss_scale_px,
+    frames_not_gained,
+    reprojection_errors_px,
+)
 from sfm_shapefit.adjustment.sources import Links, with_rays_of
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
@@ -228,7 +228,8 @@ class AdjustmentRun:
         if not free.lenses.any():
             return self, free.lenses
         try:
-            sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
+            known = estimate_covariances(last, self.options_at_optimum(), **free.overrides())
+            sigmas = focal_shares(last, known)
         except UnsolvableError:
             sigmas = np.full(len(lenses), np.inf)
         of_lens = zip(lenses, free.lenses.tolist(), sigmas.tolist(), strict=True)
@@ -282,7 +283,7 @@ class AdjustmentRun:
             freedom=self.freedom,
             errors=errors,
             covariances=covariances,
-            lens_errors=None if known is None else known.lens_errors(),
+            lens_errors=None if known is None else known.lens_errors,
             scale_sigma=None if known is None else known.scale_sigma,
             focal_sigmas=run.focal_sigmas,
             undetermined=self.undetermined,

@@ -40,7 +40,15 @@ from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.projection import SHIFT, differentiate, is_ahead, look, miss, turn_to_frame
+from sfm_shapefit.adjustment.projection import (
+    SHIFT,
+    differentiate_by_point,
+    is_ahead,
+    look,
+    miss,
+    turn_to_frame,
+    turn_to_world,
+)
 from sfm_shapefit.adjustment.residuals import kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
@@ -51,6 +59,7 @@ from sfm_shapefit.scene.lens import LensErrors
 _MOST_GROUPS = 64  # groups of neighboring points; each is one more right side for the factor
 _FEWEST_OF_A_GROUP = 8  # points of a group; fewer would share no noise
 _DEGREE = 3  # degree of the polynomials of a smooth field; ten coefficients for each axis
+_NUM_FIELDS = (_DEGREE + 1) * (_DEGREE + 2) // 2
 # Draws of smooth fields and turns; a variance from as many has a standard deviation of (2 / 24)^1/2 = 29 %.
 _SAMPLES = 24
 # Smooth field of a doubted lens, in median errors; between what two sets with truth call for, see the header.
@@ -75,19 +84,11 @@ class CenterErrors:
     covariances: FloatArray
     """Covariances (n, 3, 3) of the frames' centers, squared units of the world; 0 for fixed frames, NaN where
     no point is seen."""
-    calibration_px: float
-    """Root of the mean square of each smooth field of an image's errors; 0 where the lenses fit."""
-    lens_errors_px: FloatArray
-    """(l,) the same of the fields that all images of a lens share."""
+    lens_errors: LensErrors
+    """What the covariances take errors of the lenses for."""
     scale_sigma: float | None
     """Relative standard deviation of the scale; None where nothing in the problem sets it. From a tenth on,
     the covariances leave errors of the scale out: they are then those of the shape, in whatever scale."""
-    evidence: float
-    """Standard score of smooth errors of the lenses beyond noise; the largest of all lenses'."""
-
-    def lens_errors(self) -> LensErrors:
-        """Return what the covariances take errors of the lenses for."""
-        return LensErrors(self.evidence, self.calibration_px, float(self.lens_errors_px.max(initial=0.0)))
 
 
 def estimate_center_errors(
@@ -121,23 +122,15 @@ def estimate_center_errors(
     by_group, by_sample = pulls.draw(calibration_px, lens_errors_px, turn_sigmas)
     _add_errors_of_priors(by_sample, problem, options, system, kappa)
     groups = max(by_group.shape[2], 2)
-    moved = np.concatenate(
-        [
-            by_group / kappa * np.sqrt(groups / (groups - 1.0)),
-            by_sample / np.sqrt(_SAMPLES),
-        ],
-        axis=2,
-    )
-    moves, scale_sigma = system.solve(moved)[:, :3], None
-    if not (system.free[6].any() or problem.is_fixed().any()):
+    pulled = by_group / kappa * np.sqrt(groups / (groups - 1.0)), by_sample / np.sqrt(_SAMPLES)
+    moves, scale_sigma = system.solve(np.concatenate(pulled, axis=2))[:, :3], None
+    if not (system.free[6].any() or problem.fixed.any()):
         scale_sigma, same_scale = _split_scale(problem, system, moves)
         moves = same_scale if scale_sigma > METRIC_SIGMA else moves
     return CenterErrors(
         covariances=system.by_frame(moves @ moves.transpose(0, 2, 1)),
-        calibration_px=calibration_px,
-        lens_errors_px=lens_errors_px,
+        lens_errors=LensErrors(evidence, calibration_px, float(lens_errors_px.max(initial=0.0))),
         scale_sigma=scale_sigma,
-        evidence=evidence,
     )
 
 
@@ -185,14 +178,13 @@ class _Pulls:
         self.given = kernel_inputs(system.layout, values_of(problem), options.loss_scale_px)
         self.windows = _windows(problem)
         self.groups = _group_neighbors(problem.points)
-        self.num_fields = _count_polynomials()
 
     def draw(
         self, calibration_px: float, lens_errors_px: FloatArray, turn_sigmas_rad: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the pulls of each group's residuals (N, 6, g), and of samples of smooth errors (N, 6, s)."""
         rng = np.random.default_rng(0)
-        problem, fields_of_one = self.problem, (2, self.num_fields, _SAMPLES)
+        problem, fields_of_one = self.problem, (2, _NUM_FIELDS, _SAMPLES)
         fields = calibration_px * rng.standard_normal((problem.num_cameras, *fields_of_one))
         turns = turn_sigmas_rad[:, None, None] * rng.standard_normal((problem.num_frames, 3, _SAMPLES))
         shared = rng.standard_normal((len(problem.lenses), *fields_of_one))
@@ -236,8 +228,8 @@ class _Pulls:
     def _detect(self, lens: int, noise2: float) -> "_SharedErrors":
         """Return what the visible part of the fields of a lens says of them."""
         own = self.problem.lens_of_camera == lens
-        count = 2 * self.num_fields
-        unit = np.eye(count).reshape(2, self.num_fields, count)
+        count = 2 * _NUM_FIELDS
+        unit = np.eye(count).reshape(2, _NUM_FIELDS, count)
         fields = np.where(own[:, None, None, None], unit, 0.0)
         turns = np.zeros((self.problem.num_frames, 3, count))
         by_group = np.zeros((self.system.layout.num_nodes, SLOTS, int(self.groups.max(initial=0)) + 1))
@@ -294,10 +286,6 @@ def likeliest_variance(values: FloatArray, variances: FloatArray) -> float:
     return found
 
 
-def _count_polynomials() -> int:
-    return (_DEGREE + 1) * (_DEGREE + 2) // 2
-
-
 def _windows(problem: AdjustmentProblem) -> FloatArray:
     """Return the middle and the half size of the pixels that the lens of each camera uses, (c, 4)."""
     lenses = problem.lens_of_camera[problem.cameras_seeing]
@@ -335,7 +323,7 @@ def _pull(
     its group in `by_group`, if there is any; residuals are the last row and column of `squares`.
     """
     first, cameras, pixels, views, points, scale = given
-    count, num_fields = fields.shape[3], fields.shape[2]
+    count = fields.shape[3]
     has_groups, has_squares = by_group.shape[2] > 0, len(squares) > 0
     longest = 0
     for p in range(len(first) - 1):
@@ -343,11 +331,8 @@ def _pull(
     residual = np.empty(2)
     by_points, by_frames = np.empty((longest, 2, 3)), np.zeros((longest, 2, 6))
     errors, weights = np.empty((longest, 2, count + 1)), np.empty(longest)
-    basis, p_x, p_y = np.empty(num_fields), np.ones(8), np.ones(8)
+    basis, p_x, p_y = np.empty(_NUM_FIELDS), np.ones(_DEGREE + 1), np.ones(_DEGREE + 1)
     sums, along, left = np.empty((3, count + 1)), np.empty(3), np.empty((2, count + 1))
-    degree = 0
-    while (degree + 1) * (degree + 2) < 2 * num_fields:
-        degree += 1
     for p in range(len(first) - 1):
         sums[:] = 0.0
         for k in range(first[p], first[p + 1]):
@@ -367,13 +352,13 @@ def _pull(
             weights[at] = 1.0 / (1.0 + square / scale)
             x = (pixels[k, 0] - windows[camera, 0]) / windows[camera, 2]
             y = (pixels[k, 1] - windows[camera, 1]) / windows[camera, 3]
-            _write_polynomials(x, y, degree, p_x, p_y, basis)
+            _write_polynomials(x, y, p_x, p_y, basis)
             for axis in range(2):
                 errors[at, axis, :] = 0.0
                 for a in range(3):
                     for s in range(count):
                         errors[at, axis, s] += by_frames[at, axis, 3 + a] * turns[frame, a, s]
-                for t in range(num_fields):
+                for t in range(_NUM_FIELDS):
                     for s in range(count):
                         errors[at, axis, s] += basis[t] * fields[camera, axis, t, s]
                 errors[at, axis, count] = residual[axis]
@@ -425,35 +410,30 @@ def _differentiate_by_frame(
         point: less the frame's center, in axes of the camera. u, v: of its ray. z: its depth.
         by_point, by_frame: are written.
     """
-    slopes = differentiate(views, camera, u, v)
+    slopes = differentiate_by_point(views, camera, u, v, 1.0 / z)
     b0, b1, b2 = turn_to_frame(views, camera, point[0], point[1], point[2])
     for axis in range(2):
-        by_u, by_v = slopes[2 * axis], slopes[2 * axis + 1]
-        j0, j1, j2 = by_u / z, by_v / z, -(by_u * u + by_v * v) / z
+        j0, j1, j2 = slopes[3 * axis], slopes[3 * axis + 1], slopes[3 * axis + 2]
+        by_point[axis, 0], by_point[axis, 1], by_point[axis, 2] = turn_to_world(views, camera, j0, j1, j2)
         for a in range(3):
-            slope = j0 * views[camera, a] + j1 * views[camera, 3 + a] + j2 * views[camera, 6 + a]
-            by_point[axis, a], by_frame[axis, a] = slope, -slope
+            by_frame[axis, a] = -by_point[axis, a]
         g0, g1, g2 = turn_to_frame(views, camera, j0, j1, j2)
         by_frame[axis, 3], by_frame[axis, 4] = b1 * g2 - b2 * g1, b2 * g0 - b0 * g2
         by_frame[axis, 5] = b0 * g1 - b1 * g0
 
 
 @inner_kernel
-def _write_polynomials(x: float, y: float, degree: int, p_x: Any, p_y: Any, basis: Any) -> None:
-    """Write the products of Legendre polynomials up to a degree, each of mean square 1 over the window.
+def _write_polynomials(x: float, y: float, p_x: Any, p_y: Any, basis: Any) -> None:
+    """Write the products of Legendre polynomials of x and y in [-1, 1], each of mean square 1 there.
 
-    Args:
-        x, y: in [-1, 1] over the window.
-        degree: of the products.
-        p_x, p_y: for the polynomials of one coordinate; the first, 1, is there.
-        basis: is written.
+    `p_x` and `p_y` are for the polynomials of one coordinate; the first, 1, is there.
     """
     p_x[1], p_y[1] = x, y
-    for i in range(1, degree):
+    for i in range(1, _DEGREE):
         p_x[i + 1] = ((2 * i + 1) * x * p_x[i] - i * p_x[i - 1]) / (i + 1)
         p_y[i + 1] = ((2 * i + 1) * y * p_y[i] - i * p_y[i - 1]) / (i + 1)
     t = 0
-    for i in range(degree + 1):
-        for j in range(degree + 1 - i):
+    for i in range(_DEGREE + 1):
+        for j in range(_DEGREE + 1 - i):
             basis[t] = p_x[i] * p_y[j] * np.sqrt((2.0 * i + 1.0) * (2.0 * j + 1.0))
             t += 1

@@ -11,14 +11,9 @@ import numpy as np
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
-from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnStep
-from sfm_shapefit.adjustment.priors import (
-    add_center_prior,
-    add_lens_prior,
-    add_rotation_prior,
-    sum_priors,
-)
-from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.priors import add_priors, sum_priors
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
@@ -56,7 +51,6 @@ class Ending(enum.Enum):
     GRADIENT = "the gradient is zero to its tolerance"
     STALLED = "no step lowers the cost any more, though the gradient is not zero; start closer"
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen cost_tolerance"
-    CANCELLED = "on_iteration cancelled the adjustment; these are the best values so far"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -105,18 +99,13 @@ class Adjusted(Displayed):
 
 
 def adjust(
-    problem: AdjustmentProblem,
-    options: AdjustmentOptions | None = None,
-    *,
-    on_iteration: OnStep | None = None,
-    **overrides: Any,
+    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
 ) -> Adjusted:
     """Minimize the reprojection errors over centers, points and what the options free.
 
     Args:
         problem: the start; it is not changed.
         options: settings, see `help(AdjustmentOptions)`; defaults if None.
-        on_iteration: called after each iteration; returning False cancels and returns the best values.
         **overrides: single options by name: `adjust(problem, hold_rotations=True)`.
 
     Returns:
@@ -131,7 +120,7 @@ def adjust(
         raise InputError("there is no observation, so there is nothing to adjust")
     run = _Run(problem, options)
     try:
-        ending = run.iterate(on_iteration)
+        ending = run.iterate()
         run.linearize()
     finally:
         run.workers.close()
@@ -139,22 +128,21 @@ def adjust(
     if run.layout.scale_sensor >= 0:
         values = restore_baselines(problem, values)
     lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
+    rig = replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
     return Adjusted(
-        problem=problem.with_values(
-            values.rotations, values.centers, values.points, lenses, _rig(problem, values)
+        problem=replace(
+            problem,
+            rotations=values.rotations,
+            centers=values.centers,
+            points=values.points,
+            lenses=lenses,
+            rig=rig,
         ),
         costs=np.array(run.costs),
         gradient_norm=run.gradient_norm,
         iterations=run.iterations,
         ending=ending,
     )
-
-
-def _rig(problem: AdjustmentProblem, values: Values) -> Rig | None:
-    """Return the rig of a problem with the poses of its sensors at other values."""
-    if problem.rig is None:
-        return None
-    return replace(problem.rig, rotations=values.sensor_rotations, translations=values.sensor_translations)
 
 
 def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
@@ -167,12 +155,7 @@ def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_
     """Return which frames (n,) would have less cost at their pose of before, all else as it is after.
 
     A joint minimum is one for each frame by itself, but only a local one: a frame that few points hold may
-    have been led over a ridge by the others.
-
-    Args:
-        before: a problem at its start.
-        after: the same problem, adjusted, in the same gauge.
-        loss_scale_px: of the Cauchy loss.
+    have been led over a ridge by the others. Both are the same problem in the same gauge.
     """
     returned = replace(after, rotations=before.rotations, centers=before.centers)
     return _costs_of_frames(returned, loss_scale_px) < _costs_of_frames(after, loss_scale_px)
@@ -222,19 +205,13 @@ def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float])
 
 def values_of(problem: AdjustmentProblem) -> Values:
     """Return the numbers of a problem that an adjustment changes."""
-    if problem.rig is None:
-        sensor_rotations = np.tile(np.eye(3), (problem.num_cameras, 1, 1))
-        sensor_translations = np.zeros((problem.num_cameras, 3))
-    else:
-        sensor_rotations = np.ascontiguousarray(problem.rig.rotations, dtype=np.float64)
-        sensor_translations = np.ascontiguousarray(problem.rig.translations, dtype=np.float64)
     return Values(
         rotations=problem.rotations,
         centers=problem.centers,
         points=problem.points,
         lenses=np.array([lens.values() for lens in problem.lenses]).reshape(-1, 8),
-        sensor_rotations=sensor_rotations,
-        sensor_translations=sensor_translations,
+        sensor_rotations=np.ascontiguousarray(problem.rig.rotations, dtype=np.float64),
+        sensor_translations=np.ascontiguousarray(problem.rig.translations, dtype=np.float64),
     )
 
 
@@ -248,16 +225,7 @@ def linearize_all(
 ) -> NormalEquations:
     """Return the normal equations of observations and priors; see `linearize`."""
     normal = linearize(layout, values, options.loss_scale_px, workers, least_curvature)
-    moves = layout.node_of_frame >= 0
-    nodes = layout.node_of_frame[moves]
-    for add, slots in ((add_center_prior, slice(0, 3)), (add_rotation_prior, slice(3, 6))):
-        if slots.start == 3 and options.hold_rotations:
-            continue
-        blocks, gradients = np.zeros((len(moves), 3, 3)), np.zeros((len(moves), 3))
-        add(problem, values, options.noise_px, blocks, gradients)
-        normal.nodes[nodes, slots, slots] += blocks[moves]
-        normal.node_gradients[nodes, slots] += gradients[moves]
-    add_lens_prior(problem, layout, values, options.noise_px, normal)
+    add_priors(problem, layout, values, options.noise_px, normal)
     return normal
 
 
@@ -282,14 +250,14 @@ class _Run:
         priors = sum_priors(self.problem, values, self.options.noise_px)
         return replace(values, points=points), cost + priors
 
-    def iterate(self, on_iteration: OnStep | None) -> Ending:
+    def iterate(self) -> Ending:
         """Take steps until a reason to stop."""
         while True:
             normal = self.linearize()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
-            ending = self.lower(normal, on_iteration)
+            ending = self.lower(normal)
             if ending is not None:
                 return ending
             # The next equations would else be held beside these.
@@ -302,7 +270,7 @@ class _Run:
         self.gradient_norm = _gradient_norm(normal, self.costs[-1])
         return normal
 
-    def lower(self, normal: NormalEquations, on_iteration: OnStep | None) -> Ending | None:
+    def lower(self, normal: NormalEquations) -> Ending | None:
         """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
         while True:
             if self.iterations >= self.options.max_iterations:
@@ -311,10 +279,6 @@ class _Run:
             predicted, accepted = self.attempt(normal)
             if not accepted and predicted <= _ROUNDING * before:
                 return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
-            step = AdjustmentStep(self.iterations, self.costs[-1], self.damping, accepted)
-            answer = None if on_iteration is None else on_iteration(step)
-            if answer is not None and not answer:  # a numpy False cancels too
-                return Ending.CANCELLED
             if accepted:
                 small = before - self.costs[-1] <= self.options.cost_tolerance * before
                 return Ending.COST if small else None

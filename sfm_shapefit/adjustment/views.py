@@ -50,20 +50,13 @@ class Views:
         tracks: ObservedTracks,
         found: TriangulatedPoints,
     ) -> AdjustmentProblem:
-        """Return the problem of points, at the poses of the images.
+        """Return the problem of points found of tracks, at the poses of the images of the views.
 
-        Args:
-            images: those of the views.
-            sensors: (l,) lenses that move in their rigs.
-            given: what is known of their poses; rotations have no part yet.
-            tracks: observations of points.
-            found: the points.
+        Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
         used = np.flatnonzero(found.points_seen >= 0)
         rotations, translations = self._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
-        is_plain = np.array_equal(frames, np.arange(len(images.frames.ids))) and not translations.any()
-        is_plain = is_plain and bool((rotations == np.eye(3)).all())
         rig = Rig(
             frame_of_camera=frames,
             rotations=rotations,
@@ -79,7 +72,7 @@ class Views:
             pixels=tracks.pixels[used],
             lenses=tuple(map(_lens_of_views, images.lenses)),
             lens_of_camera=lenses,
-            rig=None if is_plain else rig,
+            rig=rig,
             fixed=np.zeros(0, np.bool_) if given.fixed is None else given.fixed,
             center_prior=given.centers,
         )
@@ -91,11 +84,9 @@ class Views:
             for lens, found in zip(images.lenses, solved.lenses, strict=True)
         ]
         moved = images.posed(solved.rotations, solved.centers).with_lenses(lenses)
-        free = solved.free_sensors()
-        if not (free >= 0).any():
+        cameras = np.flatnonzero(solved.rig.free_sensor_of_camera >= 0)
+        if not len(cameras):
             return moved
-        assert solved.rig is not None
-        cameras = np.flatnonzero(free >= 0)
         own, back = solved.lens_of_camera[cameras], self.rotations[cameras].transpose(0, 2, 1)
         rotations, translations = images.sensors.rotations.copy(), images.sensors.translations.copy()
         rotations[own] = back @ solved.rig.rotations[cameras]
@@ -137,11 +128,9 @@ def views_of(images: Images) -> Views:
 
 def _lens_of_views(lens: Lens) -> Lens:
     """Return the lens of the views of an image."""
-    return (
-        lens
-        if lens.is_adjustable
-        else Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)
-    )
+    if lens.is_adjustable:
+        return lens
+    return Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)
 
 
 def _cube() -> FloatArray:

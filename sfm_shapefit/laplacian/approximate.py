@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, Int32Array, IntArray, frozen
 from sfm_shapefit.base.jit import inner_kernel, kernel, mix_bits
-from sfm_shapefit.laplacian.operators import Adjacency
+from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator
 
 _DIVERGED = 1e6  # residual over the least so far; such a one shows that rounding leads, no longer the system
 
@@ -374,6 +374,13 @@ def conjugate_gradients(
         if largest < least:
             best, least = x, largest
     return GradientsResult(_centered(best, count), k, least, bool(least <= tol))
+
+
+def diagonal_suffices(operator: LaplacianOperator, steps: int) -> bool:
+    """Return whether so few steps with the diagonal solve a system, as they do on expanders alone."""
+    probe = np.random.default_rng(1).normal(size=(operator.graph.num_nodes, 3))
+    jacobi = JacobiPreconditioner(operator.diagonal())
+    return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=steps).converged
 
 
 def _centered(x: FloatArray, count: int) -> FloatArray:

@@ -6,16 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment import (
-    Adjusted,
-    AdjustmentOptions,
-    FrameCovariances,
-    RotationPrior,
-    adjust,
-    estimate_covariances,
-    isotropic_information,
-)
+from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covariances
 from sfm_shapefit.adjustment.freedom import GivenPoses
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import RotationPrior, isotropic_information
+from sfm_shapefit.adjustment.solve import Adjusted, adjust
 from sfm_shapefit.adjustment.sources import collect_tracks
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.display import Displayed

@@ -157,5 +157,5 @@ def refine_with_gravity(
 
     supports = relative.weight_shares * relative.num_matches
     count = len(averaged.registered)
-    given, _ = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
+    given = check_pairs(relative.pairs, relative.rotations, relative.information, supports, count)
     return with_gravity(averaged, given, gravity)

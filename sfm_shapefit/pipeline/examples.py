@@ -9,16 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    AdjustmentProblem,
-    Lens,
-    adjust,
-    estimate_covariances,
-)
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
+from sfm_shapefit.adjustment.solve import adjust
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity.pieces import parallel_rigid_pieces
@@ -34,14 +31,16 @@ from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.pipeline.relative_rotations import relative_rotations
-from sfm_shapefit.refinement.angular import Metric, allocate_normal, plan_refinement, refine_angles
+from sfm_shapefit.refinement.angular import allocate_normal, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
 from sfm_shapefit.rotations.average import average_relative_rotations, check_pairs
 from sfm_shapefit.rotations.averaging_system import plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import certify_rotations
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.lud import solve_lud
@@ -94,7 +93,7 @@ def refine_in_angles(_folder: Path) -> None:
     plan = plan_refinement(graph)
     assert plan is not None
     for solver in (plan, IterativeNormal(graph, laplacian_factor(graph))):
-        refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, np.int64)), solver)
+        refine_angles(MeasuredGraph(graph), problem.locations, solver)
 
 
 def measure_pairs(folder: Path) -> None:
@@ -212,7 +211,7 @@ def average_graphs(_folder: Path) -> None:
     edges = np.ascontiguousarray(_random_graph().edges)
     problem = rotation_problem(20, edges)
     average_relative_rotations(20, problem.relative, threads=2)
-    given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
+    given = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
     for is_expander in (False, True):
         system = replace(
             plan_system(20, given.pairs, given.supports, 1),

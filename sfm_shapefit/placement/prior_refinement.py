@@ -10,7 +10,7 @@ from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.anchored import refine_anchored, weighted_anchors
-from sfm_shapefit.refinement.angular import KERNEL_WIDTH, Metric
+from sfm_shapefit.refinement.angular import KERNEL_WIDTH
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -37,21 +37,15 @@ def pull_to_priors(
     """Return the placement refined on directions and priors together.
 
     A camera that the refinement had thrown out of the scene and put back stays undetermined, unless a prior
-    holds it where it is now. UnsolvableError if the factor would take more memory than the options allow.
-
-    Args:
-        placement: cameras placed by directions, and points with them.
-        gauge: gauge in which the priors are, from `prior_gauge`.
-        priors: priors of the images.
-        options: as they were given to `place`.
+    holds it where it is now. The gauge is that of the priors, from `prior_gauge`; the options are those of
+    the placement. UnsolvableError if the factor would take more memory than they allow.
     """
     part, refined = placement.measured_part(), placement.refined
     own = priors.of(placement.nodes).known
     start = gauge.similarity.apply(refined.locations)
     anchors = _anchor(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
     levels = np.radians(np.array(refined.levels_deg))
-    metric = Metric(part.covariance, part.classes)
-    moved = refine_anchored(part.graph, start, metric, levels, anchors, max_bytes=options.solver.factor_bytes)
+    moved = refine_anchored(part, start, levels, anchors, max_bytes=options.solver.factor_bytes)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
     kept = replace(

@@ -13,13 +13,13 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.refinement.angular import (
     DAMPING,
     KERNEL_WIDTH,
     AngularTerms,
-    Metric,
     allocate_normal,
     information_at,
     plan_refinement,
@@ -39,9 +39,8 @@ def weighted_anchors(anchors: KnownPositions, t: FloatArray) -> KnownPositions:
 
 
 def refine_anchored(
-    graph: ViewGraph,
+    measured: MeasuredGraph,
     start: FloatArray,
-    metric: Metric,
     levels: FloatArray,
     anchors: KnownPositions,
     *,
@@ -50,13 +49,13 @@ def refine_anchored(
     """Return locations (n, d), in the anchors' units, of least cost of directions and anchors together.
 
     Args:
-        graph: a connected view graph.
+        measured: a connected view graph.
         start: (n, d) locations near the anchors.
-        metric: covariance and class of each pair.
         levels: (number of classes,) in radians.
         anchors: measured positions of some nodes.
         max_bytes: limit of a factor of the normal equations; above, UnsolvableError.
     """
+    graph = measured.graph
     plan = plan_refinement(_join(graph, anchors), max_bytes)
     if plan is None:
         raise UnsolvableError(
@@ -64,7 +63,7 @@ def refine_anchored(
             f"{max_bytes / 1e6:.0f} MB allowed for one; allow more, or leave this refinement out"
         )
     factor = allocate_normal(plan, graph.dimension)
-    terms = _AnchoredTerms(graph, information_at(graph, metric, levels), anchors)
+    terms = _AnchoredTerms(graph, information_at(measured, levels), anchors)
     t, damping = start, DAMPING.first
     for _ in range(_MAX_STEPS):
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)

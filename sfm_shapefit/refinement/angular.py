@@ -25,15 +25,16 @@ with angles in place of its chords; the kernel and its graduation: Yang, Antonan
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import median_spread, tangent_bases
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.scipy_parts import chdtri
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
@@ -54,6 +55,9 @@ KERNEL_WIDTH = 3.0
 DAMPING = DampingRange()
 """Damping of the steps, relative to the damping matrix of `AngularTerms`."""
 
+ALIKE = 1e-6
+"""Relative difference of costs; closer ones are those of the same place."""
+
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 # On exact data a smaller level would reject pairs for their rounding.
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH
@@ -65,20 +69,10 @@ _CONVERGED = 1e-9  # relative decrease of the cost; a smaller one counts as none
 _STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the nodes counts as none
 # Likewise by level, where a step is dear: noise of a level moves the nodes of boxes of 1e4 by .03 of it.
 _STILL_PER_LEVEL = 1e-3
-_ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
 _HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
 _FARTHEST = 1e6  # median spreads; of nodes farther out the others are one point, whose shape is rounded away
 _MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
 _MAX_FLOPS = 1e10  # operations of one factorization in blocks; they take a third of a second per step
-
-
-class Metric(NamedTuple):
-    """What a residual is judged by."""
-
-    covariance: FloatArray | None
-    """(m, d - 1, d - 1) covariances in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
-    classes: IntArray
-    """(m,) the class of each pair, 0, 1, ...; each has a level of its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,9 +104,8 @@ def plan_refinement(
 
 
 def refine_angles(
-    graph: ViewGraph,
+    measured: MeasuredGraph,
     start: FloatArray,
-    metric: Metric,
     plan: SymbolicFactor | LaplacianFactor,
     other: FloatArray | None = None,
 ) -> AngularResult:
@@ -122,26 +115,26 @@ def refine_angles(
     found.
 
     Args:
-        graph: a connected view graph.
+        measured: a connected view graph; each of its classes of directions has a level of its own.
         start: (n, d) locations; their scale does not matter.
-        metric: covariance and class of each pair.
         plan: from `plan_refinement`; or memory for a factor, such as that over groups, in which case
             locations are and stay those of the groups.
         other: (n, d) refined locations of the other start; once the levels have settled, the refinement ends
             where it has come as low as these, and where it clearly cannot.
     """
-    factor, spread = allocate_normal(plan, graph.dimension), _spread(graph, metric)
-    first = _unit(start)
-    other = None if other is None else _unit(other)
+    graph, classes = measured.graph, measured.classes
+    factor, spread = allocate_normal(plan, graph.dimension), _spread(measured)
+    first = unit_norm(start)
+    other = None if other is None else unit_norm(other)
     t, damping, steps = first, DAMPING.first, 0
     still = _STILL_PER_LEVEL if isinstance(plan, IterativeNormal) else 0.0
     moves_singly = isinstance(plan, SymbolicFactor | IterativeNormal)
-    levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
+    levels = np.full(int(classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
-        lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
+        lower = np.clip(residual_levels(measured, t, levels), levels / 2.0, levels)
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
-        information = _information(graph, spread, levels[metric.classes])
+        information = _information(graph, spread, levels[classes])
         terms = AngularTerms(graph, information, steep=not settled)
         moved, damping, before, after = take_angular_step(terms, factor, t, damping)
         is_still = (
@@ -152,7 +145,7 @@ def refine_angles(
             break
         if settled and other is not None and _is_decided(before, after, terms.cost(other)):
             break
-    terms = AngularTerms(graph, _information(graph, spread, levels[metric.classes]))
+    terms = AngularTerms(graph, _information(graph, spread, levels[classes]))
     cost, first_cost = terms.cost(t), terms.cost(first)
     if first_cost < cost:
         t, cost = first, first_cost
@@ -161,12 +154,12 @@ def refine_angles(
 
 def _is_decided(before: float, after: float, other_cost: float) -> bool:
     """Whether a cost has reached another, or stays above it even if it falls many times as much again."""
-    return abs(after - other_cost) <= _ALIKE * other_cost or after - other_cost > _HOPELESS * (before - after)
+    return abs(after - other_cost) <= ALIKE * other_cost or after - other_cost > _HOPELESS * (before - after)
 
 
-def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
+def robust_cost(measured: MeasuredGraph, locations: FloatArray, levels: FloatArray) -> float:
     """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 by weight; levels in radians."""
-    return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
+    return AngularTerms(measured.graph, information_at(measured, levels)).cost(unit_norm(locations))
 
 
 class AngularTerms:
@@ -194,7 +187,7 @@ class AngularTerms:
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step from t."""
-        return _unit(t + step)
+        return unit_norm(t + step)
 
     def _arguments(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float, bool]:
         """Return what the kernels take: baselines, v, w, M, the floor under |d|, and which kernel."""
@@ -230,48 +223,48 @@ def take_angular_step(
     return moved, damping, before, after
 
 
-def fitting_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
+def fitting_pairs(measured: MeasuredGraph, locations: FloatArray, levels: FloatArray) -> BoolArray:
     """Return which pairs fit locations (n, d), (m,): those of chi2 below k^2 at the level of each class."""
-    information = information_at(graph, metric, levels)
-    residuals = _residuals(graph, _unit(locations))
+    information = information_at(measured, levels)
+    residuals = _residuals(measured.graph, unit_norm(locations))
     chi2 = np.einsum("ea,eab,eb->e", residuals, information, residuals)
     return np.asarray(chi2 < KERNEL_WIDTH**2)
 
 
-def residual_levels(
-    graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray
-) -> FloatArray:
+def residual_levels(measured: MeasuredGraph, locations: FloatArray, levels: FloatArray) -> FloatArray:
     """Return each class's level: median residual, own covariances included, inside the present kernel."""
+    graph, classes = measured.graph, measured.classes
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
     unknowns = graph.dimension * (graph.num_nodes - 1) - 1
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
     median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # with unit variance per axis
-    chords = np.linalg.norm(_residuals(graph, _unit(locations)), axis=1)
+    chords = np.linalg.norm(_residuals(graph, unit_norm(locations)), axis=1)
     new_levels = np.empty_like(levels)
     for c, level in enumerate(levels):
-        class_chords = chords[metric.classes == c]
+        class_chords = chords[classes == c]
         inside = class_chords[class_chords < KERNEL_WIDTH * level]
         few = len(inside) < _LEAST_SHARE * len(class_chords) or len(class_chords) == 0
         new_levels[c] = level if few else np.median(inside) / median_length
     return np.maximum(new_levels, _LEAST_LEVEL_RAD)
 
 
-def information_at(graph: ViewGraph, metric: Metric, levels: FloatArray) -> FloatArray:
+def information_at(measured: MeasuredGraph, levels: FloatArray) -> FloatArray:
     """Return M_e, (m, d, d), at the level of each class, (number of classes,) in radians."""
-    return _information(graph, _spread(graph, metric), levels[metric.classes])
+    return _information(measured.graph, _spread(measured), levels[measured.classes])
 
 
-def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] | None:
+def _spread(measured: MeasuredGraph) -> tuple[FloatArray, FloatArray] | None:
     """Return the axes (m, d, d - 1) and variances (m, d - 1) of each direction; None if all are unknown.
 
     A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
     """
-    if metric.covariance is None:
+    covariance = measured.covariance
+    if covariance is None:
         return None
-    finite = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
-    variances, axes = np.linalg.eigh(np.where(finite.reshape(-1, 1, 1), metric.covariance, 0.0))
-    return np.asarray(tangent_bases(graph.directions) @ axes), np.maximum(variances, 0.0)
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(finite.reshape(-1, 1, 1), covariance, 0.0))
+    return np.asarray(tangent_bases(measured.graph.directions) @ axes), np.maximum(variances, 0.0)
 
 
 def _information(
@@ -286,8 +279,8 @@ def _information(
     return information
 
 
-def _unit(t: FloatArray) -> FloatArray:
-    """Return the locations centered and of unit norm."""
+def unit_norm(t: FloatArray) -> FloatArray:
+    """Return locations (n, d) centered and of unit norm."""
     centered = t - t.mean(axis=0)
     return np.asarray(centered / np.sqrt(np.sum(centered * centered)))
 
@@ -299,7 +292,7 @@ def _within_reach(t: FloatArray) -> FloatArray:
     farthest = _FARTHEST * float(np.median(distances))
     if farthest == 0.0 or distances.max() <= farthest:
         return t
-    return _unit(about * np.minimum(1.0, farthest / np.maximum(distances, farthest)))
+    return unit_norm(about * np.minimum(1.0, farthest / np.maximum(distances, farthest)))
 
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:

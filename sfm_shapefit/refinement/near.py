@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.refinement.angular import Metric, residual_levels
+from sfm_shapefit.refinement.angular import residual_levels
 from sfm_shapefit.refinement.consensus import fit_mixture
 from sfm_shapefit.refinement.starts import OPENING_RAD, RefinedPlacement
 from sfm_shapefit.solver.options import SolverResult
@@ -24,21 +24,17 @@ def stay_near(
 ) -> RefinedPlacement:
     """Return the locations of cameras that an adjustment has placed, and points where their rays meet.
 
-    Args:
-        measured: a piece.
-        solved: its certified solution.
-        centers: (k, 3) adjusted centers of its cameras, in any scale and from any origin, in the same axes.
-        first: the placement that was adjusted.
+    The centers (k, 3) are those of the cameras of a piece whose certified solution is given, in any scale and
+    from any origin, in the same axes; `first` is the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]
     cap = _CAP_OF_SIZE * median_spread(there)
     locations = solved.locations.copy()
     locations[: len(centers)] = fit_similarity_l1(centers, there, rotate=False, cap=cap).apply(centers)
     locations = normalize_locations(graph, follow_cameras(measured, locations))
-    metric = Metric(measured.covariance, measured.classes)
-    levels = np.full(int(metric.classes.max()) + 1, OPENING_RAD)
+    levels = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
     for _ in range(_ROUNDS):
-        levels = residual_levels(graph, locations, metric, levels)
+        levels = residual_levels(measured, locations, levels)
     return replace(
         first,
         locations=locations,

@@ -21,16 +21,17 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.angular import (
+    ALIKE,
     AngularResult,
-    Metric,
     fitting_pairs,
     plan_refinement,
     refine_angles,
     residual_levels,
     robust_cost,
+    unit_norm,
 )
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
-from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture
+from sfm_shapefit.refinement.consensus import ResidualMixture, fit_mixture, own_variances
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.refinement.reweighted import POOR_SHARE, Reweighted, can_be_reweighted, solve_reweighted
@@ -136,14 +137,8 @@ class _Problem(NamedTuple):
     """What the starts of a graph are refined on."""
 
     measured: MeasuredGraph
-    metric: Metric
     normal_solver: SymbolicFactor | LaplacianFactor | None
     """What the refinement solves its steps with; None where the starts are not refined."""
-
-    @property
-    def graph(self) -> ViewGraph:
-        """The view graph."""
-        return self.measured.graph
 
 
 def refine_starts(
@@ -158,9 +153,9 @@ def refine_starts(
         options: which starts, and whether to refine.
         certified: compute the bound of the second start, too, where that takes little.
     """
-    graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
+    graph = measured.graph
     lud, second = _find_second_start(measured, options.solver.num_threads(), certified)
-    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
+    problem = _Problem(measured, _plan_normal_solver(measured, options) if options.refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
     is_iterative = isinstance(problem.normal_solver, IterativeNormal)
@@ -181,8 +176,8 @@ def refine_starts(
     for name, locations in candidates:
         fallback = locations if second is None else second
         starts.append(_refine_start(refining, name, locations, fallback, starts[0].best if starts else None))
-    levels = _common_levels(problem, starts)
-    costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
+    levels = _common_levels(measured, starts)
+    costs = {start.name: robust_cost(measured, start.best, levels) for start in starts}
     chosen, reason = _choose(graph, starts, costs, apart, options)
     if problem.normal_solver is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
@@ -193,7 +188,7 @@ def refine_starts(
         chosen, reason = _start_of(reweighted), _explain(usual, reweighted)
         if reweighted.refined is not None:
             levels = np.minimum(levels, reweighted.refined.levels_rad)
-        costs[chosen.name] = robust_cost(graph, chosen.best, metric, levels)
+        costs[chosen.name] = robust_cost(measured, chosen.best, levels)
     moved = _measure_moves(chosen)
     # To the bit: the certificate is that of these very locations.
     is_as_solved = chosen.locations is solved.locations and moved[1] == 0.0
@@ -206,7 +201,7 @@ def refine_starts(
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=moved,
-        num_turned_pairs=_count_turned_pairs(problem, chosen, levels),
+        num_turned_pairs=_count_turned_pairs(measured, chosen, levels),
         reset_nodes=chosen.reset_nodes,
         lud=lud,
         posterior=(usual if reweighted is None else reweighted.mixture).posterior,
@@ -225,8 +220,8 @@ def _reweight(
         return None
 
     def refine(graph: ViewGraph, locations: FloatArray, fallback: FloatArray) -> AngularResult:
-        refined = refine_angles(graph, locations, problem.metric, solver)
-        return _reset_strays(problem._replace(measured=replace(measured, graph=graph)), fallback, refined)[0]
+        weighted = replace(measured, graph=graph)
+        return _reset_strays(weighted, fallback, refine_angles(weighted, locations, solver))[0]
 
     return solve_reweighted(measured, usual, options.solver.at_scale(measured.graph.num_edges), refine)
 
@@ -277,14 +272,14 @@ def _find_second_start(
         lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=resources)
         is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
         return (lud, lud.locations) if is_usable else (None, None)
-    metric, opening = Metric(None, classes), np.full(classes.max() + 1, OPENING_RAD)
+    bare, opening = replace(measured, covariance=None), np.full(classes.max() + 1, OPENING_RAD)
     rigid, candidates = Resources(factor=Reduction.over(graph.edges, groups.normalize())), []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
         weighted = _weight_points(graph, classes, point_weight)
         with suppress(UnsolvableError):
             found = solve_lud(weighted, _GROUP_LUD_STEPS, certified=False, resources=rigid).locations
             if np.isfinite(found).all() and projected_length(graph, found) > 0.0:
-                candidates.append((robust_cost(graph, found, metric, opening), found))
+                candidates.append((robust_cost(bare, found, opening), found))
     return None, min(candidates, key=lambda pair: pair[0])[1] if candidates else None
 
 
@@ -332,57 +327,51 @@ def _refine_start(
     as_solved = Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
     if problem.normal_solver is None:
         return as_solved
-    refined = refine_angles(problem.graph, locations, problem.metric, problem.normal_solver, other)
-    refined, nodes = _reset_strays(problem, fallback, refined)
-    if projected_length(problem.graph, refined.locations) <= 0.0:
+    refined = refine_angles(problem.measured, locations, problem.normal_solver, other)
+    refined, nodes = _reset_strays(problem.measured, fallback, refined)
+    if projected_length(problem.measured.graph, refined.locations) <= 0.0:
         return as_solved
     return replace(as_solved, refined=refined, reset_nodes=nodes)
 
 
 def _reset_strays(
-    problem: _Problem, fallback: FloatArray, refined: AngularResult
+    measured: MeasuredGraph, fallback: FloatArray, refined: AngularResult
 ) -> tuple[AngularResult, IntArray]:
     """Return a refinement with lone strays reset, or all nodes where that fits better, and the strays."""
-    graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
-    agreeing = fitting_pairs(graph, refined.locations, metric, levels)
-    nodes = find_strays(graph, fallback, refined.locations, agreeing, _noise(metric, levels))
-    if problem.measured.groups is not None:
-        group_of = problem.measured.groups.group_of
+    levels = refined.levels_rad
+    agreeing = fitting_pairs(measured, refined.locations, levels)
+    nodes = find_strays(measured.graph, fallback, refined.locations, agreeing, _noise(measured, levels))
+    if measured.groups is not None:
+        group_of = measured.groups.group_of
         nodes = nodes[np.bincount(group_of)[group_of[nodes]] == 1]
     if len(nodes) == 0:
         return refined, nodes
-    locations = _normalize(put_back(fallback, refined.locations, nodes))
-    cost, fallback_cost = (robust_cost(graph, t, metric, levels) for t in (locations, fallback))
+    locations = unit_norm(put_back(fallback, refined.locations, nodes))
+    cost, fallback_cost = (robust_cost(measured, t, levels) for t in (locations, fallback))
     if fallback_cost < cost:
-        return replace(refined, locations=_normalize(fallback), cost=fallback_cost), nodes
+        return replace(refined, locations=unit_norm(fallback), cost=fallback_cost), nodes
     return replace(refined, locations=locations, cost=cost), nodes
 
 
-def _noise(metric: Metric, levels: FloatArray) -> FloatArray:
+def _noise(measured: MeasuredGraph, levels: FloatArray) -> FloatArray:
     """Return the standard deviation of each direction (m,), per axis, radians."""
-    variances = levels[metric.classes] ** 2
-    if metric.covariance is not None:
-        covariances = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
-        variances = variances + np.trace(covariances, axis1=1, axis2=2) / covariances.shape[1]
-    return np.asarray(np.sqrt(variances))
+    return np.asarray(np.sqrt(levels[measured.classes] ** 2 + own_variances(measured)))
 
 
-def _count_turned_pairs(problem: _Problem, chosen: Start, levels: FloatArray) -> int:
+def _count_turned_pairs(measured: MeasuredGraph, chosen: Start, levels: FloatArray) -> int:
     """Return how many pairs the refinement made fit, or not fit any more."""
     if chosen.refined is None:
         return 0
-    before, after = (
-        fitting_pairs(problem.graph, t, problem.metric, levels) for t in (chosen.locations, chosen.best)
-    )
+    before, after = (fitting_pairs(measured, t, levels) for t in (chosen.locations, chosen.best))
     return int(np.sum(before != after))
 
 
-def _common_levels(problem: _Problem, starts: list[Start]) -> FloatArray:
+def _common_levels(measured: MeasuredGraph, starts: list[Start]) -> FloatArray:
     """Return the levels at which costs are compared: the smallest of each class that a start ended with."""
     ended = [start.refined.levels_rad for start in starts if start.refined is not None]
     if not ended:
-        opening = np.full(int(problem.metric.classes.max()) + 1, OPENING_RAD)
-        ended = [residual_levels(problem.graph, start.locations, problem.metric, opening) for start in starts]
+        opening = np.full(int(measured.classes.max()) + 1, OPENING_RAD)
+        ended = [residual_levels(measured, start.locations, opening) for start in starts]
     return np.asarray(np.min(ended, axis=0))
 
 
@@ -407,7 +396,7 @@ def _choose(
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
         return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
-    name = "LUD" if difference < 0.0 else "ShapeFit"
+    name = "LUD" if difference < -ALIKE * costs["ShapeFit"] else "ShapeFit"  # not as rounding has it
     if apart <= COLLAPSED:
         reason = f"the starts' lengths differ by {apart:.0%}, not by a collapse; {name} fits no worse"
     elif abs(difference) <= _TIE * min(costs.values()):
@@ -420,14 +409,8 @@ def _choose(
     return by_name[name], reason
 
 
-def _normalize(t: FloatArray) -> FloatArray:
-    """Return locations (n, d) centered and of norm 1."""
-    centered = t - t.mean(axis=0)
-    return np.asarray(centered / np.linalg.norm(centered))
-
-
 def _measure_moves(chosen: Start) -> tuple[float, float]:
     """Return the median and the largest move by the refinement, see `RefinedPlacement.moved`."""
-    before, after = _normalize(chosen.locations), _normalize(chosen.best)
+    before, after = unit_norm(chosen.locations), unit_norm(chosen.best)
     moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
     return float(np.median(moved)), float(moved.max())

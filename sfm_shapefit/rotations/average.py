@@ -39,7 +39,7 @@ from sfm_shapefit.rotations.annealing import (
     refine_fully,
 )
 from sfm_shapefit.rotations.averaged import AveragedRotations
-from sfm_shapefit.rotations.averaging_kernels import cap_information, residual_squares
+from sfm_shapefit.rotations.averaging_kernels import residual_squares
 from sfm_shapefit.rotations.averaging_system import AveragingSystem, mean_eigenvalues, plan_system
 from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
 from sfm_shapefit.rotations.dual_certificate import DualCertificate, certify_rotations
@@ -82,8 +82,8 @@ def average_rotations(
 
     Source: see `rotations.annealing`, `rotations.averaging_uncertainty` and `rotations.dual_certificate`.
     """
-    given, n = check_pairs(pairs, rotations, information, weights, num_images)
-    if n == 1:
+    given = check_pairs(pairs, rotations, information, weights, num_images)
+    if given.num_cameras == 1:
         return _alone()
     return _choose(given, np.sqrt(given.supports), [np.ones(len(given.pairs), dtype=np.bool_)], threads)
 
@@ -96,8 +96,8 @@ def average_relative_rotations(
     sound, very_sound = relative.are_sound(), relative.are_sound(_VERY_SOUND)
     used = sound if sound.any() else np.ones(len(sound), dtype=np.bool_)
     part = relative.subset(used)
-    given, n = check_pairs(part.pairs, part.rotations, part.information, supports[used], num_images)
-    if n == 1:
+    given = check_pairs(part.pairs, part.rotations, part.information, supports[used], num_images)
+    if num_images == 1:
         return _alone()
     # The votes in the order of the checked pairs.
     order = np.lexsort(np.sort(part.pairs, axis=1).T[::-1])
@@ -248,8 +248,8 @@ def check_pairs(
     information: npt.ArrayLike | None,
     weights: npt.ArrayLike | None,
     num_images: int | None,
-) -> tuple[AveragingPairs, int]:
-    """Return the pairs with i < j in ascending order, and the number of images, or raise InputError."""
+) -> AveragingPairs:
+    """Return the pairs with i < j in ascending order, or raise InputError."""
     joined = np.asarray(pairs)
     if joined.size and (joined.ndim != 2 or joined.shape[1] != 2 or joined.dtype.kind not in "iu"):
         raise InputError(f"pairs must be an integer array (k, 2), got {joined.dtype} of shape {joined.shape}")
@@ -272,45 +272,27 @@ def check_pairs(
         known = _numbers("information", information, (k, 3, 3))
         size = np.abs(known).max(axis=(1, 2), initial=0.0)
         skew = np.abs(known - known.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-        definite = _are_definite(known) & (skew <= _ROTATION_TOLERANCE * size)
+        minors = [np.linalg.det(known[:, :order, :order]) for order in (1, 2, 3)]
+        definite = (np.min(minors, axis=0) > 0.0) & (skew <= _ROTATION_TOLERANCE * size)
         _refuse(~definite, joined, "has information that is not symmetric and positive definite")
     ends = np.sort(joined, axis=1)
     order = np.lexsort(ends.T[::-1])
     repeated = np.zeros(k, dtype=np.bool_)
     repeated[order[1:]] = (np.diff(ends[order], axis=0) == 0).all(axis=1)
     _refuse(repeated, joined, "is given twice; join what its matches say before")
-    return _ordered(joined, measured, known, supports, n)
-
-
-def _are_definite(blocks: FloatArray) -> BoolArray:
-    """Return which symmetric 3 x 3 blocks are positive definite: whose pivots are positive."""
-    (a, b, c), (_, d, e), (_, _, f) = blocks.transpose(1, 2, 0)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        second, beside = d - b * b / a, e - b * c / a
-        third = f - c * c / a - beside * beside / second
-    return np.asarray((a > 0.0) & (second > 0.0) & (third > 0.0))
-
-
-def _ordered(
-    pairs: IntArray, rotations: FloatArray, information: FloatArray, supports: FloatArray, num_images: int
-) -> tuple[AveragingPairs, int]:
-    """Return checked pairs, turned to i < j (R^T, -R^T w), ascending, capped; and the number of images."""
-    turned = pairs[:, 0] > pairs[:, 1]
-    back = rotations[turned].transpose(0, 2, 1)
-    rotations, information, pairs = rotations.copy(), information.copy(), np.sort(pairs, axis=1)
-    information[turned] = back @ information[turned] @ back.transpose(0, 2, 1)
-    rotations[turned] = back
-    order = np.lexsort(pairs.T[::-1])
-    capped = np.empty((len(order), 3, 3))
-    cap_information(np.ascontiguousarray(information[order]), float(_FLOOR) ** 2, capped)
-    given = AveragingPairs(
-        num_cameras=num_images,
-        pairs=np.ascontiguousarray(pairs[order]),
-        measured=quaternions_of(rotations[order]),
-        information=capped,
+    # A pair turned round is R^T, and its error -R^T w.
+    back = measured.transpose(0, 2, 1)
+    turned = (joined[:, 0] > joined[:, 1])[:, None, None]
+    known = np.where(turned, back @ known @ measured, known)[order]
+    # (H^-1 + v I)^-1, which needs no inverse of H.
+    capped = known @ np.linalg.inv(np.eye(3) + float(_FLOOR) ** 2 * known)
+    return AveragingPairs(
+        num_cameras=n,
+        pairs=np.ascontiguousarray(ends[order]),
+        measured=quaternions_of(np.where(turned, back, measured)[order]),
+        information=0.5 * (capped + capped.transpose(0, 2, 1)),
         supports=np.ascontiguousarray(supports[order]),
     )
-    return given, num_images
 
 
 def _numbers(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:

@@ -90,8 +90,7 @@ def reweigh_pairs(
 ) -> None:
     """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and the gradient D^T W x (n, 3)."""
     x = np.empty(3)
-    for i in range(len(gradient)):
-        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    gradient[:] = 0.0
     for e in range(len(pairs)):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
@@ -135,17 +134,14 @@ def weigh_blocks(
     Pairs whose residual angle is beyond `limit`, in radians, have the length NaN and the block 0.
     """
     x, r, hr, hx, half = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(4)
-    for i in range(len(gradient)):
-        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    gradient[:] = 0.0
     for e in range(len(pairs)):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
         block = blocks[e]
         if square > limit * limit:
             distances[e] = np.nan
-            for a in range(3):
-                for b in range(3):
-                    block[a, b] = 0.0
+            block[:] = 0.0
             continue
         for a in range(4):
             half[a] = turns[j, a]
@@ -213,41 +209,6 @@ def apply_blocks(pairs: Any, blocks: Any, ridge: float, x: Any, out: Any) -> Non
             pulled = b[a, 0] * d0 + b[a, 1] * d1 + b[a, 2] * d2
             out[i, a] += pulled
             out[j, a] -= pulled
-
-
-@kernel
-def sum_blocks(pairs: Any, blocks: Any, diagonal: Any) -> None:
-    """Add the block of each pair, (k, b, b), to the blocks of its two nodes, (n, b, b)."""
-    for e in range(len(pairs)):
-        for end in range(2):
-            i = pairs[e, end]
-            for a in range(blocks.shape[1]):
-                for b in range(blocks.shape[2]):
-                    diagonal[i, a, b] += blocks[e, a, b]
-
-
-@kernel
-def cap_information(information: Any, variance: float, out: Any) -> None:
-    """Fill (H^-1 + variance I)^-1 = H (I + variance H)^-1 for symmetric blocks (k, 3, 3)."""
-    for e in range(len(information)):
-        h = information[e]
-        a, b, c = 1.0 + variance * h[0, 0], variance * h[0, 1], variance * h[0, 2]
-        d, f, g = 1.0 + variance * h[1, 1], variance * h[1, 2], 1.0 + variance * h[2, 2]
-        # The adjugate of the symmetric I + variance H, and its determinant.
-        m00, m01, m02 = d * g - f * f, c * f - b * g, b * f - c * d
-        m11, m12, m22 = a * g - c * c, b * c - a * f, a * d - b * b
-        scale = 1.0 / (a * m00 + b * m01 + c * m02)
-        # H (I + v H)^-1 = (I - (I + v H)^-1) / v loses digits where v H is small; so multiply.
-        for row in range(3):
-            h0, h1, h2 = h[row, 0] * scale, h[row, 1] * scale, h[row, 2] * scale
-            out[e, row, 0] = h0 * m00 + h1 * m01 + h2 * m02
-            out[e, row, 1] = h0 * m01 + h1 * m11 + h2 * m12
-            out[e, row, 2] = h0 * m02 + h1 * m12 + h2 * m22
-        for row in range(3):
-            for column in range(row):
-                mean = 0.5 * (out[e, row, column] + out[e, column, row])
-                out[e, row, column] = mean
-                out[e, column, row] = mean
 
 
 @kernel

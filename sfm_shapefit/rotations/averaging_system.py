@@ -13,19 +13,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import (
     JacobiPreconditioner,
     Preconditioner,
     approximate_cholesky,
     conjugate_gradients,
+    diagonal_suffices,
 )
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
-from sfm_shapefit.rotations.averaging_kernels import apply_blocks, sum_blocks
+from sfm_shapefit.rotations.averaging_kernels import apply_blocks
 
 RIDGE = 1e-9
 """Share of the mean diagonal that is added to it; holds cameras whose pairs are all left out."""
@@ -95,6 +96,11 @@ class AveragingSystem:
 
         return apply
 
+    def sum_at_nodes(self, blocks: FloatArray) -> FloatArray:
+        """Return the sums (n, b, b) of the blocks (k, b, b) of the pairs at their two nodes."""
+        rows = np.repeat(blocks.reshape(len(blocks), -1), 2, axis=0)
+        return sum_by(self.pairs.ravel(), rows, self.num_nodes).reshape(-1, *blocks.shape[1:])
+
     def ground_blocks(self, blocks: FloatArray) -> CholeskyFactor:
         """Return the factor of the Laplacian of blocks without ridge, grounded at its last node."""
         factor = self._factor_of(3)
@@ -115,9 +121,7 @@ class AveragingSystem:
     def _refactor(self, blocks: FloatArray) -> None:
         """Factor the matrix of blocks (k, b, b); UnsolvableError if it is not positive definite."""
         b = blocks.shape[1]
-        factor = self._factor_of(b)
-        diagonal = np.zeros((self.num_nodes, b, b))
-        sum_blocks(self.pairs, blocks, diagonal)
+        factor, diagonal = self._factor_of(b), self.sum_at_nodes(blocks)
         own = diagonal[:, range(b), range(b)]
         diagonal[:, range(b), range(b)] += RIDGE * own.mean()
         if not factor.refactor_blocks(self.pairs, diagonal, -blocks):
@@ -170,7 +174,7 @@ def plan_system(num_nodes: int, pairs: IntArray, weights: FloatArray, threads: i
     most = max(_FEW_FLOPS, _FLOPS_PER_PAIR * len(pairs))
     plan, jacobi = None, False
     if num_nodes > _MANY_NODES:
-        jacobi = _diagonal_suffices(graph, weights, threads)
+        jacobi = diagonal_suffices(LaplacianOperator(graph, weights, Workers(threads)), _JACOBI_STEPS)
         # As on boxes of 1e4 and 1e5 cameras.
         hopeless = jacobi or 4.0 * (0.75 * widest_level(graph)) ** 3 > 10.0 * most
     else:
@@ -181,14 +185,6 @@ def plan_system(num_nodes: int, pairs: IntArray, weights: FloatArray, threads: i
             plan = plan_factorization(graph, pairs, tree)
     factors_blocks = plan is not None and _BLOCK_FLOPS * plan.flops <= most
     return AveragingSystem(num_nodes, pairs, plan, factors_blocks, jacobi, threads, graph)
-
-
-def _diagonal_suffices(graph: Adjacency, weights: FloatArray, threads: int) -> bool:
-    """Return whether the diagonal is so good a preconditioner as only expanders have it."""
-    operator = LaplacianOperator(graph, weights, Workers(threads))
-    probe = np.random.default_rng(_SEED).normal(size=(graph.num_nodes, 3))
-    jacobi = JacobiPreconditioner(operator.diagonal())
-    return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
 
 
 def mean_eigenvalues(blocks: FloatArray) -> FloatArray:

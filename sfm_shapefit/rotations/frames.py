@@ -12,7 +12,7 @@ Images need no pair inside their frame: sensors that look opposite ways are tied
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, sum_by
 from sfm_shapefit.base.geometry import rotation_angles_deg
 from sfm_shapefit.base.quaternions import rotation_vectors, rotations_of
 from sfm_shapefit.pairs.relative_rotations import AGREEMENT_DEG, RelativeRotations
@@ -61,8 +61,8 @@ def _join(several: RelativeRotations) -> RelativeRotations:
     agreeing = rotation_angles_deg(off) <= AGREEMENT_DEG
     weight = np.where(agreeing[:, None, None], ordered.information, 0.0)
     vectors = rotation_vectors(off)
-    information = _sums(weight, group, len(pairs))
-    pull = _sums(np.einsum("kab,kb->ka", weight, vectors), group, len(pairs))
+    information = sum_by(group, weight.reshape(-1, 9), len(pairs)).reshape(-1, 3, 3)
+    pull = sum_by(group, np.einsum("kab,kb->ka", weight, vectors), len(pairs))
     turns = np.linalg.solve(information, pull[:, :, None])[:, :, 0]
     counts = np.where(agreeing, ordered.num_matches, 0)
     num_matches = np.bincount(group, counts, len(pairs)).astype(np.int64)
@@ -73,10 +73,3 @@ def _join(several: RelativeRotations) -> RelativeRotations:
         num_matches=num_matches,
         weight_shares=np.bincount(group, counts * ordered.weight_shares, len(pairs)) / num_matches,
     )
-
-
-def _sums(values: FloatArray, group: IntArray, count: int) -> FloatArray:
-    """Return the sums of rows by group, (count, ...)."""
-    sums = np.zeros((count, *values.shape[1:]))
-    np.add.at(sums, group, values)
-    return sums

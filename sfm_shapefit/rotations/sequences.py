@@ -216,14 +216,14 @@ def _judge_visits(
     if len(loops.pairs) == 0:
         return [], refused
     times = np.sort(videos.time_of[loops.pairs], axis=1)
-    label = _group(times)
+    label, frames = _group(times), loops.pairs.ravel()
+    image_at = dict(zip(videos.time_of[frames].tolist(), frames.tolist(), strict=True))
     for visit in range(int(label.max()) + 1):
         rows = np.flatnonzero(label == visit)
         counts = loops.num_matches[rows]
         if 2 * counts[~refused[rows]].sum() <= counts.sum():
             refused[rows] = True
         ends = np.sort(times[rows], axis=0)[[0, -1]]
-        image_at = dict(zip(times[rows].ravel().tolist(), _by_time(videos, loops.pairs[rows]), strict=True))
         (a, b), (c, d) = ends.T.tolist()
         visits.append(
             Visit(
@@ -237,12 +237,6 @@ def _judge_visits(
             )
         )
     return sorted(visits, key=lambda visit: videos.time_of[list(visit.first)].tolist()), refused
-
-
-def _by_time(videos: Videos, pairs: IntArray) -> list[int]:
-    """Return the images of pairs, the earlier one of each first."""
-    times = videos.time_of[pairs]
-    return [int(k) for k in np.take_along_axis(pairs, np.argsort(times, axis=1), axis=1).ravel()]
 
 
 def _group(times: IntArray) -> IntArray:

@@ -21,8 +21,8 @@ from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
-from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_reduced, solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
 from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
 from sfm_shapefit.solver.reduction import Reduction

@@ -6,11 +6,12 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, Rig
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.solve import values_of
+from sfm_shapefit.scene.lens import Lens
 
 LENSES = {
     "SIMPLE_PINHOLE": (500.0, 320.0, 240.0),
@@ -50,7 +51,7 @@ def ring_problem(
     points = rng.uniform(-1.0, 1.0, (num_points, 3))
     rotations = look_at(centers, np.zeros((num_cameras, 3)))
     lenses = tuple(Lens(model, LENSES[model]) for model in models)
-    rig, count = None, num_cameras
+    rig, count = Rig.of_single_cameras(num_cameras), num_cameras
     if sensors:
         count = num_cameras * sensors
         turns = Rotation.from_rotvec(0.1 * rng.standard_normal((sensors, 3))).as_matrix()
@@ -58,6 +59,7 @@ def ring_problem(
             frame_of_camera=np.repeat(np.arange(num_cameras), sensors),
             rotations=np.tile(turns, (num_cameras, 1, 1)),
             translations=np.tile(offset * rng.standard_normal((sensors, 3)), (num_cameras, 1)),
+            free_sensor_of_camera=np.full(count, -1),
         )
     cameras, seen = np.nonzero(rng.random((count, num_points)) < share)
     problem = AdjustmentProblem(
@@ -78,7 +80,7 @@ def ring_problem(
 
 def disturb(problem, rng, center=0.05, rotation_rad=0.01, point=0.03):
     """Return the problem started elsewhere; fixed frames stay."""
-    moves = ~problem.is_fixed()
+    moves = ~problem.fixed
     n = problem.num_frames
     turns = Rotation.from_rotvec(rotation_rad * rng.standard_normal((n, 3)) * moves[:, None]).as_matrix()
     return replace(
@@ -140,8 +142,10 @@ def rig_problem_of(reconstruction):
         frame_of_camera=frame_of_camera,
         rotations=turns,
         translations=np.einsum("cab,cb->ca", plain.rotations, arms),
+        free_sensor_of_camera=np.full(len(images), -1),
     )
-    return replace(plain, rotations=rotations, centers=centers, rig=rig), frames
+    fixed = np.zeros(len(frames), np.bool_)
+    return replace(plain, rotations=rotations, centers=centers, rig=rig, fixed=fixed), frames
 
 
 def _lens(camera):

@@ -9,34 +9,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    AdjustmentProblem,
-    Ending,
-    Lens,
-    LensPrior,
-    Rig,
-    RotationPrior,
-    adjust,
-    estimate_covariances,
-    frames_not_gained,
-    isotropic_information,
-    reduced_factor,
-    reprojection_errors_px,
-)
+from sfm_shapefit.adjustment import reduced_factor
 from sfm_shapefit.adjustment import solve as adjustment_solve
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, LensPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
 from sfm_shapefit.adjustment.run import _without_lone_frames
+from sfm_shapefit.adjustment.solve import Ending, adjust, frames_not_gained, reprojection_errors_px, values_of
 from sfm_shapefit.adjustment.solve import linearize_all as every
-from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.tracks.triangulation import TriangulatedPoints
 from tests.adjustment.made import LENSES, disturb, look_at, observed, ring_problem
 
@@ -181,18 +171,6 @@ def test_a_rig_knows_its_scale():
     fit = fit_similarity(found.centers, truth.centers)
     assert fit.scale == pytest.approx(1.0, abs=0.01)  # the start is 10 % too large
     assert error(found, truth) < 0.1 * error(start, truth)
-
-
-def test_a_rig_of_one_sensor_at_its_origin_is_a_camera():
-    _, start = make_start()
-    n = start.num_frames
-
-    rig = Rig(
-        frame_of_camera=np.arange(n), rotations=np.tile(np.eye(3), (n, 1, 1)), translations=np.zeros((n, 3))
-    )
-    np.testing.assert_array_equal(
-        adjust(replace(start, rig=rig)).problem.centers, adjust(start).problem.centers
-    )
 
 
 def edge_px(lens):
@@ -364,22 +342,13 @@ def test_points_of_one_view_do_no_harm():
     np.testing.assert_allclose(found.centers, expected.centers, atol=1e-6)
 
 
-def test_cancelling_keeps_the_best_values_so_far():
+def test_a_limit_of_iterations_keeps_the_best_values_so_far():
     _, start = make_start()
-    seen = []
-
-    def watch(step):
-        seen.append(step)
-        return np.bool_(len(seen) < 3)
-
-    found = adjust(start, TIGHT, on_iteration=watch)
-    assert found.ending is Ending.CANCELLED
-    assert not found.converged
-    assert found.iterations == len(seen) == 3
-    assert found.cost == seen[-1].cost < found.costs[0]
     limited = adjust(start, replace(TIGHT, max_iterations=3))
     assert limited.ending is Ending.MAX_ITERATIONS
-    np.testing.assert_array_equal(limited.problem.centers, found.problem.centers)
+    assert not limited.converged
+    assert limited.iterations == 3
+    assert limited.cost < limited.costs[0]
 
 
 def make_bent_row(num_cameras, bend):
@@ -455,26 +424,23 @@ def test_no_step_of_a_point_by_itself_raises_its_loss():
     assert (after <= before * (1.0 + 1e-12)).all()
 
 
-def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
+def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows(monkeypatch):
     truth, _ = make_start()
     start = disturb(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
-    steps = []
-    found = adjust(start, replace(TIGHT, loss_scale_px=None), on_iteration=steps.append)
-    refused = [k for k, step in enumerate(steps) if not step.accepted]
+    attempt, steps = adjustment_solve._Run.attempt, []
+
+    def watched(run, normal):
+        before, (predicted, accepted) = run.damping, attempt(run, normal)
+        steps.append((accepted, run.damping / before))
+        return predicted, accepted
+
+    monkeypatch.setattr(adjustment_solve._Run, "attempt", watched)
+    found = adjust(start, replace(TIGHT, loss_scale_px=None))
+    refused = [growth for accepted, growth in steps if not accepted]
     assert len(refused) > 5
-    assert all(steps[k].damping > steps[k - 1].damping for k in refused)
-    assert (np.diff([found.costs[0], *(step.cost for step in steps)]) <= 0.0).all()
+    assert min(refused) > 1.0
+    assert (np.diff(found.costs) < 0.0).all()
     assert found.ending is Ending.STALLED or found.gradient_norm < 1e-6
-
-
-def test_what_the_callback_raises_comes_through():
-    _, start = make_start()
-
-    def fail(step):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        adjust(start, TIGHT, on_iteration=fail)
 
 
 def test_no_observation_is_said():
@@ -492,7 +458,7 @@ def test_no_observation_is_said():
         ({"rotations": np.tile(np.diag([1.0, 1.0, -1.0]), (12, 1, 1))}, "orthonormal"),
         ({"points": np.zeros((3, 3))}, "point index"),
         ({"lens_of_camera": np.ones(12, np.int64)}, "lens index"),
-        ({"lens_of_camera": np.zeros(11, np.int64)}, "give a rig"),
+        ({"lens_of_camera": np.zeros(11, np.int64)}, "rig's arrays have shapes"),
         ({"fixed": np.zeros(3, np.bool_)}, "fixed has shape"),
         ({"points_seen": np.zeros(3, np.int64)}, "points_seen has shape"),
     ],

@@ -6,7 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit.adjustment import AdjustmentOptions, adjust, reprojection_errors_px
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.geometry import fit_similarity
 from tests.adjustment.made import adjust_by_pycolmap, disturb, problem_of, rig_problem_of, with_values
 from tests.scenes import BUNDLED, real_scene

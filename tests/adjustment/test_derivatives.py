@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import (
-    AdjustmentOptions,
-    LensPrior,
-    RotationPrior,
-    isotropic_information,
-)
 from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
+from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.priors import sum_priors
+from sfm_shapefit.adjustment.problem import LensPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals
 from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
 from sfm_shapefit.laplacian.operators import Workers

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentOptions, adjust, estimate_covariances
+from sfm_shapefit.adjustment.covariance import estimate_covariances
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.given_rotations import estimate_rotation_errors
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.solve import adjust
 from tests.adjustment.made import ring_problem
 
 OPTIONS = AdjustmentOptions(loss_scale_px=2.0)
@@ -52,9 +54,7 @@ def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_de
     problem, _ = turned_ring(sigma_deg, 0.2)
     turned = problem.rotations.copy()
     turned[5] = Rotation.from_rotvec(np.radians([0.5, -0.4, 0.3])).as_matrix() @ turned[5]
-    errors = estimate_rotation_errors(
-        problem.with_values(turned, problem.centers, problem.points, problem.lenses), OPTIONS
-    )
+    errors = estimate_rotation_errors(replace(problem, rotations=turned), OPTIONS)
     freedom = errors.decide(Freedom())
     own = np.degrees(freedom.pull_rad)
     assert not freedom.holds_rotations  # it would be held too
@@ -69,9 +69,8 @@ def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_de
 def test_a_common_turn_of_all_is_no_error():
     problem, _ = turned_ring(0.0, 0.2)
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
-    turned = problem.with_values(
-        problem.rotations @ turn.T, problem.centers @ turn.T, problem.points @ turn.T, problem.lenses
-    )
+    poses = {"rotations": problem.rotations @ turn.T, "centers": problem.centers @ turn.T}
+    turned = replace(problem, **poses, points=problem.points @ turn.T)
     assert estimate_rotation_errors(turned, OPTIONS).decide(Freedom()).holds_rotations
 
 

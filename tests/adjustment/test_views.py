@@ -10,10 +10,10 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.adjustment import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment import run as adjustment_run
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
+from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.geometry import fit_similarity
 from sfm_shapefit.files.colmap.points import points_of

@@ -267,7 +267,8 @@ def test_a_kernel_that_has_an_array_from_another_counts_references():
 INTERRUPTED = """
 import signal
 import numpy as np
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.graph.viewgraph import ViewGraph
 drawn = random_graph_problem(40, 0.5, d=3, sigma=0.1, q=0.3, seed=1)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment import Lens
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.facts.intrinsics import (
@@ -14,7 +13,7 @@ from sfm_shapefit.facts.intrinsics import (
     intrinsics_in_doubt,
     intrinsics_warnings,
 )
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import Lens, Origin
 
 
 def row(camera=1, decided_by="adjusted", given=1000.0, found=1100.0, sigma=5.0, num_images=4):

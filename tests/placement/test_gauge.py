@@ -19,6 +19,7 @@ from sfm_shapefit.base.geometry import Similarity, compose, invert, median_sprea
 from sfm_shapefit.facts.warnings import prior_warnings
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
@@ -32,7 +33,7 @@ from sfm_shapefit.placement.gauge import (
 )
 from sfm_shapefit.placement.prior_fit import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
-from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.refinement.angular import plan_refinement, refine_angles
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
@@ -433,15 +434,15 @@ def drive(sigma):
     v = normalized(exact + error * rng.standard_normal(exact.shape))
     graph = ViewGraph(n, edges, v)
     covariance = np.broadcast_to(error**2 * np.eye(2), (len(edges), 2, 2))
-    metric = Metric(covariance, np.zeros(len(edges), dtype=np.int64))
-    found = refine_angles(graph, truth, metric, plan_refinement(graph))
+    measured = MeasuredGraph(graph, covariance=covariance)
+    found = refine_angles(measured, truth, plan_refinement(graph))
     positions = truth + sigma * rng.standard_normal(truth.shape)
     gauge = prior_gauge(found.locations, priors_of(positions, sigma))
     start = gauge.similarity.apply(found.locations)
     if gauge.axes is not None:
         positions, truth = positions @ gauge.axes, truth @ gauge.axes
     anchors = KnownPositions(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
-    return (graph, start, metric, found.levels_rad), start, truth, anchors
+    return (measured, start, found.levels_rad), start, truth, anchors
 
 
 def test_a_model_with_a_datum_is_compared_with_latitudes_where_they_stand(ring, tmp_path):

@@ -1,15 +1,18 @@
 """The robust refinement in angles: as good as least squares on the right directions, exact on exact data."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
 from sfm_shapefit.base.geometry import median_spread, normalized, tangent_bases
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement.angular import (
     AngularTerms,
-    Metric,
+    information_at,
     plan_refinement,
     refine_angles,
     residual_levels,
@@ -25,14 +28,10 @@ def graph_of(problem: synthetic.GraphProblem, rows=slice(None)) -> ViewGraph:
     return ViewGraph(len(problem.locations), problem.edges[rows], problem.directions[rows])
 
 
-def one_class(graph: ViewGraph, covariance=None) -> Metric:
-    return Metric(covariance, np.zeros(graph.num_edges, dtype=np.int64))
-
-
-def refined(graph: ViewGraph, start, metric=None):
+def refined(graph: ViewGraph, start, covariance=None):
     plan = plan_refinement(graph)
     assert plan is not None
-    return refine_angles(graph, start, metric or one_class(graph), plan)
+    return refine_angles(MeasuredGraph(graph, covariance=covariance), start, plan)
 
 
 def shaken(problem: synthetic.GraphProblem, share: float, seed: int = 0):
@@ -102,9 +101,9 @@ def test_the_cost_is_never_above_the_start_at_the_final_levels(seed):
     start = np.random.default_rng(seed).standard_normal((30, 3))  # nothing fits
     for t in (start, problem.locations):
         found = refined(graph, t)
-        assert found.cost <= robust_cost(graph, t, one_class(graph), found.levels_rad)
+        assert found.cost <= robust_cost(MeasuredGraph(graph), t, found.levels_rad)
         assert found.cost == pytest.approx(
-            robust_cost(graph, found.locations, one_class(graph), found.levels_rad), rel=1e-12
+            robust_cost(MeasuredGraph(graph), found.locations, found.levels_rad), rel=1e-12
         )
 
 
@@ -141,8 +140,8 @@ def test_a_camera_without_any_pull_is_held_where_it_was():
     plan = plan_refinement(graph)
     assert plan is not None
     factor = angular.allocate_factor(plan, 3)
-    moved = angular.take_angular_step(terms, factor, angular._unit(far), angular.DAMPING.least)[0]
-    assert np.linalg.norm(moved - angular._unit(far), axis=1)[3] < 0.2
+    moved = angular.take_angular_step(terms, factor, angular.unit_norm(far), angular.DAMPING.least)[0]
+    assert np.linalg.norm(moved - angular.unit_norm(far), axis=1)[3] < 0.2
 
 
 def test_cameras_at_one_place_do_no_harm():
@@ -197,7 +196,7 @@ def contradicting_pair(sigma_of_right: float, sigma_of_bent: float):
 @pytest.mark.parametrize("sigmas", [(1e-3, 0.05), (0.05, 1e-3)])
 def test_a_pair_of_small_covariance_wins_over_one_of_large(sigmas):
     graph, covariance, t, moved = contradicting_pair(*sigmas)
-    found = refined(graph, t, one_class(graph, covariance)).locations
+    found = refined(graph, t, covariance).locations
     right, wrong = (t, moved) if sigmas[0] < sigmas[1] else (moved, t)
     assert shape_error(found, right) < 0.1 * shape_error(wrong, right)
 
@@ -206,12 +205,12 @@ def test_an_unknown_covariance_leaves_the_level_alone_to_speak():
     problem = synthetic.random_graph_problem(25, 0.6, sigma=0.01, q=0.1, seed=3)
     graph = problem.view_graph
     unknown = np.full((graph.num_edges, 2, 2), np.nan)
-    with_nan = refined(graph, problem.locations, one_class(graph, unknown))
+    with_nan = refined(graph, problem.locations, unknown)
     without = refined(graph, problem.locations)
     np.testing.assert_allclose(with_nan.locations, without.locations, atol=1e-12)
     partly = isotropic(0.01, graph)
     partly[0, 0, 1] = np.nan
-    assert np.isfinite(refined(graph, problem.locations, one_class(graph, partly)).locations).all()
+    assert np.isfinite(refined(graph, problem.locations, partly).locations).all()
 
 
 def test_the_metric_is_the_inverse_of_covariance_and_level():
@@ -219,8 +218,7 @@ def test_the_metric_is_the_inverse_of_covariance_and_level():
     graph = problem.view_graph
     a = np.random.default_rng(0).standard_normal((graph.num_edges, 2, 2))
     covariance = a @ a.transpose(0, 2, 1)
-    metric = one_class(graph, covariance)
-    information = angular._information(graph, angular._spread(graph, metric), np.full(graph.num_edges, 0.3))
+    information = information_at(MeasuredGraph(graph, covariance=covariance), np.array([0.3]))
     bases = angular.tangent_bases(graph.directions)
     inside = bases.transpose(0, 2, 1) @ information @ bases
     np.testing.assert_allclose(
@@ -238,14 +236,15 @@ def test_each_class_finds_its_own_level_and_keeps_it_while_it_is_not_fitted():
     noise = rng.standard_normal(problem.directions.shape)
     v = normalized(problem.directions + sigma[:, None] * noise)
     graph = ViewGraph(60, problem.edges, v)
-    found = refined(graph, problem.locations, Metric(None, classes))
+    measured = SimpleNamespace(graph=graph, covariance=None, classes=classes)
+    found = refine_angles(measured, problem.locations, plan_refinement(graph))
     # The median of 700 residuals scatters by 4 %; the share that the fit takes is even over classes only
     # roughly, as the sharp class does most of the fitting.
     assert found.levels_rad == pytest.approx([0.01, 0.001], rel=0.15)
     together = shape_error(refined(graph, problem.locations).locations, problem.locations)
     assert shape_error(found.locations, problem.locations) < 0.9 * together
     nowhere = rng.standard_normal((60, 3))
-    assert residual_levels(graph, nowhere, one_class(graph), np.array([0.01])) == pytest.approx(0.01)
+    assert residual_levels(MeasuredGraph(graph), nowhere, np.array([0.01])) == pytest.approx(0.01)
 
 
 def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
@@ -280,14 +279,12 @@ def test_a_scalar_factor_serves_until_the_weights_have_changed(monkeypatch):
 
 def test_the_answer_is_a_stationary_point_of_the_robust_cost():
     problem = synthetic.random_graph_problem(20, 0.9, sigma=0.02, q=0.15, seed=5)
-    graph = problem.view_graph
+    graph, measured = problem.view_graph, MeasuredGraph(problem.view_graph)
     found = refined(graph, shaken(problem, 0.05))
     scale = np.abs(found.locations).max()
 
     def slope(t, direction):
-        up, down = (
-            robust_cost(graph, t + h * direction, one_class(graph), found.levels_rad) for h in (1e-5, -1e-5)
-        )
+        up, down = (robust_cost(measured, t + h * direction, found.levels_rad) for h in (1e-5, -1e-5))
         return (up - down) / 2e-5
 
     rng = np.random.default_rng(0)
@@ -314,10 +311,8 @@ def test_a_direction_counts_in_its_own_metric():
     graph = ViewGraph(40, problem.edges, normalized(problem.directions + (bases @ off)[:, :, 0]))
     # The bases of the measured directions are turned by the error only: the same covariance holds in them.
     covariance = turn @ np.diag(axis**2) @ turn.transpose(0, 2, 1)
-    classes = np.zeros(len(angle), dtype=np.int64)
     start = shaken(problem, 0.02)
-    known = refined(graph, start, Metric(covariance, classes))
-    unknown = refined(graph, start, Metric(None, classes))
+    known, unknown = refined(graph, start, covariance), refined(graph, start)
     truth = problem.locations
     assert shape_error(known.locations, truth) < 0.8 * shape_error(unknown.locations, truth)
 
@@ -332,7 +327,7 @@ def test_origin_and_scale_of_the_start_do_not_matter_and_another_out_of_reach_en
     assert np.linalg.norm(plain.locations) == pytest.approx(1.0)
     np.testing.assert_allclose(plain.locations.mean(axis=0), 0.0, atol=1e-15)
     best = refined(graph, problem.locations)
-    again = refine_angles(graph, start, one_class(graph), plan, other=best.locations)
+    again = refine_angles(MeasuredGraph(graph), start, plan, other=best.locations)
     assert again.iterations <= plain.iterations
     assert angular._is_decided(before=100.0, after=99.0, other_cost=50.0)  # 50 above, falling by 1
     assert not angular._is_decided(before=120.0, after=99.0, other_cost=50.0)
@@ -346,11 +341,8 @@ def test_an_edge_of_weight_two_counts_as_two():
     heavy = ViewGraph(25, graph.edges, graph.directions, weights)
     levels = np.array([0.01])
     single = [
-        robust_cost(
-            ViewGraph(25, graph.edges[keep], graph.directions[keep]), problem.locations, metric, levels
-        )
+        robust_cost(MeasuredGraph(graph.subset(keep)), problem.locations, levels)
         for keep in (weights == 2.0, weights == 1.0)
-        for metric in [Metric(None, np.zeros(int(keep.sum()), dtype=np.int64))]
     ]
-    total = robust_cost(heavy, problem.locations, one_class(heavy), levels)
+    total = robust_cost(MeasuredGraph(heavy), problem.locations, levels)
     assert total == pytest.approx(2.0 * single[0] + single[1])

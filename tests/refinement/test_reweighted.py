@@ -44,9 +44,9 @@ def test_where_a_factor_is_dear_only_the_reweighted_start_is_refined(hopeless, m
     found = place(hopeless.view_graph)
     assert found.refined.start == "reweighted ShapeFit"
     assert shape_error(found.locations, hopeless.locations) < 1e-9
-    assert all(graph.weights.min() < 1.0 for graph in refined)
+    assert all(measured.graph.weights.min() < 1.0 for measured in refined)
     place(corrupted(0.1, sigma=0.01).view_graph)
-    assert refined[-1].weights.min() == 1.0
+    assert refined[-1].graph.weights.min() == 1.0
 
 
 def test_the_answer_is_the_same_to_the_bit_for_any_number_of_threads(hopeless):

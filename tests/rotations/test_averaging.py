@@ -261,7 +261,7 @@ def ring_turned_around(extra_turns, n=24, noise_deg=0.2):
     rng = np.random.default_rng(0)
     pairs = np.sort(np.stack([np.arange(n), np.roll(np.arange(n), -1)], axis=1), axis=1)
     noise = Rotation.from_rotvec(np.radians(noise_deg) * rng.normal(size=(n, 3))).as_matrix()
-    given, _ = check_pairs(pairs, noise, None, None, n)
+    given = check_pairs(pairs, noise, None, None, n)
     angles = 2.0 * np.pi * extra_turns * np.arange(n) / n
     turns = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_quat()
     system = plan_system(n, given.pairs, given.supports, 1)
@@ -291,8 +291,8 @@ def test_the_global_minimum_is_certified_and_a_ring_turned_once_around_is_not(la
 def test_the_lower_bound_holds_for_other_rotations():
     problem = made("expander")
     relative = problem.relative.subset(~problem.wrong)
-    given, n = check_pairs(relative.pairs, relative.rotations, None, None, 300)
-    system = plan_system(n, given.pairs, given.supports, 1)
+    given = check_pairs(relative.pairs, relative.rotations, None, None, 300)
+    system = plan_system(300, given.pairs, given.supports, 1)
     truth = Rotation.from_matrix(problem.rotations).as_quat()
     found = certify_rotations(system, given.measured, np.ones(len(given.pairs)), truth)
     i, j = relative.pairs.T
@@ -312,7 +312,7 @@ def test_triangles_that_close_raise_a_pair_and_others_lower_it():
     pairs = np.array([(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4)])
     problem = rotation_problem(5, pairs, wrong_share=0.0, noise=0.0)
     problem.relative.rotations[4] = Rotation.from_rotvec([2.0, 0.0, 0.0]).as_matrix()
-    given, _ = check_pairs(pairs, problem.relative.rotations, None, None, 5)
+    given = check_pairs(pairs, problem.relative.rotations, None, None, 5)
     shares = annealing.closing_shares(given, plan_system(5, pairs, np.ones(6), 1))
     # With one triangle that counts as closed and one that does not: 2/3, 1/3, and 1/2 without any.
     assert shares == pytest.approx([2 / 3, 2 / 3, 1 / 2, 1 / 3, 1 / 3, 1 / 2], abs=2e-3)
@@ -364,9 +364,9 @@ def test_what_rests_on_an_estimated_eigenvalue_is_not_called_proved(monkeypatch)
 @pytest.mark.parametrize("weight", [0.0, 1e-18])
 def test_images_that_hang_on_pairs_of_no_weight_have_no_sigma(weight):
     pairs = np.array([(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4), (2, 5), (4, 5)])
-    given, n = check_pairs(pairs, np.tile(np.eye(3), (8, 1, 1)), None, None, None)
+    given = check_pairs(pairs, np.tile(np.eye(3), (8, 1, 1)), None, None, None)
     is_loose = (given.pairs >= 4).sum(axis=1) == 1
     blocks = np.where(is_loose, weight, 1.0)[:, None, None] * np.eye(3)
-    system = plan_system(n, given.pairs, np.ones(8), 1)
+    system = plan_system(6, given.pairs, np.ones(8), 1)
     sigmas = estimate_sigmas(given, system, Linearized(blocks, np.ones(8)))
     assert np.isfinite(sigmas).tolist() == [True] * 4 + [False] * 2

@@ -11,7 +11,7 @@ from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_g
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.certificate import certify, certify_in_place
-from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor

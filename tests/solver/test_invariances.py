@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.graph.groups import RigidGroups
+from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
-from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.refinement.angular import plan_refinement, refine_angles
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.solve import solve
@@ -29,8 +31,7 @@ class Problem(NamedTuple):
 
 def refine(problem):
     graph = problem.graph
-    metric = Metric(None, np.zeros(graph.num_edges, dtype=np.int64))
-    return refine_angles(graph, solve(graph).locations, metric, plan_refinement(graph)).locations
+    return refine_angles(MeasuredGraph(graph), solve(graph).locations, plan_refinement(graph)).locations
 
 
 def lud_over(graph, groups):

@@ -10,8 +10,10 @@ from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, sparse, steps
+from sfm_shapefit.solver.newton import dense, sparse, steps
+from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.irls_start import approach
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,

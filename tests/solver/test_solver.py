@@ -13,7 +13,7 @@ from sfm_shapefit.base.errors import InputError, UnsolvableError
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
-from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     adjoint,

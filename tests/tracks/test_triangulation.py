@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment import adjust, choose_loss_scale_px
+from sfm_shapefit.adjustment.solve import adjust, choose_loss_scale_px
 from sfm_shapefit.tracks import triangulation
 from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.thin_tracks import choose_thin_tracks

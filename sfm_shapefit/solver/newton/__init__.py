@@ -39,8 +39,3 @@ minimizing a sum of Euclidean norms", SIAM J. Sci. Comput. 22 (2000), for the sy
 Stadler, "An infeasible primal-dual algorithm for total bounded variation-based inf-convolution-type image
 restoration", SIAM J. Sci. Comput. 28 (2006), for going on from a projected dual.
 """
-
-from sfm_shapefit.solver.newton.dense import solve_newton_dense
-from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
-
-__all__ = ["solve_newton_dense", "solve_newton_sparse"]

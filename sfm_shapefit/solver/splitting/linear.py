@@ -18,6 +18,7 @@ from sfm_shapefit.laplacian.approximate import (
     Preconditioner,
     approximate_cholesky,
     conjugate_gradients,
+    diagonal_suffices,
 )
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
@@ -84,7 +85,7 @@ class IterativeSolver:
         self._operator.reweigh(weights)
         # A fixed linear map, as `solve` is not.
         self.preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
-        if not _diagonal_suffices(self._operator, self.preconditioner):
+        if not diagonal_suffices(self._operator, _JACOBI_STEPS):
             self.preconditioner = approximate_cholesky(self._graph, weights, _SEED)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -92,12 +93,6 @@ class IterativeSolver:
         return conjugate_gradients(
             self._operator, self.preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
         ).x
-
-
-def _diagonal_suffices(operator: LaplacianOperator, jacobi: Preconditioner) -> bool:
-    """Return whether the diagonal is so good a preconditioner as only expanders have it."""
-    probe = np.random.default_rng(_SEED).normal(size=(operator.graph.num_nodes, 3))
-    return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
 
 
 class Prediction(NamedTuple):
@@ -123,7 +118,7 @@ def predict_factor(graph: ViewGraph) -> Prediction:
     neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if graph.num_nodes >= _LARGE:
         operator = LaplacianOperator(neighbors, graph.weights, Workers(1))
-        if _diagonal_suffices(operator, JacobiPreconditioner(operator.diagonal())):
+        if diagonal_suffices(operator, _JACOBI_STEPS):
             return Prediction(None)
     if graph.num_nodes >= _HUGE:
         rough_flops = 4.0 * (0.75 * widest_level(neighbors)) ** 3  # as on boxes of 1e4 and 1e5 cameras
