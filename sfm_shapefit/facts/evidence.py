@@ -167,17 +167,15 @@ class ToldEvidence(Record):
     @property
     def statements(self) -> list[str]:
         """A sentence for each."""
-        seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
-        lenses, second = (told.statement for told in self.lenses), self.second
-        differs = second is not None and (second.wrong or second.undecided or second.ambiguous)
-        untied = (told.statement for told in self.untied)
         told = [
-            *seams,
-            *untied,
-            *places,
-            *lenses,
-            *([second.statement] if second is not None and differs else []),
+            *(one.statement for one in self.seams),
+            *(one.statement for one in self.untied),
+            *(one.statement for one in self.places),
+            *(one.statement for one in self.lenses),
         ]
+        second = self.second
+        if second is not None and (second.wrong or second.undecided or second.ambiguous):
+            told.append(second.statement)
         if self.contradicted:
             told.append(
                 f"{_cameras(self.contradicted)} where many pairs contradict, and no points confirm it"
@@ -188,21 +186,19 @@ class ToldEvidence(Record):
 def tell_evidence(
     evidence: ModelEvidence, images: Images, scale: float = 1.0, axes: FloatArray | None = None
 ) -> ToldEvidence:
-    """Return what evidence says, by name.
+    """Return what evidence says, by name of the images and of the lenses that they were asked for.
 
     Args:
-        evidence: by rows of images and their lenses.
-        images: with the lenses that were asked.
+        evidence, images: in one order.
         scale: from the units of the evidence to those of the output.
         axes: (3, 3) rotation from the axes of the evidence to those of the output; the same if None.
     """
     return ToldEvidence(
         lenses=tuple(_tell_lens(wrong, images.lenses[wrong.lens]) for wrong in evidence.lenses),
         places=tuple(
-            AmbiguousPlace(
+            AmbiguousPlace.taken_from(
+                found,
                 image=images.names[found.camera],
-                num_here=found.num_here,
-                num_there=found.num_there,
                 offset=tuple((scale * (found.offset if axes is None else axes @ found.offset)).tolist()),
             )
             for found in evidence.places

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED
-from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts, find_seams
+from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
@@ -25,11 +25,9 @@ class Structure(NamedTuple):
     """The points of a model, and what they are seen with."""
 
     points: Points
-    """Points that the images see."""
     images: Images
     """Images where the model has them; NaN where it does not."""
     pictures: Pictures
-    """Keypoints and lenses of the images."""
     among: BoolArray | None = None
     """(i,) images that make the points; all if None."""
     asked: BoolArray | None = None
@@ -44,18 +42,17 @@ def gather_evidence(
 ) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use.
 
-    Args:
-        source: the images, at the rotations of the model, and their matches.
-        fits: of all pairs, their directions measured at these rotations; None if there are none.
-        structure: the points of the model.
-        threads: number of threads to use.
+    Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))
     if fits is None:
         return ModelEvidence(lenses=lenses)
     tied, untied = _tie(source, fits, structure)
-    seams = _question_cuts(source, find_cuts(*fits.sides, tied), threads)
+    cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
+    if cuts:  # which are seams by the rotations that pairs across have by themselves
+        across = np.concatenate([cut.contradicting for cut in cuts])
+        seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
     contradicted = fits.contradicted(images)
     doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
@@ -174,11 +171,3 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
         lost[ends[same & ~sound, 0]] = True
         carried[ends[same & sound, 0]] = True
     return lost & ~carried
-
-
-def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:
-    """Return the cuts that are seams, by the rotations that pairs across have by themselves."""
-    if not cuts:
-        return ()
-    across = np.concatenate([cut.contradicting for cut in cuts])
-    return find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)

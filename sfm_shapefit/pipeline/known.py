@@ -6,7 +6,6 @@ line in each of the two functions here.
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, off_by
+from sfm_shapefit.pipeline.gauge_choice import say_unused
 from sfm_shapefit.pipeline.seed import Seeded, turn_about_origin
 from sfm_shapefit.placement.control_points import (
     control_gauge,
@@ -40,11 +39,7 @@ def read_known(
     control_points: str = "",
     gravity: str = "",
 ) -> Known:
-    """Return what the user tells of images: position priors, control points, gravity, as far as asked for.
-
-    Raises:
-        InputError: if something is asked for and cannot be read, or there is none of these images.
-    """
+    """Return what the user tells of images: position priors, control points, gravity, as far as asked for."""
     return Known(
         priors=None if priors is None else _read_priors(images, file, priors),
         control=_read_control(images, control_points) if control_points else None,
@@ -52,20 +47,16 @@ def read_known(
     )
 
 
-class BroughtToKnown(NamedTuple):
-    """A model after what the user told has set its axes, and what is said of it."""
-
-    seeded: Seeded
-    control_points: tuple[ControlPoint, ...]
-    """A row for each control point."""
-    warnings: tuple[str, ...]
-
-
-def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool) -> BroughtToKnown:
+def bring_to_known(
+    seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool
+) -> tuple[Seeded, tuple[ControlPoint, ...], list[str]]:
     """Return a model in scale and axes of control points, or with z up by gravity, where these are known.
 
     Points that cannot tell scale and axes leave the model as it is, and so do all where the model is not to
     move: they check its scale then.
+
+    Returns:
+        The model, a row for each control point, and what to warn of.
     """
     rows, warnings = list[ControlPoint](), list[str]()
     if known.control is not None:
@@ -73,7 +64,7 @@ def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, m
     if known.gravity is not None:
         seeded, more = _turn_upright(seeded, known.gravity)
         warnings += more
-    return BroughtToKnown(seeded, tuple(rows), tuple(warnings))
+    return seeded, tuple(rows), warnings
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:
@@ -110,11 +101,9 @@ def _bring_to_control_points(
     if isinstance(fit, str):
         return seeded, rows, warnings
     if not moves:
-        unused = (
-            f"control points were not used for the scale, which is that of {SETS_SCALE[seeded.gauge.scale]}"
-        )
         checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
-        return seeded, checks, [*warnings, f"{unused}; {off_by(fit.motion.scale)}"]
+        unused = say_unused("control points were", seeded.gauge, lambda: fit.motion.scale)
+        return seeded, checks, [*warnings, unused]
     return seeded.moved(fit.motion, control_gauge(seeded.gauge, known, fit)), rows, warnings
 
 

@@ -8,8 +8,8 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,12 +18,9 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariance_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
-
-if TYPE_CHECKING:
-    from sfm_shapefit.files.colmap.seed import PickedPoints
-
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
@@ -56,8 +53,6 @@ class Poses:
     """(n, 3)"""
     half_sizes: FloatArray
     """(n, 2) half the width and height of the picture at distance 1, limited to what can be drawn."""
-    focal_lengths_px: FloatArray
-    """(n,)"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,8 +76,7 @@ class Cameras:
     @property
     def sigmas(self) -> FloatArray:
         """(n,) largest standard deviation over the axes; NaN where it is not known."""
-        found: FloatArray = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).max(axis=1))
-        return found
+        return np.asarray(np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).max(axis=1)))
 
     @property
     def ellipsoids(self) -> FloatArray:
@@ -143,24 +137,7 @@ class Pairs:
     def worst_first(self) -> IntArray:
         """Return the rows, those that contradict the solution most first, those without a direction last."""
         rank = np.array([2, 0, 1, 3])[self.classes]
-        order: IntArray = np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank))
-        return order
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DrawnPoints:
-    """The 3D points that are drawn."""
-
-    positions: FloatArray
-    """(k, 3)"""
-    colors: IntArray
-    """(k, 3) in 0..255."""
-    num_all: int
-    """How many the model has."""
-    track_lengths: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(s,) by how many images points are seen: of all, or of evenly picked ones."""
-    errors_px: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(s,) mean reprojection errors of the same points; NaN where it is not known."""
+        return np.asarray(np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -169,7 +146,8 @@ class Drawing:
 
     cameras: Cameras
     pairs: Pairs
-    points: DrawnPoints
+    points: PickedPoints
+    """The points that are drawn; lengths and errors, NaN where not known, are of those far outside too."""
     axes: FloatArray
     """(3, 3) rows: to the right, forward and up as seen by the cameras, in the output's axes."""
     frustum_depth: float
@@ -187,8 +165,7 @@ class Drawing:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""
         if not self.input_is_aligned:
             return np.full(len(self.cameras.names), np.nan)
-        distances: FloatArray = np.linalg.norm(self.cameras.centers - self.cameras.poses.centers, axis=1)
-        return distances
+        return np.asarray(np.linalg.norm(self.cameras.centers - self.cameras.poses.centers, axis=1))
 
     @property
     def noun(self) -> str:
@@ -207,7 +184,7 @@ def build_drawing(
     pairs: Sequence[PairRow],
     *,
     poses: Poses | None = None,
-    points: "PickedPoints | None" = None,
+    points: PickedPoints | None = None,
     certified: FloatArray | None = None,
 ) -> Drawing:
     """Return the drawing of a result's rows; what does not follow from these has its default.
@@ -238,27 +215,22 @@ def poses_of(images: Images | None, names: Sequence[str]) -> Poses:
     row_of = {name: row for row, name in enumerate(names)}
     rows = [k for k, name in enumerate(images.names) if name in row_of]
     own = [row_of[images.names[k]] for k in rows]
-    focal_lengths_px = images.focal_lengths_px[rows]
+    halves = images.sizes_px[rows] / (2.0 * images.focal_lengths_px[rows, None])
     found.rotations[own], found.centers[own] = images.rotations[rows], images.centers[rows]
-    found.half_sizes[own] = np.clip(images.sizes_px[rows] / (2.0 * focal_lengths_px[:, None]), *_HALF_SIZES)
-    found.focal_lengths_px[own] = focal_lengths_px
+    found.half_sizes[own] = np.clip(halves, *_HALF_SIZES)
     return found
 
 
 def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> FloatArray:
     """Return the picture corners of cameras in the world's axes, shape (k, 4, 3), around each picture.
 
-    Args:
-        drawing: rotations, pictures and depth.
-        rows: (k,) cameras with a rotation.
-        centers: (k, 3) where they stand.
+    The cameras are those of some rows (k,) with a rotation, and stand at the centers (k, 3).
     """
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     halves = drawing.cameras.poses.half_sizes[rows]
     in_camera = np.concatenate([signs * halves[:, None, :], np.ones((len(rows), 4, 1))], axis=2)
     rotations = drawing.cameras.poses.rotations[rows]
-    corners: FloatArray = centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations
-    return corners
+    return np.asarray(centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations)
 
 
 def input_centers(drawing: Drawing) -> FloatArray | None:
@@ -279,10 +251,7 @@ def view_axes(rotations: FloatArray) -> FloatArray:
     """Return right, forward and up, as rows, as most cameras see them; the world's axes if there are none.
 
     People hold cameras level: up is the direction most orthogonal to the pictures' x axes and, as far as that
-    leaves it open, opposite to their y axes.
-
-    Args:
-        rotations: (n, 3, 3) cam_from_world.
+    leaves it open, opposite to their y axes. Rotations (n, 3, 3) are cam_from_world.
     """
     rotations = rotations[np.isfinite(rotations).all(axis=(1, 2))]
     if len(rotations) == 0:
@@ -305,7 +274,6 @@ def _unknown_poses(n: int) -> Poses:
         rotations=np.full((n, 3, 3), np.nan),
         centers=np.full((n, 3), np.nan),
         half_sizes=np.full((n, 2), np.nan),
-        focal_lengths_px=np.full(n, np.nan),
     )
 
 
@@ -373,21 +341,17 @@ def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatAr
     return angles
 
 
-def _points(picked: "PickedPoints | None", cameras: FloatArray) -> DrawnPoints:
+def _points(picked: PickedPoints | None, cameras: FloatArray) -> PickedPoints:
     """Return points without those far out that would shrink the rest."""
     if picked is None or not len(picked.xyz):
-        return DrawnPoints(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
+        nothing = np.zeros((0, 3))
+        return PickedPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0), 0)
     both = np.concatenate([picked.xyz, cameras])
     middle = np.median(both, axis=0)
     limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(picked.xyz - middle, axis=1) <= limit
-    return DrawnPoints(
-        positions=picked.xyz[near],
-        colors=picked.colors[near].astype(np.int64),
-        num_all=picked.num_all,
-        track_lengths=picked.lengths,
-        errors_px=np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan),
-    )
+    errors_px = np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan)
+    return picked._replace(xyz=picked.xyz[near], colors=picked.colors[near], errors_px=errors_px)
 
 
 def _frustum_depth(positions: FloatArray) -> float:
