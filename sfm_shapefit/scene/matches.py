@@ -102,22 +102,6 @@ class MatchBatch(RayMatches):
     """(M, 2) index of the keypoint in image i and in image j."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RelativePoses:
-    """The relative poses of k image pairs: x_j = rotation x_i + translation in camera axes."""
-
-    pairs: IntArray
-    """(k, 2) images (i, j), i < j."""
-    rotations: FloatArray
-    """(k, 3, 3) camera j from camera i."""
-    translations: FloatArray
-    """(k, 3) unit vectors, in the axes of camera j."""
-    configs: IntArray
-    """(k,) COLMAP's TwoViewGeometryConfiguration."""
-    num_inliers: IntArray
-    """(k,) number of inlier matches."""
-
-
 class Reading(NamedTuple):
     """How much memory may be taken, so that nothing is read or computed twice."""
 
