@@ -21,7 +21,8 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.scene.posed_model import ListedPoses, PosedModelFile
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.listed_poses import ListedPoses
 
 
 def read_tum(file: Path) -> ListedPoses:
@@ -48,27 +49,27 @@ def read_tum(file: Path) -> ListedPoses:
     return ListedPoses(tuple(names), turns.swapaxes(1, 2), rows[:, :3], np.full((len(rows), 2), np.nan))
 
 
-def tum_text(model: PosedModelFile) -> str:
-    """Return the posed images as a trajectory; numbers round-trip."""
+def tum_text(images: Images) -> str:
+    """Return posed images as a trajectory; numbers round-trip."""
     from scipy.spatial.transform import Rotation  # here, since it takes long to import
 
-    quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
-    numbers = (np.concatenate([model.centers, quaternions], axis=1) + 0.0).tolist()
-    rows = sorted(zip(_timestamps(model.names), numbers, strict=True), key=lambda row: float(row[0]))
+    quaternions = Rotation.from_matrix(images.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
+    numbers = (np.concatenate([images.centers, quaternions], axis=1) + 0.0).tolist()
+    rows = sorted(zip(_timestamps(images.names), numbers, strict=True), key=lambda row: float(row[0]))
     lines = [" ".join([stamp, *map(repr, row)]) for stamp, row in rows]
     return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
 
 
-def poses_csv(model: PosedModelFile) -> str:
-    """Return the posed images as a CSV; numbers round-trip."""
+def poses_csv(images: Images) -> str:
+    """Return posed images as a CSV; numbers round-trip."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z", "qw", "qx", "qy", "qz"])
     from scipy.spatial.transform import Rotation  # here, since it takes long to import
 
-    quaternions = np.roll(Rotation.from_matrix(model.rotations).as_quat(canonical=True), 1, axis=1)
-    numbers = np.concatenate([model.centers, quaternions], axis=1) + 0.0
-    for name, row in zip(model.names, numbers.tolist(), strict=True):
+    quaternions = np.roll(Rotation.from_matrix(images.rotations).as_quat(canonical=True), 1, axis=1)
+    numbers = np.concatenate([images.centers, quaternions], axis=1) + 0.0
+    for name, row in zip(images.names, numbers.tolist(), strict=True):
         writer.writerow([name, *map(repr, row)])
     return stream.getvalue()
 

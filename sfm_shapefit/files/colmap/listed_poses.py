@@ -23,7 +23,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.posed_model import ListedPoses
+from sfm_shapefit.scene.listed_poses import ListedPoses
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum}
 
