@@ -21,10 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.scene.images import Frames, Images, Sensors
@@ -100,7 +100,7 @@ def _images(reconstruction: JsonNode) -> Images:
         key = shot.get("camera").text()
         if key not in order:
             raise shot.error(f"has the camera {key!r}, which is not among the cameras")
-        rotation = Rotation.from_rotvec(shot.get("rotation").numbers(3)).as_matrix()
+        rotation = rotations_of(np.array([shot.get("rotation").numbers(3)]))[0]
         names.append(name)
         lens_of.append(order[key])
         rotations.append(rotation)
