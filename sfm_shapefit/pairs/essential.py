@@ -86,7 +86,7 @@ def estimate_relative_rotations(
     if likely is not None:
         tried = np.flatnonzero(np.isfinite(likely.translations).all(axis=1))
         start = likely.rotations[tried], likely.translations[tried]
-        near = _refine(batch.rays_of(tried), *start, threads)
+        near = refine_two_view_poses(batch.rays_of(tried), *start, threads)
         fits = near.weight_shares >= likely.least_weights[tried]
         parts, places, others = [near.subset(fits)], [tried[fits]], np.delete(others, tried[fits])
     slices = [others[k : k + _PAIRS_PER_SLICE] for k in range(0, len(others), _PAIRS_PER_SLICE)]
@@ -123,7 +123,8 @@ def refine_rough_rotations(
     products = np.append(normals[:, :, None] * normals[:, None, :], np.zeros((1, 3, 3)), axis=0)
     sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
     translations = np.linalg.eigh(sums)[1][:, :, 0]  # rays meet in planes with it
-    refined = _refine(batch, rotations, translations, threads, _ROUGH_WIDTH * sigma_rad)
+    off_rad = _ROUGH_WIDTH * sigma_rad
+    refined = refine_two_view_poses(batch, rotations, translations, threads, off_rad)
     advance(len(batch.pairs))
     return refined
 
@@ -149,22 +150,7 @@ def _estimate_slice(
     """Return the relative rotations of some pairs by trials, and which of them got one."""
     matches = batch.rays_of(pairs)
     has_pose, rotations, translations = _start_by_trials(matches, are_many)
-    return _refine(matches, rotations, translations).subset(has_pose), has_pose
-
-
-def _refine(
-    matches: RayMatches, turns: FloatArray, shifts: FloatArray, threads: int = 1, off_rad: float = 0.0
-) -> RelativeRotations:
-    """Return the relative rotations of pairs that fit all their matches best, near those of a start."""
-    poses = refine_two_view_poses(matches, turns, shifts, threads, off_rad)
-    return RelativeRotations(
-        pairs=matches.pairs,
-        rotations=poses.rotations,
-        information=poses.information,
-        num_matches=np.diff(matches.offsets),
-        weight_shares=poses.weight_shares,
-        translations=poses.translations,
-    )
+    return refine_two_view_poses(matches, rotations, translations).subset(has_pose), has_pose
 
 
 def _start_by_trials(matches: RayMatches, are_many: bool) -> tuple[BoolArray, FloatArray, FloatArray]:
