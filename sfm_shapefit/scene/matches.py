@@ -11,7 +11,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar
 from weakref import WeakSet
 
@@ -57,13 +57,8 @@ class RayMatches:
     def rays_of(self, chosen: IntArray) -> "RayMatches":
         """Return the rays of some of the pairs, in that order."""
         offsets, rows = rows_of_parts(self.offsets, chosen)
-        return RayMatches(
-            pairs=self.pairs[chosen],
-            offsets=offsets,
-            rays_i=self.rays_i[rows],
-            rays_j=self.rays_j[rows],
-            pixel_angles=self.pixel_angles[chosen],
-        )
+        pairs, pixel_angles = self.pairs[chosen], self.pixel_angles[chosen]
+        return replace(self._taken(offsets, rows), pairs=pairs, pixel_angles=pixel_angles)
 
     def thinned(self, most: int) -> "RayMatches":
         """Return the pairs with at most so many matches each, taken evenly."""
@@ -72,7 +67,10 @@ class RayMatches:
         offsets = np.append(0, np.cumsum(taken))
         position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
         steps = position * np.repeat(counts, taken) // np.repeat(taken, taken)
-        rows = np.repeat(self.offsets[:-1], taken) + steps
+        return self._taken(offsets, np.repeat(self.offsets[:-1], taken) + steps)
+
+    def _taken(self, offsets: IntArray, rows: IntArray) -> "RayMatches":
+        """Return the pairs with other matches, by rows."""
         return RayMatches(
             pairs=self.pairs,
             offsets=offsets,

@@ -156,11 +156,8 @@ class SeededModel:
         points, offsets = self.points, self.points.offsets[first : last + 1]
         seen, lengths = slice(int(offsets[0]), int(offsets[-1])), np.diff(offsets)
         heads = np.empty(len(lengths), POINT3D)
-        heads["id"], heads["xyz"], heads["rgb"] = (
-            points.ids[first:last],
-            points.xyz[first:last],
-            self.colors[first:last],
-        )
+        heads["id"], heads["xyz"] = points.ids[first:last], points.xyz[first:last]
+        heads["rgb"] = self.colors[first:last]
         heads["error"] = -1.0 if points.errors_px is None else points.errors_px[first:last]
         heads["length"] = lengths
         tracks = np.empty((seen.stop - seen.start, 2), dtype="<u4")
