@@ -25,7 +25,8 @@ from sfm_shapefit import ViewGraph, locate
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.scene.evaluation import NamedPoses, evaluate_poses
+from sfm_shapefit.scene.evaluation import evaluate_poses
+from sfm_shapefit.scene.pose_errors import NamedPoses
 
 EQUAL = 1.05
 """Differences below count as equal: the truth is no better."""

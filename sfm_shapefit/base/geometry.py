@@ -154,7 +154,7 @@ def distances_in_spreads(points: FloatArray, reference: FloatArray) -> FloatArra
 
 
 def fit_similarity_l1(
-    source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf, iterations: int = 200
+    source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf
 ) -> Similarity:
     """Return the similarity that minimizes the sum of unsquared distances min(distance, cap).
 
@@ -170,7 +170,6 @@ def fit_similarity_l1(
         source, target: (n, d) corresponding points, n >= 1.
         rotate: False keeps the axes and fits scale and translation only.
         cap: positive distance, in the target's units, beyond which a point counts as lost.
-        iterations: limit of reweighting steps from each start; it stops earlier once nothing changes.
     """
     floor = 1e-9 * (median_spread(target) or 1.0)
 
@@ -185,7 +184,7 @@ def fit_similarity_l1(
 
     def reweigh(best: Similarity) -> Similarity:
         apart = distances(best)
-        for _ in range(iterations):
+        for _ in range(_MAX_REWEIGHTINGS):
             weights = np.where(apart < cap, floor / np.maximum(apart, floor), 0.0)
             if not weights.any():
                 break
@@ -201,13 +200,11 @@ def fit_similarity_l1(
     return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
 
 
-def fits_of_few_points(
-    source: FloatArray, target: FloatArray, *, rotate: bool, count: int = _NUM_SAMPLES
-) -> list[Similarity]:
+def fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
     """Return similarities that each fit as few points as determine one, drawn with a fixed seed."""
     size = min(len(source), source.shape[1] if rotate else 2)
     rng = np.random.default_rng(0)
-    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(count)])
+    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(_NUM_SAMPLES)])
     w = np.full(size, 1.0 / size)
     source_means, target_means = w @ source[few], w @ target[few]
     x, y = source[few] - source_means[:, None], target[few] - target_means[:, None]
@@ -215,8 +212,8 @@ def fits_of_few_points(
     crosses = np.swapaxes(w[:, None] * y, 1, 2) @ x
     eyes = np.broadcast_to(np.eye(source.shape[1]), crosses.shape)
     rotations = nearest_rotations(crosses) if rotate else eyes
-    alike = np.maximum((rotations * crosses).reshape(count, -1).sum(axis=1), 0.0)
-    scales = np.divide(alike, spreads, out=np.ones(count), where=spreads > 0.0)
+    alike = np.maximum((rotations * crosses).sum(axis=(1, 2)), 0.0)
+    scales = np.divide(alike, spreads, out=np.ones_like(spreads), where=spreads > 0.0)
     moved = ((scales[:, None, None] * rotations) @ source_means[:, :, None])[:, :, 0]
     fits = zip(scales.tolist(), rotations, target_means - moved, strict=True)
     return [Similarity(scale=scale, rotation=turn, translation=shift) for scale, turn, shift in fits]

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray
-from sfm_shapefit.base.geometry import nearest_rotations
+from sfm_shapefit.base.geometry import nearest_rotations, normalized
 from sfm_shapefit.base.jit import kernel
 
 _SERIES_RAD = 1e-3  # angle below which a series replaces sin(t / 2) / t; its next term is t^6 / 322,560 of it
@@ -28,7 +28,7 @@ def rotation_vectors(rotations: FloatArray) -> FloatArray:
 
 def matrices_of(quaternions: FloatArray) -> FloatArray:
     """Return the rotations (n, 3, 3) of quaternions (n, 4), which need not be of length 1."""
-    return _matrices(_normalized(quaternions))
+    return _matrices(normalized(quaternions))
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:
@@ -60,14 +60,7 @@ def quaternions_of(rotations: FloatArray) -> FloatArray:
         found[rows, i] = 1.0 - traces[rows] + 2.0 * r[:, i, i]
         found[rows, j], found[rows, k] = r[:, j, i] + r[:, i, j], r[:, k, i] + r[:, i, k]
         found[rows, 3] = r[:, k, j] - r[:, j, k]
-    return _normalized(found)
-
-
-def _normalized(q: FloatArray) -> FloatArray:
-    """Return quaternions of length 1; squares are added in their order."""
-    squares = q * q
-    lengths = np.sqrt(squares[:, 0] + squares[:, 1] + squares[:, 2] + squares[:, 3])
-    return np.asarray(q / lengths[:, None])
+    return normalized(found)
 
 
 @kernel

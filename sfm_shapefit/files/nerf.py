@@ -20,7 +20,9 @@ import numpy as np
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import FLIP_YZ
 from sfm_shapefit.files.json_node import JsonNode, read_json
-from sfm_shapefit.scene.posed_model import Intrinsics, ListedPoses, PosedModelFile
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.listed_poses import ListedPoses
 
 _LEAST_ANGLE_RAD = 1e-3  # radians, angle of view; no lens has so small a one, and none has 0
 
@@ -88,35 +90,32 @@ def _focal_shares(frame: JsonNode, content: JsonNode) -> tuple[float, float]:
     return (across, y / height if height > 0.0 else np.nan)
 
 
-def nerf_text(scene: PosedModelFile) -> str:
-    """Return the posed images as the text of a transforms.json.
+def nerf_text(images: Images) -> str:
+    """Return posed images as the text of a transforms.json.
 
     Raises:
         InputError: if a camera model has no equivalent there.
     """
-    intrinsics = [_intrinsics(camera) for camera in scene.cameras]
-    used = sorted(set(scene.camera_of.tolist()))
-    shared = intrinsics[used[0]] if len(used) == 1 else {}
+    intrinsics = [_intrinsics(lens) for lens in images.lenses]
+    shared = intrinsics[0] if len(intrinsics) == 1 else {}
+    matrices = np.tile(np.eye(4), (images.num_images, 1, 1))
+    matrices[:, :3, :3] = images.rotations.swapaxes(1, 2) @ FLIP_YZ
+    matrices[:, :3, 3] = images.centers
     frames: list[dict[str, Any]] = []
-    for name, camera, rotation, center in zip(
-        scene.names, scene.camera_of.tolist(), scene.rotations, scene.centers, strict=True
-    ):
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = rotation.T @ FLIP_YZ, center
-        lens = {} if shared else intrinsics[camera]
-        frames.append({"file_path": f"images/{name}", **lens, "transform_matrix": (matrix + 0.0).tolist()})
+    for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
+        own = {} if shared else intrinsics[lens]
+        frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
     return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _intrinsics(camera: Intrinsics) -> dict[str, Any]:
-    """Return a camera's keys."""
-    if camera.model not in _MODELS:
+def _intrinsics(lens: Lens) -> dict[str, Any]:
+    """Return a lens's keys."""
+    if lens.model not in _MODELS:
         raise InputError(
-            f"the camera model {camera.model} has no equivalent in transforms.json; "
-            "undistort the images first"
+            f"the camera model {lens.model} has no equivalent in transforms.json; undistort the images first"
         )
-    name, num_focals, keys = _MODELS[camera.model]
-    focals, (cx, cy, *coefficients) = camera.params[:num_focals], camera.params[num_focals:]
+    name, num_focals, keys = _MODELS[lens.model]
+    focals, (cx, cy, *coefficients) = lens.parameters[:num_focals], lens.parameters[num_focals:]
     distortion = dict(zip(keys, coefficients, strict=True))
     denominator = [distortion.pop(key) for key in _DENOMINATOR if key in distortion]
     if any(denominator):
@@ -127,8 +126,8 @@ def _intrinsics(camera: Intrinsics) -> dict[str, Any]:
         "fl_y": focals[-1],
         "cx": cx,
         "cy": cy,
-        "w": camera.width,
-        "h": camera.height,
+        "w": lens.width,
+        "h": lens.height,
         **distortion,
-        "camera_angle_x": float(2.0 * np.arctan(camera.width / (2.0 * focals[0]))),
+        "camera_angle_x": float(2.0 * np.arctan(lens.width / (2.0 * focals[0]))),
     }

@@ -15,22 +15,45 @@ normalized; tracks are the points. Where there are several reconstructions, the 
 Source: https://opensfm.org/docs/geometry.html and dataset.html.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.quaternions import rotations_of
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.scene.posed_model import Intrinsics, PosedImage, PosedModelFile, model_of_images
+from sfm_shapefit.scene.images import Frames, Images, Sensors
+from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.points import Points
 
 _TRACKS_FILE = "tracks.csv"
-_MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
+_MODELS = {
+    "perspective": "RADIAL",
+    "brown": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "simple_radial": "OPENCV",
+    "radial": "OPENCV",
+}
+"""COLMAP's name of a camera model, by OpenSfM's."""
 
 
-def read_opensfm(file: Path) -> PosedModelFile:
+class OpenSfmModel(NamedTuple):
+    """Images in the order of the file, each in a frame of its own, and the points that two of them see."""
+
+    images: Images
+    points: Points
+    colors: npt.NDArray[np.uint8]
+    """(x, 3)"""
+    keypoints: list[FloatArray]
+    """Pixels (k, 2) of the observations of each image."""
+
+
+def read_opensfm(file: Path) -> OpenSfmModel:
     """Read the largest reconstruction of a file.
 
     Raises:
@@ -42,36 +65,60 @@ def read_opensfm(file: Path) -> PosedModelFile:
         raise InputError(f"{file} is no model: give OpenSfM's reconstruction.json or a COLMAP folder")
     reconstructions = JsonNode(file, "", content).elements()
     chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
-    cameras = {key: _camera(node) for key, node in chosen.get("cameras").items()}
-    order = {key: k for k, key in enumerate(cameras)}
-    images: list[PosedImage] = []
-    for name, shot in chosen.get("shots").items():
-        key = shot.get("camera").text()
-        if key not in cameras:
-            raise shot.error(f"has the camera {key!r}, which is not among the cameras")
-        rotation = Rotation.from_rotvec(shot.get("rotation").numbers(3)).as_matrix()
-        center = -rotation.T @ np.array(shot.get("translation").numbers(3))
-        images.append((name, order[key], rotation, center))
-    ids, points, colors = [], [], []
+    images = _images(chosen)
+    ids, xyz, colors = [], [], []
     for key, node in chosen.get("points").items() if chosen.has("points") else []:
         ids.append(key)
-        points.append(node.get("coordinates").numbers(3))
+        xyz.append(node.get("coordinates").numbers(3))
         colors.append(node.get("color").numbers(3) if node.has("color") else [0.0, 0.0, 0.0])
-    observed, scaled = _observations(file, ids, [image[0] for image in images])
-    sizes = np.array([camera[1:3] for camera in cameras.values()], dtype=np.float64).reshape(-1, 2)
-    of_image = sizes[np.array([image[1] for image in images], dtype=np.int64)[observed[:, 1]]]
-    return model_of_images(
-        cameras.values(),
-        images,
-        points=np.array(points).reshape(-1, 3),
-        colors=np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.int64),
-        observed=observed,
-        pixels=scaled * of_image.max(axis=1, keepdims=True, initial=0.0) + of_image / 2.0,
+    observed, scaled = _observations(file, ids, images.names)
+    sizes = images.sizes_px[observed[:, 1]]
+    pixels = scaled * sizes.max(axis=1, keepdims=True, initial=0.0) + sizes / 2.0
+    bounds = np.searchsorted(observed[:, 1], np.arange(images.num_images + 1))
+    order = np.argsort(observed[:, 0], kind="stable")
+    known, lengths = np.unique(observed[:, 0], return_counts=True)
+    points = Points(
+        xyz=np.reshape(xyz, (-1, 3))[known],
+        offsets=np.append(0, np.cumsum(lengths)),
+        images=observed[order, 1],
+        keypoints=(np.arange(len(observed)) - bounds[observed[:, 1]])[order],
+        ids=known + 1,
+    )
+    rounded = np.clip(np.reshape(colors, (-1, 3)), 0, 255).astype(np.uint8)[known]
+    return OpenSfmModel(images, points, rounded, np.split(pixels, bounds[1:-1]))
+
+
+def _images(reconstruction: JsonNode) -> Images:
+    """Return the images of a reconstruction; ids are from 1 on."""
+    cameras = reconstruction.get("cameras").items()
+    order = {key: k for k, (key, _) in enumerate(cameras)}
+    shots = reconstruction.get("shots").items()
+    if not shots:
+        raise reconstruction.error("has no shots")
+    names, lens_of, rotations, centers = [], [], [], []
+    for name, shot in shots:
+        key = shot.get("camera").text()
+        if key not in order:
+            raise shot.error(f"has the camera {key!r}, which is not among the cameras")
+        rotation = rotations_of(np.array([shot.get("rotation").numbers(3)]))[0]
+        names.append(name)
+        lens_of.append(order[key])
+        rotations.append(rotation)
+        centers.append(-rotation.T @ np.array(shot.get("translation").numbers(3)))
+    ids = np.arange(1, len(names) + 1)
+    return Images(
+        names=tuple(names),
+        ids=ids,
+        frame_of=ids - 1,
+        lens_of=np.array(lens_of, dtype=np.int64),
+        frames=Frames(ids=ids, rotations=np.array(rotations), centers=np.array(centers)),
+        lenses=tuple(_lens(node, k) for k, (_, node) in enumerate(cameras, start=1)),
+        sensors=Sensors.references(len(cameras)),
     )
 
 
-def _camera(node: JsonNode) -> Intrinsics:
-    """Return a camera in COLMAP's terms; missing coefficients are 0."""
+def _lens(node: JsonNode, camera_id: int) -> Lens:
+    """Return a camera's lens in COLMAP's terms; missing coefficients are 0."""
     kind = node.get("projection_type").text()
     if kind not in _MODELS:
         raise node.error(f"has the projection type {kind!r}; {', '.join(_MODELS)} are read")
@@ -88,21 +135,21 @@ def _camera(node: JsonNode) -> Intrinsics:
     if fx <= 0.0 or fy <= 0.0:
         raise node.error("has a focal length that is not positive")
     center = (size * value("c_x") + width / 2.0, size * value("c_y") + height / 2.0)
-    k1, k2 = value("k1"), value("k2")
+    parameters = [fx, fy, *center, value("k1"), value("k2"), 0.0, 0.0]
     if kind == "perspective":
-        return Intrinsics("RADIAL", width, height, (fx, *center, k1, k2))
-    both = (fx, fy, *center, k1, k2)
-    if kind == "brown":
-        extra = (value("p1"), value("p2"), value("k3"), 0.0, 0.0, 0.0)
-        return Intrinsics("FULL_OPENCV", width, height, (*both, *extra))
-    model = "OPENCV_FISHEYE" if kind == "fisheye" else "OPENCV"
-    return Intrinsics(model, width, height, (*both, 0.0, 0.0))
+        parameters = [fx, *parameters[2:6]]
+    elif kind == "brown":
+        parameters[6:] = [value("p1"), value("p2"), value("k3"), 0.0, 0.0, 0.0]
+    return Lens(_MODELS[kind], tuple(parameters), id=camera_id, width=width, height=height)
 
 
-def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:
-    """Return the observations (point, image) of tracks.csv, and their normalized coordinates."""
+def _observations(file: Path, points: Sequence[str], names: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    """Return the observations (point, image) of tracks.csv, by image, and their normalized coordinates.
+
+    If an image observes a point several times, the first observation counts; points of one image are none.
+    """
     tracks = file.with_name(_TRACKS_FILE)
-    observed, coordinates = [], []
+    found: dict[tuple[int, int], tuple[float, float]] = {}
     if tracks.is_file():
         point_of, image_of = ({key: k for k, key in enumerate(keys)} for keys in (points, names))
         for number, line in enumerate(text_of(tracks).splitlines(), start=1):
@@ -116,9 +163,9 @@ def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntA
             if not (np.isfinite(x) and np.isfinite(y)):
                 raise InputError(f"{tracks}, line {number}: has a number that is not finite")
             if track in point_of and image in image_of:
-                observed.append((point_of[track], image_of[image]))
-                coordinates.append((x, y))
-    return (
-        np.array(observed, dtype=np.int64).reshape(-1, 2),
-        np.array(coordinates, dtype=np.float64).reshape(-1, 2),
-    )
+                found.setdefault((point_of[track], image_of[image]), (x, y))
+    observed = np.array(list(found), dtype=np.int64).reshape(-1, 2)
+    coordinates = np.array(list(found.values()), dtype=np.float64).reshape(-1, 2)
+    rows = np.argsort(observed[:, 1], kind="stable")
+    rows = rows[np.bincount(observed[:, 0])[observed[rows, 0]] >= 2]
+    return observed[rows], coordinates[rows]

@@ -20,8 +20,9 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
-from sfm_shapefit.files.lines import text_of
-from sfm_shapefit.scene.posed_model import ListedPoses, PosedModelFile
+from sfm_shapefit.files.lines import is_number, lines_of_cells
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.listed_poses import ListedPoses
 
 
 def read_tum(file: Path) -> ListedPoses:
@@ -31,44 +32,38 @@ def read_tum(file: Path) -> ListedPoses:
         InputError: if a line is none of a trajectory.
     """
     names, numbers = [], []
-    for number, line in enumerate(text_of(file).splitlines(), start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        norm = float(np.linalg.norm(values[4:]))
-        if words and not (len(values) == 8 and np.isfinite(values).all() and norm > 0.0):
+    for number, words in lines_of_cells(file):
+        values = np.array([float(word) for word in words if is_number(word)])
+        if not (len(words) == len(values) == 8 and np.isfinite(values).all() and np.linalg.norm(values[4:])):
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
-        if words:
-            names.append(words[0])
-            numbers.append(values[1:])
+        names.append(words[0])
+        numbers.append(values[1:])
     rows = np.array(numbers).reshape(-1, 7)
     turns = matrices_of(rows[:, 3:])
     return ListedPoses(tuple(names), turns.swapaxes(1, 2), rows[:, :3], np.full((len(rows), 2), np.nan))
 
 
-def tum_text(model: PosedModelFile) -> str:
-    """Return the posed images as a trajectory; numbers round-trip."""
+def tum_text(images: Images) -> str:
+    """Return posed images as a trajectory; numbers round-trip."""
     from scipy.spatial.transform import Rotation  # here, since it takes long to import
 
-    quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
-    numbers = (np.concatenate([model.centers, quaternions], axis=1) + 0.0).tolist()
-    rows = sorted(zip(_timestamps(model.names), numbers, strict=True), key=lambda row: float(row[0]))
+    quaternions = Rotation.from_matrix(images.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
+    numbers = (np.concatenate([images.centers, quaternions], axis=1) + 0.0).tolist()
+    rows = sorted(zip(_timestamps(images.names), numbers, strict=True), key=lambda row: float(row[0]))
     lines = [" ".join([stamp, *map(repr, row)]) for stamp, row in rows]
     return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
 
 
-def poses_csv(model: PosedModelFile) -> str:
-    """Return the posed images as a CSV; numbers round-trip."""
+def poses_csv(images: Images) -> str:
+    """Return posed images as a CSV; numbers round-trip."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z", "qw", "qx", "qy", "qz"])
     from scipy.spatial.transform import Rotation  # here, since it takes long to import
 
-    quaternions = np.roll(Rotation.from_matrix(model.rotations).as_quat(canonical=True), 1, axis=1)
-    numbers = np.concatenate([model.centers, quaternions], axis=1) + 0.0
-    for name, row in zip(model.names, numbers.tolist(), strict=True):
+    quaternions = np.roll(Rotation.from_matrix(images.rotations).as_quat(canonical=True), 1, axis=1)
+    numbers = np.concatenate([images.centers, quaternions], axis=1) + 0.0
+    for name, row in zip(images.names, numbers.tolist(), strict=True):
         writer.writerow([name, *map(repr, row)])
     return stream.getvalue()
 

@@ -84,11 +84,6 @@ class MeasuredGraph:
         return (~self.is_pair).astype(np.int64)
 
     @property
-    def pair_graph(self) -> ViewGraph:
-        """The view graph of all cameras without the points."""
-        return self.without_points().graph
-
-    @property
     def cameras_per_group(self) -> IntArray:
         """(B,) number of cameras in each rigid group; 0 for a point, which is a group of its own."""
         assert self.groups is not None

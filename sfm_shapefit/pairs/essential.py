@@ -1,4 +1,4 @@
-"""Relative rotations of the image pairs of a database, estimated from their inlier matches, or as stored.
+"""Relative rotations of the image pairs of a database, estimated from their inlier matches.
 
 COLMAP leaves `cam2_from_cam1` out by default, and databases of other tools hold inlier matches and nothing
 else. So the relative pose of a pair is estimated anew:
@@ -19,19 +19,16 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import fields
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import normalized
-from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.two_view_poses import refine_two_view_poses
-from sfm_shapefit.scene.matches import RayMatches, View
-
-RelativeSource = Literal["matches", "stored"]
+from sfm_shapefit.scene.matches import RayMatches
 
 _TRIAL_MATCHES = 60  # matches per trial; the essential matrix is a start, all matches refine it
 _LEAST_TRIALS = 10  # trials of a pair; matches in agreement need no more
@@ -47,7 +44,6 @@ _FEWER_TRIALS = {"confidence": 0.99, "dyn_num_trials_multiplier": 1.0}
 _INLIER_PX = 2.0  # pixels, in trials; chosen on scripts/results/notes.md#relative-rotations-of-pairs
 _ROUGH_WIDTH = 2.0  # standard deviations of an image's rotation; by as much rough ones make rays miss
 _PAIRS_PER_SLICE = 64  # pairs; Python can be interrupted between slices, every 50 ms
-_STORED_NOISE_PX = 20.0  # pixels, noise of a stored pose per match; see `stored_relative_rotations`
 
 
 class LikelyPoses(NamedTuple):
@@ -90,7 +86,7 @@ def estimate_relative_rotations(
     if likely is not None:
         tried = np.flatnonzero(np.isfinite(likely.translations).all(axis=1))
         start = likely.rotations[tried], likely.translations[tried]
-        near = _refine(batch.rays_of(tried), *start, threads)
+        near = refine_two_view_poses(batch.rays_of(tried), *start, threads)
         fits = near.weight_shares >= likely.least_weights[tried]
         parts, places, others = [near.subset(fits)], [tried[fits]], np.delete(others, tried[fits])
     slices = [others[k : k + _PAIRS_PER_SLICE] for k in range(0, len(others), _PAIRS_PER_SLICE)]
@@ -127,35 +123,10 @@ def refine_rough_rotations(
     products = np.append(normals[:, :, None] * normals[:, None, :], np.zeros((1, 3, 3)), axis=0)
     sums = np.add.reduceat(products, batch.offsets[:-1], axis=0)
     translations = np.linalg.eigh(sums)[1][:, :, 0]  # rays meet in planes with it
-    refined = _refine(batch, rotations, translations, threads, _ROUGH_WIDTH * sigma_rad)
+    off_rad = _ROUGH_WIDTH * sigma_rad
+    refined = refine_two_view_poses(batch, rotations, translations, threads, off_rad)
     advance(len(batch.pairs))
     return refined
-
-
-def stored_relative_rotations(view: View, min_matches: int = 1) -> RelativeRotations:
-    """Return the relative rotations that a database stores; pairs without one are left out.
-
-    Nothing says how well they are known. So their information is taken as isotropic, n / (20 px)^2, with
-    the angle of a pixel at the smaller focal length, between what estimates have along their least and their
-    middle axis; W is 1.
-
-    Args:
-        view: view of the images, whose focal lengths count.
-        min_matches: pairs with fewer inlier matches are left out.
-
-    Raises:
-        InputError: naming the pair whose pose is damaged.
-    """
-    poses = relative_poses(view)
-    noise = _STORED_NOISE_PX / view.images.focal_lengths_px[poses.pairs].min(axis=1)
-    stored = RelativeRotations(
-        pairs=poses.pairs,
-        rotations=poses.rotations,
-        information=(poses.num_inliers / noise**2)[:, None, None] * np.eye(3),
-        num_matches=poses.num_inliers,
-        weight_shares=np.ones(len(poses.pairs)),
-    )
-    return stored.subset(poses.num_inliers >= min_matches)
 
 
 def concatenate_rotations(parts: Sequence[RelativeRotations]) -> RelativeRotations:
@@ -179,22 +150,7 @@ def _estimate_slice(
     """Return the relative rotations of some pairs by trials, and which of them got one."""
     matches = batch.rays_of(pairs)
     has_pose, rotations, translations = _start_by_trials(matches, are_many)
-    return _refine(matches, rotations, translations).subset(has_pose), has_pose
-
-
-def _refine(
-    matches: RayMatches, turns: FloatArray, shifts: FloatArray, threads: int = 1, off_rad: float = 0.0
-) -> RelativeRotations:
-    """Return the relative rotations of pairs that fit all their matches best, near those of a start."""
-    poses = refine_two_view_poses(matches, turns, shifts, threads, off_rad)
-    return RelativeRotations(
-        pairs=matches.pairs,
-        rotations=poses.rotations,
-        information=poses.information,
-        num_matches=np.diff(matches.offsets),
-        weight_shares=poses.weight_shares,
-        translations=poses.translations,
-    )
+    return refine_two_view_poses(matches, rotations, translations).subset(has_pose), has_pose
 
 
 def _start_by_trials(matches: RayMatches, are_many: bool) -> tuple[BoolArray, FloatArray, FloatArray]:

@@ -32,8 +32,6 @@ Simulated, 100 matches of .5 px: the covariance of the estimates is .93 to .99 o
 translation may be anywhere, and standard deviations are up to three times those that the information says.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
@@ -41,6 +39,7 @@ from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.pairs.estimate import run_over_pairs
 from sfm_shapefit.pairs.kernels import fill_basis, median
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.scene.matches import RayMatches
 
 _FIRST_WIDTH_PX = 4.0  # pixels, s of the first step at least; a pose from few trials is off by as much
@@ -57,27 +56,14 @@ _LEAST_INFORMATION = 1.0  # rad^-2; a rotation is never known less
 _ROUNDING = 1e-12  # share of H_ww's trace; the rounding of the Schur complement
 
 
-class TwoViewPoses(NamedTuple):
-    """The relative poses of k image pairs, refined."""
-
-    rotations: FloatArray
-    """(k, 3, 3) cam_j_from_cam_i."""
-    translations: FloatArray
-    """(k, 3) unit vectors in axes of camera j, x_j = rotation x_i + translation; the sign is the start's."""
-    information: FloatArray
-    """(k, 3, 3) information of the rotations, in rad^-2; axes of camera j, see `RelativeRotations`."""
-    weight_shares: FloatArray
-    """(k,) mean robust weight of the matches, in [0, 1]."""
-
-
 def refine_two_view_poses(
     matches: RayMatches,
     rotations: FloatArray,
     translations: FloatArray,
     threads: int = 1,
     off_rad: float = 0.0,
-) -> TwoViewPoses:
-    """Return the relative poses that fit all matches best, near a start.
+) -> RelativeRotations:
+    """Return the relative poses that fit all matches best, near a start, whose signs translations keep.
 
     Each pair is refined on its own: neither batches nor `threads` change a bit of the answer.
 
@@ -91,14 +77,18 @@ def refine_two_view_poses(
     Source: Sampson's error as in Hartley and Zisserman, "Multiple View Geometry", 11.4.3, for rays.
     """
     k = len(matches.pairs)
-    poses = TwoViewPoses(
-        np.array(rotations, dtype=np.float64, order="C").reshape(k, 3, 3),
-        np.array(translations, dtype=np.float64, order="C").reshape(k, 3),
-        np.zeros((k, 3, 3)),
-        np.zeros(k),
+    turns = np.array(rotations, dtype=np.float64, order="C").reshape(k, 3, 3)
+    shifts = np.array(translations, dtype=np.float64, order="C").reshape(k, 3)
+    information, shares = np.zeros((k, 3, 3)), np.zeros(k)
+    run_over_pairs(refine_pairs, matches, threads, off_rad, turns, shifts, information, shares)
+    return RelativeRotations(
+        pairs=matches.pairs,
+        rotations=turns,
+        information=information,
+        num_matches=np.diff(matches.offsets),
+        weight_shares=shares,
+        translations=shifts,
     )
-    run_over_pairs(refine_pairs, matches, threads, off_rad, *poses)
-    return poses
 
 
 @kernel
@@ -193,11 +183,9 @@ def _linearize(
         by_a, by_b = e * along_a / q, e * along_b / q
         d0, d1, d2 = n0 + by_a * a0 + by_b * b0, n1 + by_a * a1 + by_b * b1, n2 + by_a * a2 + by_b * b2
         # Both terms of the rotation's are a' x (...).
-        m0, m1, m2 = (
-            b1 * t2 - b2 * t1 + by_a * t0,
-            b2 * t0 - b0 * t2 + by_a * t1,
-            b0 * t1 - b1 * t0 + by_a * t2,
-        )
+        m0 = b1 * t2 - b2 * t1 + by_a * t0
+        m1 = b2 * t0 - b0 * t2 + by_a * t1
+        m2 = b0 * t1 - b1 * t0 + by_a * t2
         ratio = scale * e / width_px
         weight = 1.0 / (1.0 + ratio * ratio)
         lines[k] = scale * (d0 * x0 + d1 * x1 + d2 * x2)

@@ -64,7 +64,7 @@ def convert(
     """
     # Here, so that the command line knows the formats without loading pycolmap.
     from sfm_shapefit.files.colmap.model import model_of, read_model
-    from sfm_shapefit.files.colmap.other_programs import posed_model_of, reconstruction_of
+    from sfm_shapefit.files.colmap.other_programs import reconstruction_of
     from sfm_shapefit.files.colmap.seed import write_model
     from sfm_shapefit.files.opensfm import read_opensfm
 
@@ -75,22 +75,22 @@ def convert(
     source = model_of(source)
     protect = [source] if isinstance(source, Path | str) else []
     if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
-        source = reconstruction_of(read_opensfm(Path(source)), source)
+        source = reconstruction_of(read_opensfm(Path(source)))
     if name in {"glb", "ply"}:
         from sfm_shapefit.report.mesh import mesh_bytes
 
         _write_file(mesh_bytes(_drawing_of(source), name), path, overwrite=overwrite)
         return name
-    model = read_model(source).reconstruction
+    model = read_model(source)
     if FORMATS[name].text_of:
         module, _, function = FORMATS[name].text_of.partition(":")
-        text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(posed_model_of(model))
+        text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(model.images)
         _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
         return name
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")
     with atomic_folder(path, protect=protect) as folder:
-        write_model(model, folder, text=name == "colmap-txt")
+        write_model(model.reconstruction, folder, text=name == "colmap-txt")
     return name
 
 

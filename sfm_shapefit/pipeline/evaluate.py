@@ -12,12 +12,12 @@ from sfm_shapefit.files.colmap.model import ModelSource, read_model
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
-    NamedPoses,
     PositionEvaluation,
     evaluate_poses,
     evaluate_positions,
 )
 from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.pose_errors import NamedPoses
 
 
 def evaluate(

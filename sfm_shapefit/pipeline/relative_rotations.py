@@ -7,7 +7,6 @@ from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
@@ -17,11 +16,9 @@ from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pairs.essential import (
     LikelyPoses,
-    RelativeSource,
     concatenate_rotations,
     estimate_relative_rotations,
     have_many_pairs,
-    stored_relative_rotations,
 )
 from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
@@ -53,7 +50,6 @@ def relative_rotations(
     database: Path | str,
     *,
     min_matches: int = LEAST_MATCHES,
-    source: RelativeSource = "matches",
     threads: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -65,8 +61,6 @@ def relative_rotations(
     Args:
         database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
         min_matches: pairs with fewer inlier matches are left out; at least 1.
-        source: "matches": estimated from the inlier matches; "stored": as the database stores them, see
-            `stored_relative_rotations`.
         threads: among which the pairs are shared out; 0 for one per core.
         executor: of `concurrent.futures`; its workers estimate instead, and open the database themselves. It
             is not shut down.
@@ -81,18 +75,13 @@ def relative_rotations(
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    if source not in get_args(RelativeSource):
-        raise ValueError(f"source must be one of {', '.join(get_args(RelativeSource))}, got {source!r}")
     if min_matches < 1:
         raise ValueError(f"min_matches must be at least 1, got {min_matches}")
     clock = Clock.of(progress, SolverOptions(threads=threads), executor)
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())
-        if source == "stored":
-            found = stored_relative_rotations(view, min_matches)
-        else:
-            found = measure_rotations(view, min_matches, clock)
+        found = measure_rotations(view, min_matches, clock)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=images.names)
 

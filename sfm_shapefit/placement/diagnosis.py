@@ -117,7 +117,7 @@ def diagnose(
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)
     options = options or PlacementOptions()
-    graph, n, pairs = measured.graph, measured.num_cameras, measured.pair_graph
+    graph, n, pairs = measured.graph, measured.num_cameras, measured.without_points().graph
     pieces = order_pieces(graph, n)
     obstacle = ""
     try:

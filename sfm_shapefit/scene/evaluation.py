@@ -13,7 +13,7 @@ a camera that the model misses counts as a failure. AUC of relative poses, ATE a
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -30,8 +30,8 @@ from sfm_shapefit.base.geometry import (
 )
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.scene.pose_errors import (
-    ComparedPoses,
     ErrorSummary,
+    NamedPoses,
     TrajectoryErrors,
     area_under_recall,
     relative_pose_errors,
@@ -55,19 +55,6 @@ _MIN_COMMON = 3  # centers in common; fewer never determine a similarity
 _CAP_OF_SPREAD = 0.5
 _OTHER_SCENE_DEG = 20.0  # degrees; poses that are only rough are nearer, unlike scenes 30 and more apart
 _COLLINEAR_RATIO = 1e-3  # second over first singular value of the centers; with less they are a line
-# Largest entry of R R^T - I; published references printed with 6 digits are off by 2e-6.
-_ORTHOGONALITY_TOLERANCE = 1e-4
-
-
-class NamedPoses(NamedTuple):
-    """n cameras, known by their names."""
-
-    names: Sequence[str]
-    """Each distinct."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world."""
-    centers: FloatArray
-    """(n, 3) in world axes."""
 
 
 class Recall(Record):
@@ -171,10 +158,8 @@ class Evaluation(Displayed):
     """Diagonal of the bounding box of all reference centers, in the reference's units."""
     recalls: tuple[Recall, ...]
     """Recall at the relative thresholds, then at the absolute ones that were asked for."""
-    relative_pose_errors_deg: FloatArray
-    """(p,) errors of pairs of common cameras: the larger of the angles of rotation and direction."""
     relative_pose_aucs: tuple[RelativePoseAuc, ...]
-    """The area under the recall of these errors at 0.5, 1, 5 and 10 degrees."""
+    """The area under the recall of the errors of pairs at 0.5, 1, 5 and 10 degrees."""
     trajectory: TrajectoryErrors | None
     """ATE and RPE of the common cameras in the order of their names; None if not asked for."""
     warnings: tuple[str, ...]
@@ -254,17 +239,15 @@ def evaluate_poses(
         trajectory: also compute ATE and RPE of the common cameras in the order of their names.
 
     Raises:
-        InputError: if an array has a wrong shape, is not finite or holds a matrix that is no rotation, a name
-            stands twice, a threshold is not positive, fewer than 3 cameras are common, or all common
-            centers of either side coincide.
+        InputError: if a threshold is not positive, fewer than 3 cameras are common, or all common centers of
+            either side coincide.
     """
-    _check_poses("the model", model)
-    _check_poses("the reference", reference)
     for threshold in thresholds:
         if not (np.isfinite(threshold) and threshold > 0.0):
             raise InputError(f"a recall threshold must be a positive number, got {threshold}")
     in_model, in_ref = _common_cameras(model.names, reference.names)
-    x, y = model.centers[in_model], reference.centers[in_ref]
+    ours, theirs = model.taken(in_model), reference.taken(in_ref)
+    x, y = ours.centers, theirs.centers
     _refuse_coincident("the model", x)
     _refuse_coincident("the reference", y)
 
@@ -272,18 +255,17 @@ def evaluate_poses(
     ref_from_model = fit_similarity_l1(x, y, cap=cap)
     aligned = ref_from_model.apply(x)
     errors = np.linalg.norm(aligned - y, axis=1)
-    turns = np.swapaxes(reference.rotations[in_ref], 1, 2) @ model.rotations[in_model]
+    turns = np.swapaxes(theirs.rotations, 1, 2) @ ours.rotations
     global_rotation = mean_rotation_l1(turns)
 
     turned_deg = rotation_angles_deg(turns @ global_rotation.T)
     close = errors < cap
     degenerate = _on_a_line(x, close) or _on_a_line(y, close)
     extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
-    ours, theirs = ComparedPoses(model.rotations[in_model], x), ComparedPoses(reference.rotations[in_ref], y)
     pair_errors = relative_pose_errors(ours, theirs, extent)
-    in_time = np.argsort(np.array([reference.names[k] for k in in_ref]), kind="stable")
+    in_time = np.argsort(np.array(theirs.names), kind="stable")
     return Evaluation(
-        names=tuple(reference.names[k] for k in in_ref),
+        names=theirs.names,
         missing=_only_in(reference.names, model.names),
         extra=_only_in(model.names, reference.names),
         position_errors=frozen(errors),
@@ -293,37 +275,10 @@ def evaluate_poses(
         rotation_ref_from_model=frozen(global_rotation),
         extent=extent,
         recalls=_recalls(errors, len(reference.names), extent, thresholds),
-        relative_pose_errors_deg=frozen(pair_errors),
         relative_pose_aucs=_relative_pose_aucs(pair_errors, len(in_ref), len(reference.names)),
         trajectory=trajectory_errors(ours.taken(in_time), theirs.taken(in_time)) if trajectory else None,
         warnings=_warnings(degenerate, close, cap, turned_deg),
     )
-
-
-def _check_poses(owner: str, poses: NamedPoses) -> None:
-    """Raise InputError unless names, rotations and centers are distinct, matching, finite and orthogonal."""
-    names, rotations, centers = poses.names, poses.rotations, poses.centers
-    count = len(names)
-    if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
-        raise InputError(
-            f"{owner} has {count} names, rotations of shape {rotations.shape} and centers of shape"
-            f" {centers.shape}; give ({count}, 3, 3) and ({count}, 3)"
-        )
-    if len(set(names)) < count:
-        repeated = next(name for k, name in enumerate(names) if name in names[:k])
-        raise InputError(f"{owner} has two cameras named '{repeated}'; names must be distinct")
-    finite = np.isfinite(centers).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
-    _refuse(np.asarray(~finite), owner, names, "has a pose that is not finite; repair or remove it")
-    product = rotations @ np.swapaxes(rotations, 1, 2)
-    skewed = np.abs(product - np.eye(3)).max(axis=(1, 2), initial=0.0) > _ORTHOGONALITY_TOLERANCE
-    mirrored = np.linalg.det(rotations) < 0.0
-    _refuse(np.asarray(skewed | mirrored), owner, names, "has a matrix that is no rotation; repair it")
-
-
-def _refuse(bad: BoolArray, owner: str, names: Sequence[str], reason: str) -> None:
-    """Raise InputError for the first camera that is bad."""
-    if bad.any():
-        raise InputError(f"camera '{names[int(np.argmax(bad))]}' of {owner} {reason}")
 
 
 def _only_in(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:

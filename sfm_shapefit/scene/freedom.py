@@ -39,12 +39,10 @@ class FreedomOptions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, asks in (
-            ("intrinsics", self.intrinsics in ("focal", "all")),
-            ("rigs", self.rigs == "free"),
-        ):
-            if asks:
-                self.refuse_held(name, getattr(self, name))
+        if self.intrinsics in ("focal", "all"):
+            self.refuse_held("intrinsics", self.intrinsics)
+        if self.rigs == "free":
+            self.refuse_held("rigs", self.rigs)
 
     def adjusts_cameras(self, num_cameras: int) -> bool:
         """Return whether `num_cameras` placed cameras are adjusted, unless the optimum is wanted as it is."""

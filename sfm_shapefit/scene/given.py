@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
 from sfm_shapefit.base.geometry import principal_lengths
 from sfm_shapefit.scene.known_positions import KnownPositions
 
@@ -16,6 +16,12 @@ class Datum(NamedTuple):
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
+
+    @property
+    def statement(self) -> str:
+        """What coordinates in these axes are, in words."""
+        place = f"{self.latitude_deg:.6f}, {self.longitude_deg:.6f} deg, {self.altitude_m:.2f} m"
+        return f"meters east, north and up of {place}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +42,7 @@ class PositionPriors:
     def with_sigmas(self) -> "PositionPriors":
         """Return those whose standard deviation is known."""
         has_sigma: BoolArray = np.asarray(np.isfinite(self.known.information).all(axis=(1, 2)))
-        return replace(self, known=self.known.subset(has_sigma))
+        return replace(self, known=rows_taken(self.known, has_sigma))
 
     def __len__(self) -> int:
         """Return how many cameras have one."""
@@ -127,7 +133,7 @@ class Gravity(NamedTuple):
     def of(self, images: IntArray) -> "Gravity":
         """Return those of some images (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.indices, images, assume_unique=True, return_indices=True)
-        return Gravity(places, self.directions[rows], self.sigmas[rows])
+        return rows_taken(self, rows)._replace(indices=places)
 
     def of_frames(self, frame_of_image: IntArray, sensor_rotations: FloatArray) -> "Gravity":
         """Return the gravities of frames, by the frame (n,) and sensor_from_rig (n, 3, 3) of each image.

@@ -71,6 +71,16 @@ class Sensors:
         object.__setattr__(self, "rig_of", frozen(np.asarray(self.rig_of, dtype=np.int64)))
         object.__setattr__(self, "is_reference", frozen(np.asarray(self.is_reference, dtype=np.bool_)))
 
+    @classmethod
+    def references(cls, count: int) -> "Sensors":
+        """Return so many lenses, each the reference of a rig of its own."""
+        return cls(
+            rotations=np.tile(np.eye(3), (count, 1, 1)),
+            translations=np.zeros((count, 3)),
+            rig_of=np.arange(count),
+            is_reference=np.ones(count, dtype=np.bool_),
+        )
+
     def part(self, lenses: IntArray) -> "Sensors":
         """Return those of some lenses, rigs renumbered."""
         return Sensors(
@@ -212,18 +222,9 @@ class Images:
         """Return the images each in a frame of its own, at the origin, in axes of its camera."""
         ids, frame_of = np.unique(self.ids, return_inverse=True)
         turns, places = np.tile(np.eye(3), (len(ids), 1, 1)), np.zeros((len(ids), 3))
-        count = len(self.lenses)
-        return replace(
-            self,
-            frame_of=frame_of.ravel(),
-            frames=Frames(ids=ids, rotations=turns, centers=places),
-            sensors=Sensors(
-                rotations=np.tile(np.eye(3), (count, 1, 1)),
-                translations=np.zeros((count, 3)),
-                rig_of=np.arange(count),
-                is_reference=np.ones(count, dtype=np.bool_),
-            ),
-        )
+        frames = Frames(ids=ids, rotations=turns, centers=places)
+        sensors = Sensors.references(len(self.lenses))
+        return replace(self, frame_of=frame_of.ravel(), frames=frames, sensors=sensors)
 
     def turned_to(self, rotations: FloatArray) -> "Images":
         """Return the images with rotations (i, 3, 3) cam_from_world, all frames at the origin.

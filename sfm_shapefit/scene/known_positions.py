@@ -4,7 +4,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray, rows_taken
 
 
 class KnownPositions(NamedTuple):
@@ -31,13 +31,7 @@ class KnownPositions(NamedTuple):
     def among(self, members: IntArray) -> Self:
         """Return those of some members (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
-        return self.subset(rows)._replace(indices=places)
-
-    def subset(self, rows: IntArray | BoolArray) -> Self:
-        """Return the given ones, in that order."""
-        return self._replace(
-            indices=self.indices[rows], positions=self.positions[rows], information=self.information[rows]
-        )
+        return rows_taken(self, rows)._replace(indices=places)
 
     def sigmas(self) -> FloatArray:
         """Return the standard deviation per axis, (k,), the mean of all axes; NaN where it is not known."""

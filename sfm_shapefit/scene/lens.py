@@ -210,10 +210,8 @@ def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float
             vv = radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v
             cross = slope * uv + 2.0 * (p1 * u + p2 * v)
             determinant = uu * vv - cross * cross
-            step_u, step_v = (
-                (vv * off_u - cross * off_v) / determinant,
-                (uu * off_v - cross * off_u) / determinant,
-            )
+            step_u = (vv * off_u - cross * off_v) / determinant
+            step_v = (uu * off_v - cross * off_u) / determinant
             u, v, step = u - step_u, v - step_v, np.hypot(step_u, step_v)
             if not (step > _STILL).any():
                 break

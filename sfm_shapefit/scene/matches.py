@@ -11,7 +11,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar
 from weakref import WeakSet
 
@@ -57,13 +57,8 @@ class RayMatches:
     def rays_of(self, chosen: IntArray) -> "RayMatches":
         """Return the rays of some of the pairs, in that order."""
         offsets, rows = rows_of_parts(self.offsets, chosen)
-        return RayMatches(
-            pairs=self.pairs[chosen],
-            offsets=offsets,
-            rays_i=self.rays_i[rows],
-            rays_j=self.rays_j[rows],
-            pixel_angles=self.pixel_angles[chosen],
-        )
+        pairs, pixel_angles = self.pairs[chosen], self.pixel_angles[chosen]
+        return replace(self._taken(offsets, rows), pairs=pairs, pixel_angles=pixel_angles)
 
     def thinned(self, most: int) -> "RayMatches":
         """Return the pairs with at most so many matches each, taken evenly."""
@@ -72,7 +67,10 @@ class RayMatches:
         offsets = np.append(0, np.cumsum(taken))
         position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
         steps = position * np.repeat(counts, taken) // np.repeat(taken, taken)
-        rows = np.repeat(self.offsets[:-1], taken) + steps
+        return self._taken(offsets, np.repeat(self.offsets[:-1], taken) + steps)
+
+    def _taken(self, offsets: IntArray, rows: IntArray) -> "RayMatches":
+        """Return the pairs with other matches, by rows."""
         return RayMatches(
             pairs=self.pairs,
             offsets=offsets,
@@ -100,22 +98,6 @@ class MatchBatch(RayMatches):
 
     keypoints: IntArray
     """(M, 2) index of the keypoint in image i and in image j."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RelativePoses:
-    """The relative poses of k image pairs: x_j = rotation x_i + translation in camera axes."""
-
-    pairs: IntArray
-    """(k, 2) images (i, j), i < j."""
-    rotations: FloatArray
-    """(k, 3, 3) camera j from camera i."""
-    translations: FloatArray
-    """(k, 3) unit vectors, in the axes of camera j."""
-    configs: IntArray
-    """(k,) COLMAP's TwoViewGeometryConfiguration."""
-    num_inliers: IntArray
-    """(k,) number of inlier matches."""
 
 
 class Reading(NamedTuple):

@@ -43,17 +43,20 @@ class TrajectoryErrors(Record):
     rpe_rotation_deg: Annotated[ErrorSummary, "Angle of the relative pose error of neighbors."]
 
 
-class ComparedPoses(NamedTuple):
-    """n cameras."""
+class NamedPoses(NamedTuple):
+    """n cameras, known by their names."""
 
+    names: tuple[str, ...]
+    """Each distinct."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     centers: FloatArray
     """(n, 3) in world axes."""
 
-    def taken(self, order: IntArray) -> "ComparedPoses":
+    def taken(self, order: IntArray) -> "NamedPoses":
         """Return some of the cameras, in another order."""
-        return ComparedPoses(self.rotations[order], self.centers[order])
+        names = tuple(self.names[k] for k in order.tolist())
+        return NamedPoses(names, self.rotations[order], self.centers[order])
 
 
 def summarize_errors(errors: FloatArray) -> ErrorSummary:
@@ -86,7 +89,7 @@ def area_under_recall(errors: FloatArray, num_missing: int, thresholds: Sequence
     return areas
 
 
-def relative_pose_errors(model: ComparedPoses, reference: ComparedPoses, extent: float) -> FloatArray:
+def relative_pose_errors(model: NamedPoses, reference: NamedPoses, extent: float) -> FloatArray:
     """Return the error of each pair of n cameras in degrees, of at most `MOST_COMPARED_PAIRS` pairs.
 
     Args:
@@ -109,10 +112,10 @@ def relative_pose_errors(model: ComparedPoses, reference: ComparedPoses, extent:
     return np.asarray(errors)
 
 
-def trajectory_errors(model: ComparedPoses, reference: ComparedPoses) -> TrajectoryErrors:
+def trajectory_errors(model: NamedPoses, reference: NamedPoses) -> TrajectoryErrors:
     """Return ATE and RPE of n corresponding cameras in the order of time."""
     onto = fit_similarity(model.centers, reference.centers)
-    moved = ComparedPoses(model.rotations @ onto.rotation.T, onto.apply(model.centers))
+    moved = NamedPoses(model.names, model.rotations @ onto.rotation.T, onto.apply(model.centers))
     turns, shifts = [], []
     for poses in (moved, reference):
         before, after = poses.rotations[:-1], poses.rotations[1:]

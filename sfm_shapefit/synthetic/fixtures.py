@@ -34,9 +34,6 @@ if TYPE_CHECKING:
 __all__ = ["assert_locations_near", "assert_reconstruction_near"]
 
 
-# --- comparisons -------------------------------------------------------------------------------------------
-
-
 def assert_reconstruction_near(
     found: Any,
     truth: Any,
@@ -95,9 +92,6 @@ def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: fl
     error = float(np.linalg.norm(difference))
     worst = int(np.argmax(np.linalg.norm(difference, axis=1)))
     assert error <= max_error, f"relative error {error:.3g}, limit {max_error:g}; worst location {worst}"
-
-
-# --- fixtures ----------------------------------------------------------------------------------------------
 
 
 def _new_folder(tmp_path: Path) -> Path:

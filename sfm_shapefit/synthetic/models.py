@@ -12,24 +12,14 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.files.colmap.points import add_points
 from sfm_shapefit.files.colmap.seed import write_model
+from sfm_shapefit.files.colmap.template import Template, heads_of
+from sfm_shapefit.scene.points import Points, number_points
 from sfm_shapefit.synthetic.layouts import ByteArray, SceneCameras
 from sfm_shapefit.synthetic.mounts import Rigs
 from sfm_shapefit.synthetic.options import ModelContent
-
-
-class ModelPoints(NamedTuple):
-    """The points of a model."""
-
-    ids: IntArray
-    """(p,)"""
-    xyz: FloatArray
-    """(p, 3) world axes."""
-    colors: ByteArray
-    """(p, 3) red, green, blue."""
-    tracks: Sequence[IntArray]
-    """Per point (k, 2): (image, keypoint)."""
 
 
 def image_name(index: int) -> str:
@@ -95,7 +85,9 @@ class ModelParts(NamedTuple):
     camera: pycolmap.Camera
     keypoints: Sequence[FloatArray]
     """Per image, (k, 2)."""
-    points: ModelPoints | None
+    points: Points
+    colors: ByteArray
+    """(x, 3) red, green, blue of each point."""
 
     def model(self, rotations: FloatArray) -> pycolmap.Reconstruction:
         """Return the model with the given rotations at the true centers."""
@@ -104,30 +96,21 @@ class ModelParts(NamedTuple):
 
     def rotations_only(self) -> pycolmap.Reconstruction:
         """Return cameras and images with the stated rotations, all centers at the origin, and no points."""
-        bare = self._replace(keypoints=[np.empty((0, 2))] * self.scene.num_images, points=None)
+        nothing = [np.empty((0, 2))] * self.scene.num_images
+        bare = self._replace(keypoints=nothing, points=number_points([]), colors=self.colors[:0])
         return bare._assemble([rigid(rotation, np.zeros(3)) for rotation in self.scene.stated_rotations])
 
     def _assemble(self, poses: list[pycolmap.Rigid3d]) -> pycolmap.Reconstruction:
         """Return the model; a frame has the pose of the reference sensor of its rig."""
-        model = pycolmap.Reconstruction()
         cameras, rigs = new_rigs(self.scene.rigs, self.camera)
         images, frames = new_images(self.scene.rigs, self.keypoints)
-        for camera in cameras:
-            model.add_camera(camera)
-        for rig in rigs:
-            model.add_rig(rig)
         for frame, k in zip(frames, np.flatnonzero(self.scene.rigs.sensor_of_image == 0), strict=True):
             frame.rig_from_world = poses[k]
-            model.add_frame(frame)
-        for image, f in zip(images, self.scene.rigs.frame_of_image, strict=True):
-            image.frame_id = int(f) + 1
-            model.add_image(image)
-        if self.points is not None:
-            for point_id, xyz, color, seen in zip(*self.points, strict=True):
-                track = pycolmap.Track([pycolmap.TrackElement(k + 1, xy) for k, xy in seen.tolist()])
-                point = pycolmap.Point3D(xyz=xyz, color=color, track=track)
-                model.add_point3D_with_id(int(point_id), point)
-            model.update_point_3d_errors()
+        model = Template(
+            cameras=tuple(cameras), rigs=tuple(rigs), frames=heads_of(frames), images=tuple(images)
+        ).build()
+        add_points(model, np.arange(1, len(images) + 1), self.points, self.colors)
+        model.update_point_3d_errors()
         return model
 
 

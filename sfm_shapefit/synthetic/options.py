@@ -1,6 +1,5 @@
 """What to photograph and what to write of it: data alone, cheap to import, as flags are made of it."""
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -64,18 +63,23 @@ class SceneOptions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in _SMALLEST_INTEGERS.items():
-            self.check_range(name, least)
+        for least, names in (
+            (0, ("seed",)),
+            (1, ("num_points", "max_pairs_per_image")),
+            (2, ("num_images",)),
+            (8, ("min_matches", "max_keypoints_per_image")),
+            (16, ("image_width", "image_height")),
+        ):
+            for name in names:
+                self.check_range(name, least)
         most = self.max_matches_per_pair
         if most is not None and most < self.min_matches:
             raise ValueError(f"max_matches_per_pair must be >= min_matches = {self.min_matches}, got {most}")
-        for name in ("pixel_noise_px", "rotation_noise_deg"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and >= 0, got {getattr(self, name)}")
+        self.check_range("pixel_noise_px", 0.0, 1e6)
+        self.check_range("rotation_noise_deg", 0.0, 180.0)
         for name in ("wrong_match_fraction", "corrupted_pair_fraction"):
             self.check_range(name, 0.0, 1.0)
-        if not 0.0 < self.focal_length_px < math.inf:
-            raise ValueError(f"focal_length_px must be positive, got {self.focal_length_px}")
+        self.check_range("focal_length_px", 1e-3, 1e9)
 
     @property
     def calibration(self) -> "FloatArray":
@@ -84,18 +88,6 @@ class SceneOptions(Settings):
 
         f, x, y = self.focal_length_px, self.image_width / 2.0, self.image_height / 2.0
         return np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
-
-
-_SMALLEST_INTEGERS = {
-    "num_images": 2,
-    "num_points": 1,
-    "max_pairs_per_image": 1,
-    "min_matches": 8,
-    "max_keypoints_per_image": 8,
-    "image_width": 16,
-    "image_height": 16,
-    "seed": 0,
-}
 
 
 @explained

@@ -18,16 +18,16 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, sum_by
 from sfm_shapefit.base.atomic_folder import atomic_folder
 from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.scene.matches import MatchBatch, Reading
+from sfm_shapefit.scene.points import Points, number_points
 from sfm_shapefit.synthetic.models import (
     ModelParts,
-    ModelPoints,
     image_name,
     new_camera,
     new_images,
@@ -176,33 +176,33 @@ def _mount_cameras(scene: RenderedScene, path: Path) -> None:
             database.write_frame(frame, use_frame_id=True)
 
 
-# --- models ------------------------------------------------------------------------------------------------
-
-
 def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
     """Return what models are made of: judged keypoints and their points, or none."""
-    camera = _camera(scene)
-    if judged is None:
-        return ModelParts(scene, camera, [np.empty((0, 2))] * scene.num_images, None)
-    return ModelParts(scene, camera, judged.keypoints, _true_points(judged))
+    keypoints, points = [np.empty((0, 2))] * scene.num_images, number_points([])
+    if judged is not None:
+        keypoints, points = judged.keypoints, _true_points(judged)
+    colors = np.full((points.num_points, 3), _POINT_GRAY, dtype=np.uint8)
+    return ModelParts(scene, _camera(scene), keypoints, points, colors)
 
 
-def _true_points(judged: JudgedMatches) -> ModelPoints:
+def _true_points(judged: JudgedMatches) -> Points:
     """Return the points along right matches, each at the mean of the surface points under its keypoints."""
-    first = np.cumsum([0] + [len(xy) for xy in judged.keypoints])
+    counts = [len(xy) for xy in judged.keypoints]
+    first, image = np.cumsum([0, *counts]), np.repeat(np.arange(len(counts)), counts)
     pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
     nodes = (judged.matches.keypoints + first[judged.matches.pairs[pair]])[judged.is_right]
     label = connected_components(int(first[-1]), nodes)
-    order = np.argsort(label, kind="stable")
-    surface = np.concatenate(judged.surface)
-    points, tracks = [], []
-    for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        images, once = np.unique(np.searchsorted(first, group, side="right") - 1, return_index=True)
-        if len(images) >= 2:
-            points.append(surface[group[once]].mean(axis=0))
-            tracks.append(np.stack([images, group[once] - first[images]], axis=1))
-    colors = np.full((len(points), 3), _POINT_GRAY, dtype=np.uint8)
-    return ModelPoints(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
+    rows = np.unique(label * len(counts) + image, return_index=True)[1]  # the first in each image
+    rows = rows[np.bincount(label[rows])[label[rows]] >= 2]
+    known, place, lengths = np.unique(label[rows], return_inverse=True, return_counts=True)
+    surface = np.concatenate(judged.surface)[rows]
+    return Points(
+        xyz=sum_by(place, surface, len(known)) / lengths[:, None],
+        offsets=np.append(0, np.cumsum(lengths)),
+        images=image[rows],
+        keypoints=rows - first[image[rows]],
+        ids=np.arange(1, len(known) + 1),
+    )
 
 
 def _camera(scene: RenderedScene) -> pycolmap.Camera:

@@ -132,9 +132,6 @@ def project_distorted(scene: RenderedScene, image: int, points: FloatArray) -> F
     return np.asarray(xy, dtype=np.float64).reshape(-1, 2)
 
 
-# --- options -----------------------------------------------------------------------------------------------
-
-
 def _refuse_folding(scene: RenderedScene) -> None:
     """Raise InputError unless the distorted radius grows with the true one out to the image's corners."""
     size = scene.options.image_width, scene.options.image_height
@@ -149,9 +146,6 @@ def _refuse_folding(scene: RenderedScene) -> None:
             f"a lens with k1 = {k1} and k2 = {k2} folds an image of this size over itself;"
             " choose smaller ones or a longer focal length"
         )
-
-
-# --- rays and triangles ------------------------------------------------------------------------------------
 
 
 def _undistort(scene: RenderedScene, xy: FloatArray) -> FloatArray:
@@ -230,9 +224,6 @@ def _nearest_triangles(
                     inverse_depth[r, c] = total
                     nearest[r, c] = k
     return nearest, inverse_depth
-
-
-# --- colors -----------------------------------------------------------------------------------------------
 
 
 class Canvas(NamedTuple):

@@ -162,9 +162,6 @@ def project_points(
     return np.asarray(xy, dtype=np.float64).reshape(-1, 2)
 
 
-# --- keypoints -------------------------------------------------------------------------------------------
-
-
 def _candidates(layout: SceneLayout, options: SceneOptions) -> Iterator[IntArray]:
     """Yield for each image the points, ascending, near enough to be shown: those in a ball about its view.
 
@@ -222,9 +219,6 @@ def _inside_image(xy: FloatArray, options: SceneOptions, margin_px: float = 0.0)
     x, y = xy[..., 0], xy[..., 1]
     in_width = (x >= margin_px) & (x <= options.image_width - margin_px)
     return np.asarray(in_width & (y >= margin_px) & (y <= options.image_height - margin_px))
-
-
-# --- pairs and matches -----------------------------------------------------------------------------------
 
 
 def _pairs(keypoint_points: list[IntArray], options: SceneOptions) -> IntArray:
@@ -292,9 +286,6 @@ def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> t
     changed[rows, 1] = np.roll(matches[rows, 1], 1)
     wrong[rows] = True
     return changed, wrong
-
-
-# --- corrupted pairs -------------------------------------------------------------------------------------
 
 
 def _false_lists(

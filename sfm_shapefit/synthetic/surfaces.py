@@ -93,9 +93,6 @@ def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random
     )
 
 
-# --- shapes ------------------------------------------------------------------------------------------------
-
-
 def _facade(num_images: int, repeated: float, rng: np.random.Generator) -> list[_Part]:
     """Return a row of houses along x, their fronts at y = 0, with boxes and ground before them."""
     columns = int(np.ceil(np.sqrt(num_images)))
@@ -178,9 +175,6 @@ _BUILDERS: dict[Shape, Callable[[int, float, np.random.Generator], list[_Part]]]
     "drive": _drive,
     "courtyard": _courtyard,
 }
-
-
-# --- things ------------------------------------------------------------------------------------------------
 
 
 def _house_maker(

@@ -17,8 +17,9 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.atomic_folder import atomic_folder
+from sfm_shapefit.scene.points import Points
 from sfm_shapefit.synthetic import models
-from sfm_shapefit.synthetic.models import ModelParts, ModelPoints
+from sfm_shapefit.synthetic.models import ModelParts
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.scenes import Scene
 
@@ -35,11 +36,12 @@ def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = 
     with atomic_folder(out) as workspace:
         if options.database:
             _write_database(scene, workspace / "database.db", relative_poses=options.relative_poses)
-        parts = ModelParts(scene, _camera(scene), scene.keypoints, _points(scene))
+        points = _points(scene)
+        parts = ModelParts(scene, _camera(scene), scene.keypoints, points, scene.colors[points.ids - 1])
         models.write_models(parts, workspace, options.model)
 
 
-def _points(scene: Scene) -> ModelPoints:
+def _points(scene: Scene) -> Points:
     """Return the points that two images or more show; point p of the scene has id p + 1."""
     image = np.repeat(np.arange(scene.num_images), [len(ids) for ids in scene.keypoint_points])
     keypoint = np.concatenate([np.arange(len(ids)) for ids in scene.keypoint_points])
@@ -48,18 +50,19 @@ def _points(scene: Scene) -> ModelPoints:
     visible = np.flatnonzero((point >= 0) & (length[point] >= 2))
     visible = visible[np.argsort(point[visible], kind="stable")]
     shown = np.flatnonzero(length >= 2)
-    seen = np.stack([image[visible], keypoint[visible]], axis=1)
-    tracks = np.split(seen, np.cumsum(length[shown])[:-1]) if len(shown) else []
-    return ModelPoints(shown + 1, scene.points[shown], scene.colors[shown], tracks)
+    return Points(
+        xyz=scene.points[shown],
+        offsets=np.append(0, np.cumsum(length[shown])),
+        images=image[visible],
+        keypoints=keypoint[visible],
+        ids=shown + 1,
+    )
 
 
 def _camera(scene: Scene) -> pycolmap.Camera:
     """Return the camera of a scene."""
     k = scene.calibration
     return models.new_camera(scene, "PINHOLE", [k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
-
-
-# --- database --------------------------------------------------------------------------------------------
 
 
 def _write_database(scene: Scene, path: Path, *, relative_poses: bool) -> None:

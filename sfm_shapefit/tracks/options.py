@@ -71,13 +71,7 @@ class StructureOptions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 < self.max_reprojection_error_px < float("inf"):
-            raise ValueError(
-                f"max_reprojection_error_px must be positive and finite, got {self.max_reprojection_error_px}"
-            )
-        if not 0.0 <= self.min_triangulation_angle_deg < 90.0:
-            raise ValueError(
-                f"min_triangulation_angle_deg must lie in [0, 90), got {self.min_triangulation_angle_deg}"
-            )
+        self.check_range("max_reprojection_error_px", 1e-6, 1e6)
+        self.check_range("min_triangulation_angle_deg", 0.0, 89.9)
         self.check_range("min_track_length", 2)
         self.check_range("min_points_per_image", 0)

@@ -17,16 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt64Array
+from sfm_shapefit.base.jit import kernel, mix_bits
 
 _LONG = 6  # views; longer tracks come no earlier, see the header
 _WANTED, _WANTED_IN_ALL = 200, 20_000  # observations per image, and in all; small scenes can afford more each
 # Observations beyond which a track may be far longer than the others, and how many times as long as nine
 # tenths of them it is then; see the header.
 _MAYBE_JOINED, _FAR_LONGER = 100, 4.0
-# Multipliers that scramble bits; the finalizer of splitmix64 (Steele, Lea and Flood 2014).
-_MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _TURN = np.uint64(0x9E3779B97F4A7C15)  # multiplier of the second coordinate; the increment of splitmix64
 
 
@@ -58,20 +56,12 @@ def _longest(lengths: IntArray) -> float:
     return max(_MAYBE_JOINED, _FAR_LONGER * float(np.quantile(lengths, 0.9)))
 
 
-def _draw(offsets: IntArray, pixels: FloatArray) -> np.ndarray[Any, np.dtype[np.uint64]]:
+def _draw(offsets: IntArray, pixels: FloatArray) -> UInt64Array:
     """Return a random number of each track, (t,), that its pixels alone determine."""
     bits = np.ascontiguousarray(pixels, dtype=np.float64).view(np.uint64)
-    mixed = _scramble(_scramble(bits[:, 0]) + _TURN * bits[:, 1])
+    mixed = mix_bits(mix_bits(bits[:, 0]) + _TURN * bits[:, 1])
     sums = np.concatenate([np.zeros(1, dtype=np.uint64), np.cumsum(mixed)])
-    return _scramble(sums[offsets[1:]] - sums[offsets[:-1]])
-
-
-def _scramble(
-    values: np.ndarray[Any, np.dtype[np.uint64]],
-) -> np.ndarray[Any, np.dtype[np.uint64]]:
-    for shift, factor in zip((30, 27), _MIX, strict=True):
-        values = (values ^ (values >> np.uint64(shift))) * factor
-    return values ^ (values >> np.uint64(31))
+    return np.asarray(mix_bits(sums[offsets[1:]] - sums[offsets[:-1]]))
 
 
 @kernel

@@ -181,7 +181,7 @@ def test_no_nearby_similarity_has_a_smaller_sum_of_distances(cap):
     source = rng.normal(size=(15, 3))
     target = source + 0.1 * rng.standard_t(2, size=(15, 3))
     target[:4] += 1.0
-    fit = fit_similarity_l1(source, target, cap=cap, iterations=2000)
+    fit = fit_similarity_l1(source, target, cap=cap)
 
     def cost(s: Similarity) -> float:
         return float(np.minimum(np.linalg.norm(s.apply(source) - target, axis=1), cap).sum())

@@ -17,7 +17,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import angle_between_deg, normalized
 from sfm_shapefit.files.colmap import check, sqlite_file
 from sfm_shapefit.files.colmap.check import check_model_files
-from sfm_shapefit.files.colmap.database import find_database, relative_poses
+from sfm_shapefit.files.colmap.database import find_database
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.lenses import lens_of, rays_of
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
@@ -552,7 +552,7 @@ def pair_id(a: int, b: int) -> int:
 
 
 def write_database(path: Path, scene: pycolmap.Reconstruction, id_of=lambda i: i, cols: int = 6) -> Path:
-    """Write the scene's keypoints, matches and exact relative poses, with ids renamed by `id_of`."""
+    """Write the scene's keypoints and matches, with ids renamed by `id_of`."""
     connection = sqlite3.connect(path)
     connection.executescript(SCHEMA)
     for i, image in scene.images.items():
@@ -568,8 +568,7 @@ def write_database(path: Path, scene: pycolmap.Reconstruction, id_of=lambda i: i
             for k, p in enumerate(scene.image(a).points2D)
             if p.has_point3D() and p.point3D_id in of_point
         ]
-        pose = scene.image(b).cam_from_world() * scene.image(a).cam_from_world().inverse()
-        add_pair(connection, id_of(a), id_of(b), rows, pose=pose)
+        add_pair(connection, id_of(a), id_of(b), rows)
     connection.commit()
     connection.close()
     return path
@@ -581,21 +580,19 @@ def path(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
     return write_database(tmp_path / "d.db", scene)
 
 
-def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=None) -> None:
+def add_pair(connection, a, b, rows, *, config=2) -> None:
     """Insert or replace one row of two_view_geometries."""
-    if pose is not None:
-        qvec, tvec = pose.rotation.quat[[3, 0, 1, 2]].tobytes(), pose.translation.tobytes()
     data = np.array(rows, dtype="<u4").reshape(-1, 2).tobytes()
     connection.execute(
-        "INSERT OR REPLACE INTO two_view_geometries VALUES (?, ?, 2, ?, ?, NULL, NULL, NULL, ?, ?)",
-        (pair_id(a, b), len(rows), data, config, qvec, tvec),
+        "INSERT OR REPLACE INTO two_view_geometries VALUES (?, ?, 2, ?, ?, NULL, NULL, NULL, NULL, NULL)",
+        (pair_id(a, b), len(rows), data, config),
     )
 
 
 def read_all(path: Path, model):
-    """Read everything a database offers."""
+    """Read all matches that a database offers."""
     with view_of(path, model.images) as view:
-        return as_sets(view.batches()), relative_poses(view)
+        return as_sets(view.batches())
 
 
 ID_ORDERS = {"same ids": lambda i: i, "reversed ids": lambda i: 100 - i, "mixed ids": lambda i: i * 5 % 7}
@@ -623,18 +620,6 @@ def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols
     assert all(found[p] >= expected[p] for p in twice)
 
 
-@pytest.mark.parametrize("order", ID_ORDERS)
-def test_relative_poses_point_from_camera_j_to_camera_i(scene, model, tmp_path, order):
-    _, poses = read_all(write_database(tmp_path / "d.db", scene, ID_ORDERS[order]), model)
-    assert poses.pairs.tolist() == [list(pair) for pair in itertools.combinations(range(6), 2)]
-    assert_poses_point_to_the_first_camera(poses, model)
-    i, j = poses.pairs.T
-    relative = model.images.rotations[j] @ model.images.rotations[i].transpose(0, 2, 1)
-    np.testing.assert_allclose(poses.rotations, relative, atol=64 * EPS)
-    assert poses.configs.tolist() == [2] * 15
-    assert poses.num_inliers.tolist() == [12] * 15
-
-
 def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
     def change(connection):
         add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
@@ -646,72 +631,25 @@ def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
     assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
 
 
-def test_only_configurations_with_verified_matches_or_poses_are_used(path, model):
+def test_only_configurations_with_verified_matches_are_used(path, model):
     pairs = list(itertools.combinations(range(1, 6), 2))  # ten pairs, one per configuration
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 2.0]))
 
     def change(connection):
         connection.execute("DELETE FROM two_view_geometries")
         for config, (a, b) in enumerate(pairs):
-            add_pair(connection, a, b, [(0, 0), (1, 1)], config=config, pose=pose)
+            add_pair(connection, a, b, [(0, 0), (1, 1)], config=config)
 
-    matches, poses = read_all(edit_database(path, change), model)
+    matches = read_all(edit_database(path, change), model)
     config_of = {(a - 1, b - 1): config for config, (a, b) in enumerate(pairs)}
     assert [config_of[pair] for pair in matches] == [2, 3, 4, 5, 6, 8, 9]
-    assert poses.configs.tolist() == [2, 3, 4, 6, 9]
-    np.testing.assert_array_equal(poses.translations, [[0.0, 0.0, 1.0]] * 5)
-
-
-def test_poses_that_mean_none_are_left_out(path, model):
-    def blob(*values):
-        return np.array(values, dtype="<f8").tobytes()
-
-    one, none = blob(1.0, 0.0, 0.0, 0.0), blob(0.0, 0.0, 0.0)
-    step = blob(0.1, 0.0, 0.0)
-    absent = [
-        (None, None), (one, None), (None, step), (one, none), (blob(0, 0, 0, 0), step),
-        (blob(0.6, 0.8, 0, 0), none), (blob(NAN, 0, 0, 1), step), (one, blob(1, INF, 0)),
-        (one, blob(1e200, 1e200, 0)),
-    ]  # fmt: skip
-
-    def change(connection):
-        connection.execute("DELETE FROM two_view_geometries")
-        pairs = itertools.combinations(range(1, 7), 2)
-        for (qvec, tvec), (a, b) in zip([*absent, (one, step)], pairs, strict=False):
-            add_pair(connection, a, b, [(0, 0)], qvec=qvec, tvec=tvec)
-
-    matches, poses = read_all(edit_database(path, change), model)
-    assert len(matches) == len(absent) + 1
-    assert len(poses.pairs) == 1
-    np.testing.assert_array_equal(poses.translations, [[1.0, 0.0, 0.0]])
-
-
-def test_an_old_database_without_pose_columns_has_no_relative_poses(path, model):
-    drop = "ALTER TABLE two_view_geometries DROP COLUMN "
-    matches, poses = read_all(edit_database(path, drop + "qvec", drop + "tvec", "DROP TABLE cameras"), model)
-    assert len(matches) == 15
-    assert poses.pairs.shape == (0, 2)
-    assert poses.rotations.shape == (0, 3, 3)
 
 
 def test_a_database_of_pycolmap_is_read(tmp_path):
-    settings = {"num_frames_per_rig": 4, "two_view_geometry_has_relative_pose": True}
     with pycolmap.Database.open(tmp_path / "database.db") as database:
-        scene = synthesize(4, database, num_rigs=1, num_points3D=20, **settings)
-    model = read_model(scene)
-    matches, poses = read_all(tmp_path / "database.db", model)
+        scene = synthesize(4, database, num_rigs=1, num_points3D=20, num_frames_per_rig=4)
+    matches = read_all(tmp_path / "database.db", read_model(scene))
     # In its database every pair of keypoints is a match of one point; the points2D carry the same order.
     assert matches == brute_force_tracks(scene)
-    assert_poses_point_to_the_first_camera(poses, model)
-
-
-def assert_poses_point_to_the_first_camera(poses, model):
-    """R_j^T t_ij is the direction of C_i - C_j."""
-    i, j = poses.pairs.T
-    directions = np.einsum("nji,nj->ni", model.images.rotations[j], poses.translations)
-    np.testing.assert_allclose(
-        directions, normalized(model.images.centers[i] - model.images.centers[j]), atol=256 * EPS
-    )
 
 
 def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
@@ -739,8 +677,6 @@ BROKEN_ROWS = {
     "negative pair": (f"{GEOMETRY} pair_id = -pair_id", "pair -.* is damaged"),
     "unknown image": (f"{GEOMETRY} pair_id = {pair_id(1, 77)} {FIRST}", "joins the images with ids 1 and 77"),
     "own image": (f"{GEOMETRY} pair_id = {pair_id(2, 2)} {FIRST}", "joins the images with ids 2 and 2"),
-    "short pose": (f"{GEOMETRY} qvec = x'00'", "a relative pose of wrong length"),
-    "text pose": (f"{GEOMETRY} tvec = 'north'", "a relative pose of wrong length"),
     "few keypoints": (
         f"{KEYPOINTS} rows = 3, data = substr(data, 1, 72) WHERE image_id = 2",
         "has matches of keypoints that do not exist",
@@ -803,7 +739,7 @@ def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
 def test_reading_changes_no_byte_and_leaves_no_file(path, model, journal_mode):
     edit_database(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
     before = fingerprint(path.parent)
-    assert len(read_all(path, model)[0]) == 15
+    assert len(read_all(path, model)) == 15
     assert fingerprint(path.parent) == before
 
 
@@ -834,7 +770,7 @@ def test_rows_that_sit_in_a_wal_file_are_read_with_or_without_its_shm_and_the_fi
     for there, files in ((path, {"d.db", "d.db-wal", "d.db-shm"}), (crashed, {"d.db", "d.db-wal"})):
         before = {name: content for name, content in fingerprint(there.parent).items() if "/" not in name}
         assert set(before) == files
-        matches, _ = read_all(there, model)
+        matches = read_all(there, model)
         assert (0, 1) not in matches
         assert len(matches) == 14
         assert before.items() <= fingerprint(there.parent).items()
@@ -852,7 +788,7 @@ def test_a_hot_journal_is_rolled_back_in_a_copy_only(path, model):
     assert crashed.read_bytes() != path.read_bytes()
     before = fingerprint(crashed.parent)
 
-    assert len(read_all(crashed, model)[0]) == 15
+    assert len(read_all(crashed, model)) == 15
     assert fingerprint(crashed.parent) == before
 
 
@@ -860,7 +796,7 @@ def test_paths_that_mean_something_in_a_uri_are_read(scene, model, tmp_path):
     folder = tmp_path / "50%41 of #1? & Fotos für=alle"
     folder.mkdir()
     path = write_database(folder / "d?mode=rwc.db", scene)
-    assert len(read_all(path, model)[0]) == 15
+    assert len(read_all(path, model)) == 15
     assert os.listdir(folder) == [path.name]
 
 

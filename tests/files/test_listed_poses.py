@@ -51,7 +51,7 @@ def test_focal_lengths_are_those_of_the_frame_or_of_all_or_unknown(tmp_path, fra
 @pytest.mark.parametrize("kind", ["transforms.json", "poses.tum"])
 def test_a_models_poses_come_back_by_the_names_of_its_images(tmp_path, kind):
     convert(TRUTH, tmp_path / kind)
-    found = read_list(tmp_path / kind, DATABASE).reconstruction
+    found = read_list(tmp_path / kind, DATABASE)[0]
     truth = poses_of(pycolmap.Reconstruction(TRUTH))
     assert poses_of(found).keys() == truth.keys()
     for name, pose in poses_of(found).items():
@@ -67,14 +67,13 @@ def test_guessed_focal_lengths_are_those_of_the_list_at_the_databases_size_and_m
         for name, fl in zip(names, (110, 90, 120), strict=True)
     ]
     (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
-    measured = read_list(tmp_path / "poses.json", database)
-    assert measured.guessed == frozenset()
+    assert read_list(tmp_path / "poses.json", database)[1] == frozenset()
     edit_database(database, "UPDATE cameras SET prior_focal_length = 0")
-    found = read_list(tmp_path / "poses.json", database)
-    (camera,) = found.reconstruction.cameras.values()
-    assert found.guessed == {camera.camera_id}
+    found, guessed = read_list(tmp_path / "poses.json", database)
+    (camera,) = found.cameras.values()
+    assert guessed == {camera.camera_id}
     assert camera.mean_focal_length() == pytest.approx(1.1 * camera.width)
-    assert len(found.reconstruction.reg_image_ids()) == 3
+    assert len(found.reg_image_ids()) == 3
 
 
 @pytest.mark.parametrize(

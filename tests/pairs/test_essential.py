@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.geometry import normalized, rotation_angles_deg
-from sfm_shapefit.files.colmap.database import relative_poses
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pairs import essential as relative_rotations
@@ -15,11 +14,8 @@ from sfm_shapefit.pairs.essential import (
     concatenate_rotations,
     estimate_relative_rotations,
     have_many_pairs,
-    stored_relative_rotations,
 )
 from sfm_shapefit.scene.matches import MatchBatch, Reading
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
-from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.problems import turn
 from tests.scenes import COURTYARD, read_from, real_scene, view_of
 
@@ -144,28 +140,6 @@ def test_where_matches_fit_a_likely_pose_there_are_no_trials_and_elsewhere_it_ch
     close = rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ without.rotations)
     assert np.quantile(close[~is_tried], 0.95) < 1e-3
     assert_same_bits(estimate_relative_rotations(batch, threads=3, likely=likely), found)
-
-
-def test_stored_rotations_count_by_their_matches(tmp_path):
-    write_workspace(
-        make_scene(SceneOptions(num_images=8, num_points=300)),
-        tmp_path / "ring",
-        WorkspaceOptions(relative_poses=True),
-    )
-    path = tmp_path / "ring" / "database.db"
-    model = unposed(path)
-    with view_of(path, model) as view:
-        every = stored_relative_rotations(view)
-        least = int(np.median(every.num_matches)) + 1
-        few = stored_relative_rotations(view, least)
-        poses = relative_poses(view)
-    assert 0 < len(few.pairs) < len(every.pairs)
-    assert_same_bits(every.subset(every.num_matches >= least), few)
-    np.testing.assert_array_equal(every.rotations, poses.rotations)
-    np.testing.assert_array_equal(every.weight_shares, 1.0)
-    focal_px = model.focal_lengths_px.min()
-    expected = every.num_matches[:, None, None] * (focal_px / 20.0) ** 2 * np.eye(3)
-    np.testing.assert_allclose(every.information, expected)
 
 
 @pytest.mark.parametrize("field_deg", [60.0, 170.0, 300.0])

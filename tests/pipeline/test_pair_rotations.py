@@ -46,11 +46,10 @@ def test_pairs_are_positions_in_the_sorted_names(found):
     assert fingerprint(COURTYARD) == before
 
 
-def test_inlier_matches_are_enough_and_without_stored_poses_none_are_found(found, tmp_path):
+def test_inlier_matches_are_enough(found, tmp_path):
     nothing = "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL"
     path = edit_database(copied(COURTYARD, tmp_path) / "database.db", nothing)
     assert_same_bits(sfm_shapefit.relative_rotations(path), found)
-    assert len(sfm_shapefit.relative_rotations(path, source="stored").pairs) == 0
 
 
 def test_of_very_many_pairs_few_are_tried_for_and_the_others_sought_near_their_average(found, monkeypatch):
@@ -134,7 +133,5 @@ def test_other_bad_arguments_are_refused(tmp_path):
         sfm_shapefit.relative_rotations(tmp_path / "none.db")
     with pytest.raises(ValueError, match="min_matches must be at least 1"):
         sfm_shapefit.relative_rotations(DATABASE, min_matches=0)
-    with pytest.raises(ValueError, match="source must be one of"):
-        sfm_shapefit.relative_rotations(DATABASE, source="guessed")
     with pytest.raises(ValueError, match="threads must"):
         sfm_shapefit.relative_rotations(DATABASE, threads=-1)

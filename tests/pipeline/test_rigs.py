@@ -166,7 +166,7 @@ def test_bundle_adjustment_keeps_the_rigs_their_scale_and_the_origin_of_the_inpu
 
 def test_a_list_of_poses_keeps_the_rigs_of_its_database(workspace, rigs, tmp_path):
     convert(workspace / "truth", tmp_path / "poses.json")
-    given = read_model(read_list(tmp_path / "poses.json", workspace / "database.db").reconstruction)
+    given = read_model(read_list(tmp_path / "poses.json", workspace / "database.db")[0])
     assert_rigs_equal(given.reconstruction, pycolmap.Reconstruction(workspace / "truth"), atol=1e-9)
     np.testing.assert_allclose(given.images.centers, rigs.centers, atol=1e-9)
     found = sfm_shapefit.locate(tmp_path / "poses.json", workspace / "database.db", rotations=2.0)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.scene import pose_errors
-from sfm_shapefit.scene.evaluation import NamedPoses, evaluate_poses
+from sfm_shapefit.scene.evaluation import evaluate_poses
 from sfm_shapefit.scene.pose_errors import (
-    ComparedPoses,
+    NamedPoses,
     area_under_recall,
     relative_pose_errors,
     trajectory_errors,
@@ -14,9 +14,13 @@ from sfm_shapefit.scene.pose_errors import (
 from tests.problems import random_rotations, turn
 
 
-def poses(seed: int, n: int) -> ComparedPoses:
+def numbered(rotations: np.ndarray, centers: np.ndarray) -> NamedPoses:
+    return NamedPoses(tuple(f"{k}.jpg" for k in range(len(centers))), rotations, centers)
+
+
+def poses(seed: int, n: int) -> NamedPoses:
     rng = np.random.default_rng(seed)
-    return ComparedPoses(random_rotations(rng, n), rng.normal(size=(n, 3)))
+    return numbered(random_rotations(rng, n), rng.normal(size=(n, 3)))
 
 
 def test_the_area_under_the_recall_is_that_of_its_trapezoids():
@@ -33,7 +37,7 @@ def test_a_turned_camera_spoils_its_own_pairs_by_its_angle_in_any_world():
     rotations = truth.rotations.copy()
     rotations[2] = turn(np.array([1.0, 2.0, 3.0]), 12.5) @ rotations[2]
     world = random_rotations(np.random.default_rng(1), 1)[0]
-    model = ComparedPoses(rotations @ world.T, 7.0 * truth.centers @ world.T + 3.0)
+    model = numbered(rotations @ world.T, 7.0 * truth.centers @ world.T + 3.0)
     errors = relative_pose_errors(model, truth, extent=3.0)
     first, second = np.triu_indices(6, 1)
     own = (first == 2) | (second == 2)
@@ -43,21 +47,18 @@ def test_a_turned_camera_spoils_its_own_pairs_by_its_angle_in_any_world():
 
 def test_the_direction_counts_where_it_is_the_larger_and_not_between_cameras_at_one_place():
     rotations = np.tile(np.eye(3), (3, 1, 1))
-    truth = ComparedPoses(rotations, np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]]))
-    model = ComparedPoses(rotations, np.array([[0.0, 0, 0], [1.0, 1.0, 0], [0.0, 0, 5.0]]))
+    truth = numbered(rotations, np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]]))
+    model = numbered(rotations, np.array([[0.0, 0, 0], [1.0, 1.0, 0], [0.0, 0, 5.0]]))
     errors = relative_pose_errors(model, truth, extent=1.0)
     between_1_and_2 = np.degrees(np.arccos(1.0 / np.sqrt(27.0)))  # (-1, -1, 5) against (-1, 0, 0)
     np.testing.assert_allclose(errors, [45.0, 0.0, between_1_and_2], atol=1e-12)
-    collapsed = ComparedPoses(rotations, np.zeros((3, 3)))
+    collapsed = numbered(rotations, np.zeros((3, 3)))
     assert relative_pose_errors(collapsed, truth, extent=1.0).tolist() == [180.0, 0.0, 180.0]
 
 
 def test_missing_cameras_fail_in_all_their_pairs():
     truth = poses(3, 10)
-    names = [f"{k}.jpg" for k in range(10)]
-    found = evaluate_poses(
-        NamedPoses(names[:6], truth.rotations[:6], truth.centers[:6]), NamedPoses(names, *truth)
-    )
+    found = evaluate_poses(truth.taken(np.arange(6)), truth)
     for auc in found.relative_pose_aucs:
         assert auc.auc == pytest.approx(15 / 45, abs=1e-6)
     assert [auc.threshold_deg for auc in found.relative_pose_aucs] == [0.5, 1.0, 5.0, 10.0]
@@ -69,7 +70,7 @@ def test_of_many_cameras_so_many_pairs_are_drawn_with_the_same_area(monkeypatch)
     truth = poses(4, 60)
     rotations = truth.rotations.copy()
     rotations[:6] = turn(np.array([0.0, 0.0, 1.0]), 90.0) @ rotations[:6]
-    model = ComparedPoses(rotations, truth.centers)
+    model = numbered(rotations, truth.centers)
     all_pairs = relative_pose_errors(model, truth, extent=5.0)
     monkeypatch.setattr(pose_errors, "MOST_COMPARED_PAIRS", 1000)
     some = relative_pose_errors(model, truth, extent=5.0)
@@ -87,8 +88,8 @@ def test_ate_and_rpe_of_a_bent_square_are_those_computed_by_hand():
     turned = rotations.copy()
     turned[3] = turn(np.array([1.0, 0.0, 0.0]), 10.0) @ turned[3]
     world = random_rotations(np.random.default_rng(5), 1)[0]
-    model = ComparedPoses(turned @ world.T, 4.0 * (square + bend) @ world.T - 8.0)
-    found = trajectory_errors(model, ComparedPoses(rotations, square))
+    model = numbered(turned @ world.T, 4.0 * (square + bend) @ world.T - 8.0)
+    found = trajectory_errors(model, numbered(rotations, square))
     assert found.ate.rms == pytest.approx(np.sqrt(2.0 / 3.0), abs=1e-12)
     assert found.ate.max == pytest.approx(found.ate.median, abs=1e-12)
     # A side of 2 became 4/3 long and rises by 4/3.

@@ -108,9 +108,6 @@ def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float
         raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 
-# --- binary models ---------------------------------------------------------------------------------
-
-
 class _BinaryFile:
     """A model file that is read once, from its begin to its end; every read is checked against the end."""
 
@@ -386,9 +383,6 @@ def _check_frames_match_images(file: _BinaryFile, camera_of_image: dict[int, int
                 f"image {image_id} belongs to camera {camera_of_image[image_id]} here, "
                 f"but to camera {camera_of[image_id]} in images.bin"
             )
-
-
-# --- text models -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

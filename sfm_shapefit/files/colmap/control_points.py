@@ -87,8 +87,7 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
         raise InputError(f"{path}: {error}") from error
     statement = f"{len(names)} points of {path}"
     if datum is not None:
-        latitude, longitude, altitude = datum
-        statement += f", meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+        statement += f", {datum.statement}"
     if len(used) < len(marks):
         statement += f", without {len(marks) - len(used)} of {len(marks)} marks, whose images the model lacks"
     return ControlPoints(

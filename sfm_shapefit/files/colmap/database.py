@@ -1,4 +1,4 @@
-"""Inlier matches and relative poses of a COLMAP database, read by sqlite3 without touching the file.
+"""Inlier matches of a COLMAP database, read by sqlite3 without touching the file.
 
 How the file is opened stands in `sqlite_file`, which pairs it has in `database_pairs`.
 """
@@ -13,29 +13,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array
+from sfm_shapefit.base.arrays import FloatArray, IntArray, UInt32Array, rows_taken
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.files.colmap.database_pairs import PairRows, check_schema, match_names, read_pairs
-from sfm_shapefit.files.colmap.images import rotation_matrices
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_blob
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
-from sfm_shapefit.scene.matches import Matches, Reading, RelativePoses, View
+from sfm_shapefit.scene.matches import Matches, Reading, View
 
 PIXEL_BYTES, MOST_KEYPOINTS = 8, 10_000_000
 """Bytes of a keypoint that is kept, and keypoints of a database up to which they are: a run looks at each a
 dozen times."""
 
 _HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of two of them
-
-_CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
-"""COLMAP's configurations without a direction: not verified (0, 1, 7), pure turn (5), several motions (8)."""
-
-# Stored translations are 1, or of the scene's size; shorter ones mean "none".
-_MIN_TRANSLATION = 1e-12
 
 
 def find_database(model_folder: Path) -> Path | None:
@@ -179,7 +171,7 @@ class DatabaseMatches(Matches):
         return [
             DatabasePart(
                 path=path,
-                rows=self.rows.subset(view.rows[part])._replace(pairs=view.pairs[part]),
+                rows=rows_taken(self.rows, view.rows[part])._replace(pairs=view.pairs[part]),
                 images=images,
             )
             for part in ranges
@@ -193,46 +185,6 @@ class DatabaseMatches(Matches):
         """Return the error that names a pair of images."""
         names = " and ".join(self.names[image] for image in self.pairs[pair])
         return InputError(f"{self.file.path}: the pair {names} has {what}; match the images again")
-
-
-def relative_poses(view: View) -> RelativePoses:
-    """Return the relative poses that the database of a view stores, most often none.
-
-    Left out are pairs whose configuration has no pose with a direction, and poses that are NULL, not
-    finite, of zero quaternion, or of zero translation (older COLMAP wrote the identity for "none").
-    Pairs are oriented i < j in the order of images: the pose is inverted when the database's ids
-    are in the other order. Translations are scaled to length 1.
-
-    Raises:
-        InputError: naming the pair whose pose is damaged.
-    """
-    matches = view.matches
-    assert isinstance(matches, DatabaseMatches)
-    keep = np.flatnonzero(~np.isin(matches.rows.configs[view.rows], _CONFIGS_WITHOUT_POSE))
-    poses = np.full((len(keep), 7), np.nan)
-    if {"qvec", "tvec"} <= matches.file.columns("two_view_geometries"):
-        rows = view.rows[keep]
-        for k, (qvec, tvec) in enumerate(matches.look_up(rows, "qvec, tvec")):
-            if qvec is None or tvec is None:
-                continue
-            if not (is_blob(qvec, 4, 1, itemsize=8) and is_blob(tvec, 3, 1, itemsize=8)):
-                raise matches.damaged_pair(int(rows[k]), "a relative pose of wrong length")
-            poses[k] = np.frombuffer(qvec + tvec, dtype="<f8")
-    with np.errstate(over="ignore", invalid="ignore"):  # neither NaN nor infinity passes
-        lengths = np.stack([np.linalg.norm(part, axis=1) for part in (poses[:, :4], poses[:, 4:])])
-        sound = ((lengths > [[0.0], [_MIN_TRANSLATION]]) & (lengths < np.inf)).all(axis=0)
-    keep, poses = keep[sound], poses[sound]
-
-    rotations, translations = rotation_matrices(poses[:, :4]), normalized(poses[:, 4:])
-    swapped = matches.rows.swapped[view.rows[keep]]
-    inverted = -np.einsum("nji,nj->ni", rotations, translations)
-    return RelativePoses(
-        pairs=view.pairs[keep],
-        rotations=np.where(swapped[:, None, None], rotations.transpose(0, 2, 1), rotations),
-        translations=np.where(swapped[:, None], inverted, translations),
-        configs=matches.rows.configs[view.rows[keep]],
-        num_inliers=matches.num_matches[view.rows[keep]],
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -15,7 +15,7 @@ import pycolmap
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
-from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.images import images_of, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.files.colmap.template import FrameHead, Template
 from sfm_shapefit.scene.images import Frames, Images
@@ -102,8 +102,9 @@ def _put_in_rigs(alone: Images, rigs: DatabaseRigs) -> Images:
     places = rigs.place_of_image
     frame_ids = [places[i].frame_id if i in places else i for i in alone.ids.tolist()]
     ids, frame_of = np.unique(frame_ids, return_inverse=True)
+    sensors = sensors_of(rigs.rigs.values(), [lens.id for lens in alone.lenses])
     frames = Frames(ids=ids, rotations=np.tile(np.eye(3), (len(ids), 1, 1)), centers=np.zeros((len(ids), 3)))
-    return replace(alone, frame_of=frame_of.ravel(), frames=frames, sensors=rigs.sensors_of(alone.lenses))
+    return replace(alone, frame_of=frame_of.ravel(), frames=frames, sensors=sensors)
 
 
 def trivial_rig(camera: pycolmap.Camera) -> pycolmap.Rig:

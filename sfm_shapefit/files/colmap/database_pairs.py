@@ -1,10 +1,9 @@
 """The tables of a COLMAP database that say which images have matches, checked row by row.
 
 Images of the database and of a model are matched by name, since their ids may differ. A pair of
-database images (a, b), a < b, has pair_id = 2147483647 a + b; `cam2_from_cam1` maps camera a to camera b.
+database images (a, b), a < b, has pair_id = 2147483647 a + b.
 
-Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc`; facts on versions 3.6
-to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
+Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc`.
 """
 
 from collections.abc import Sequence
@@ -42,12 +41,7 @@ class PairRows(NamedTuple):
     """Rows of two_view_geometries."""
     swapped: BoolArray
     """Whether the database has image j first."""
-    configs: IntArray
     num_inliers: IntArray
-
-    def subset(self, chosen: IntArray) -> "PairRows":
-        """Return the chosen pairs."""
-        return PairRows._make(column[chosen] for column in self)
 
 
 def check_schema(file: DatabaseFile) -> None:
@@ -114,7 +108,7 @@ def read_pairs(file: DatabaseFile, index_of_id: dict[int, int]) -> PairRows:
     if len(repeated):
         raise InputError(f"{file.path}: the two-view geometry of pair {repeated[0]} stands twice")
     order = order[~np.isin(configs[order], _CONFIGS_WITHOUT_MATCHES)]
-    return PairRows(ends[order], rowids[order], swapped[order], configs[order], num_inliers[order])
+    return PairRows(ends[order], rowids[order], swapped[order], num_inliers[order])
 
 
 def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:

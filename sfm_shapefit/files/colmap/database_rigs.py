@@ -7,7 +7,8 @@ Source: https://colmap.github.io/database.html, tables rigs, rig_sensors, frames
 and later); `sensor_from_rig` is a quaternion w x y z and a translation, eight bytes each.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +20,8 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
+from sfm_shapefit.files.colmap.images import sensor_id
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
-from sfm_shapefit.scene.images import Sensors
-from sfm_shapefit.scene.lens import Lens
 
 _CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 _POSE_BYTES = 7 * 8  # bytes of a pose; a quaternion and a translation in doubles
@@ -51,32 +51,9 @@ class DatabaseRigs:
 
     def renumbered(self, rig_id: int, new_id: int) -> pycolmap.Rig:
         """Return a copy of a rig under another id."""
-        rig = self.rigs[rig_id]
-        copy = pycolmap.Rig(rig_id=new_id)
-        copy.add_ref_sensor(rig.ref_sensor_id)
-        for sensor, pose in rig.non_ref_sensors.items():
-            copy.add_sensor(sensor, pose)
+        copy = deepcopy(self.rigs[rig_id])
+        copy.rig_id = new_id
         return copy
-
-    def sensors_of(self, lenses: Sequence[Lens]) -> Sensors:
-        """Return where lenses are in their rigs; one without a rig is the reference of its own."""
-        rig_of = {sensor.id: i for i, rig in self.rigs.items() for sensor in rig.sensor_ids()}
-        rotations, translations = np.tile(np.eye(3), (len(lenses), 1, 1)), np.zeros((len(lenses), 3))
-        is_reference = np.ones(len(lenses), dtype=np.bool_)
-        for k, lens in enumerate(lenses):
-            rig, sensor = self.rigs.get(rig_of.get(lens.id, -1)), _sensor(lens.id)
-            if rig is not None and not rig.is_ref_sensor(sensor):
-                pose = rig.sensor_from_rig(sensor)
-                assert pose is not None  # the rig is calibrated
-                rotations[k], translations[k] = pose.rotation.matrix(), pose.translation
-                is_reference[k] = False
-        numbers = [rig_of.get(lens.id, -1 - lens.id) for lens in lenses]
-        return Sensors(
-            rotations=rotations,
-            translations=translations,
-            rig_of=np.unique(numbers, return_inverse=True)[1].ravel(),
-            is_reference=is_reference,
-        )
 
 
 def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRigs:
@@ -102,15 +79,15 @@ def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRi
             continue
         if rig_id not in rigs:
             rigs[rig_id] = pycolmap.Rig(rig_id=rig_id)
-            rigs[rig_id].add_ref_sensor(_sensor(references[rig_id]))
-        if rigs[rig_id].has_sensor(_sensor(camera_id)):
+            rigs[rig_id].add_ref_sensor(sensor_id(references[rig_id]))
+        if rigs[rig_id].has_sensor(sensor_id(camera_id)):
             raise InputError(f"{path}: camera {camera_id} stands twice in rig {rig_id}; configure rigs again")
-        rigs[rig_id].add_sensor(_sensor(camera_id), _pose(path, rig_id, pose))
+        rigs[rig_id].add_sensor(sensor_id(camera_id), _pose(path, rig_id, pose))
     places = _places(path, images, rig_of_frame, data)
     for image_id, image in images.images.items():
         place = places.get(image_id)
         for rig_id, rig in rigs.items():
-            if rig.has_sensor(_sensor(image.camera_id)) and (place is None or place.rig_id != rig_id):
+            if rig.has_sensor(sensor_id(image.camera_id)) and (place is None or place.rig_id != rig_id):
                 incomplete.add(rig_id)
     return DatabaseRigs(
         rigs={rig_id: rig for rig_id, rig in rigs.items() if rig_id not in incomplete},
@@ -124,11 +101,6 @@ def _rows(file: DatabaseFile, table: str, columns: tuple[str, ...], kind: str = 
     of_cameras = f" WHERE {kind} = {_CAMERA}" if kind else ""
     query = f"SELECT {', '.join(columns)} FROM {table}{of_cameras} ORDER BY 1, 2"
     return file.rows(table, {(*columns, *([kind] if kind else [])): query})
-
-
-def _sensor(camera_id: int) -> pycolmap.sensor_t:
-    """Return the id of a camera as a sensor."""
-    return pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera_id)
 
 
 def _refuse_unknown_camera(

@@ -5,6 +5,8 @@ images are not written into a new one but into what they were read from, and wha
 keeps its bits.
 """
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 import pycolmap
 
@@ -27,7 +29,7 @@ def images_of(reconstruction: pycolmap.Reconstruction) -> Images:
         lens_of=camera_of.ravel(),
         frames=Frames(ids=frame_ids, rotations=rotations, centers=centers),
         lenses=tuple(lens_of(reconstruction.camera(i)) for i in camera_ids.tolist()),
-        sensors=_sensors(reconstruction, camera_ids.tolist()),
+        sensors=sensors_of(reconstruction.rigs.values(), camera_ids.tolist()),
     )
 
 
@@ -55,18 +57,15 @@ def put_images(reconstruction: pycolmap.Reconstruction, images: Images) -> None:
             if old is None:
                 reconstruction.register_frame(frame_id)
     camera_ids = [lens.id for lens in images.lenses]
-    before, after = _sensors(reconstruction, camera_ids), images.sensors
+    before, after = sensors_of(reconstruction.rigs.values(), camera_ids), images.sensors
     _scale_other_sensors(reconstruction, camera_ids, before, after)
     for k, lens in enumerate(images.lenses):
-        camera, rotation, translation = (
-            reconstruction.camera(lens.id),
-            after.rotations[k],
-            after.translations[k],
-        )
+        camera = reconstruction.camera(lens.id)
+        rotation, translation = after.rotations[k], after.translations[k]
         changes = (rotation != before.rotations[k]).any() or (translation != before.translations[k]).any()
         if changes and np.isfinite(translation).all():
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-            _rigs_by_camera(reconstruction)[lens.id].set_sensor_from_rig(camera.sensor_id, pose)
+            rigs_by_camera(reconstruction.rigs.values())[lens.id].set_sensor_from_rig(camera.sensor_id, pose)
         if lens.parameters != tuple(camera.params.tolist()):
             camera.params = list(lens.parameters)
 
@@ -76,7 +75,7 @@ def _scale_other_sensors(
 ) -> None:
     """Let sensors through which no image of ours was taken scale with those of their rig that are ours."""
     for rig in reconstruction.rigs.values():
-        own = [k for k, camera_id in enumerate(camera_ids) if rig.has_sensor(_sensor_id(camera_id))]
+        own = [k for k, camera_id in enumerate(camera_ids) if rig.has_sensor(sensor_id(camera_id))]
         lengths = [np.linalg.norm(sensors.translations[own], axis=1).sum() for sensors in (before, after)]
         if not (lengths[0] > 0.0 and lengths[1] > 0.0 and lengths[0] != lengths[1]):
             continue
@@ -86,7 +85,7 @@ def _scale_other_sensors(
                 rig.set_sensor_from_rig(sensor, moved)
 
 
-def _sensor_id(camera_id: int) -> pycolmap.sensor_t:
+def sensor_id(camera_id: int) -> pycolmap.sensor_t:
     """Return the id of a camera as a sensor."""
     return pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=camera_id)
 
@@ -98,18 +97,13 @@ def _poses(reconstruction: pycolmap.Reconstruction, frame_ids: list[int]) -> tup
         pose = reconstruction.frame(frame_id).rig_from_world
         if pose is not None:
             quaternions[k], translations[k] = pose.rotation.quat, pose.translation
-    rotations = rotation_matrices(quaternions[:, [3, 0, 1, 2]])
+    rotations = rotation_matrices(quaternions)
     return rotations, -np.einsum("nba,nb->na", rotations, translations)
 
 
-def _matrix(rotation: pycolmap.Rotation3d) -> FloatArray:
-    """Return the matrix of a rotation; the quaternion of a model in text need not be of length 1."""
-    return np.asarray(rotation_matrices(rotation.quat[None, [3, 0, 1, 2]])[0])
-
-
-def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
-    """Return the (n, 3, 3) rotations of quaternions (n, 4) in the order w, x, y, z; none may be zero."""
-    w, x, y, z = normalized(quaternions_wxyz).T
+def rotation_matrices(quaternions: FloatArray) -> FloatArray:
+    """Return the (n, 3, 3) rotations of quaternions (n, 4) x, y, z, w, which need not be of length 1."""
+    w, x, y, z = normalized(quaternions[:, [3, 0, 1, 2]]).T
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
         [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
@@ -118,29 +112,28 @@ def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
 
 
-def _sensors(reconstruction: pycolmap.Reconstruction, camera_ids: list[int]) -> Sensors:
-    """Return where cameras are in their rigs."""
-    rigs = _rigs_by_camera(reconstruction)
-    rotations, translations = np.tile(np.eye(3), (len(camera_ids), 1, 1)), np.zeros((len(camera_ids), 3))
-    is_reference = np.zeros(len(camera_ids), dtype=np.bool_)
+def sensors_of(all_rigs: Iterable[pycolmap.Rig], camera_ids: Sequence[int]) -> Sensors:
+    """Return where cameras are in their rigs; one without a rig is the reference of its own."""
+    rigs, count = rigs_by_camera(all_rigs), len(camera_ids)
+    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    is_reference = np.ones(count, dtype=np.bool_)
     for k, camera_id in enumerate(camera_ids):
-        rig, sensor = rigs[camera_id], reconstruction.camera(camera_id).sensor_id
-        is_reference[k] = rig.is_ref_sensor(sensor)
-        if not is_reference[k]:
+        rig, sensor = rigs.get(camera_id), sensor_id(camera_id)
+        if rig is not None and not rig.is_ref_sensor(sensor):
+            is_reference[k] = False
             pose = rig.sensor_from_rig(sensor) if rig.has_sensor_from_rig(sensor) else None
-            rotations[k] = np.nan if pose is None else _matrix(pose.rotation)
+            rotations[k] = np.nan if pose is None else rotation_matrices(pose.rotation.quat[None])[0]
             translations[k] = np.nan if pose is None else pose.translation
-    rig_ids = [rigs[camera_id].rig_id for camera_id in camera_ids]
+    numbers = [rigs[i].rig_id if i in rigs else -1 - i for i in camera_ids]
     return Sensors(
         rotations=rotations,
         translations=translations,
-        rig_of=np.unique(rig_ids, return_inverse=True)[1].ravel(),
+        rig_of=np.unique(numbers, return_inverse=True)[1].ravel(),
         is_reference=is_reference,
     )
 
 
-def _rigs_by_camera(reconstruction: pycolmap.Reconstruction) -> dict[int, pycolmap.Rig]:
+def rigs_by_camera(rigs: Iterable[pycolmap.Rig]) -> dict[int, pycolmap.Rig]:
     """Return the rig of each camera by its id."""
     kind = pycolmap.SensorType.CAMERA
-    rigs = reconstruction.rigs.values()
     return {sensor.id: rig for rig in rigs for sensor in rig.sensor_ids() if sensor.type == kind}

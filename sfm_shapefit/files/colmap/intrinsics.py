@@ -161,20 +161,16 @@ Rows = list[tuple[Any, ...]]
 
 def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]:
     """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
-    cameras = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
-    images = ("image_id", "name", "camera_id")
-    pairs = ("pair_id", "rows", "config", "F")
-    where = "WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id"
     most = _MOST_PAIRS + len(left_out)
-    queries = {
-        "cameras": (cameras, f"SELECT {', '.join(cameras)} FROM cameras"),
-        "images": (images, f"SELECT {', '.join(images)} FROM images"),
-        "two_view_geometries": (
-            pairs,
-            f"SELECT {', '.join(pairs)} FROM two_view_geometries {where} LIMIT {most}",
-        ),
+    which = f"WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id LIMIT {most}"
+    found = {
+        table: database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {chosen}"})
+        for table, columns, chosen in (
+            ("cameras", ("camera_id", "model", "width", "height", "params", "prior_focal_length"), ""),
+            ("images", ("image_id", "name", "camera_id"), ""),
+            ("two_view_geometries", ("pair_id", "rows", "config", "F"), which),
+        )
     }
-    found = {table: database.rows(table, {needed: query}) for table, (needed, query) in queries.items()}
     ids = {name: image_id for image_id, name, _ in found["images"]}
     unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in indices_of_pairs(ids, left_out).tolist()}
     kept = [row for row in found["two_view_geometries"] if row[0] not in unwanted]

@@ -7,7 +7,6 @@ focal length is that of the list, the median of its images, which is a guess too
 from collections import Counter
 from contextlib import closing
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -23,17 +22,9 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.posed_model import ListedPoses
+from sfm_shapefit.scene.listed_poses import ListedPoses
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum}
-
-
-class ListedModel(NamedTuple):
-    """A model made of a list of poses."""
-
-    reconstruction: pycolmap.Reconstruction
-    guessed: frozenset[int]
-    """Ids of the cameras whose focal lengths are those of the list."""
 
 
 def is_list(source: object) -> bool:
@@ -51,13 +42,15 @@ def read_source(source: ModelSource, database: Path | str | None) -> tuple[Colma
         InputError: as `read_model` and `read_list`.
     """
     if isinstance(source, Path | str) and is_list(source):
-        listed = read_list(Path(source), database)
-        return read_model(listed.reconstruction), listed.guessed
+        model, guessed = read_list(Path(source), database)
+        return read_model(model), guessed
     return read_model(source), frozenset()
 
 
-def read_list(file: Path, database: Path | str | None) -> ListedModel:
-    """Return the images of a database with the poses of a list; those that it lacks have none.
+def read_list(file: Path, database: Path | str | None) -> tuple[pycolmap.Reconstruction, frozenset[int]]:
+    """Return the images of a database with the poses of a list, and ids of cameras as `read_source`.
+
+    Images that the list lacks have no pose.
 
     Raises:
         InputError: if a file cannot be used, or hardly an image is in both.
@@ -85,7 +78,7 @@ def read_list(file: Path, database: Path | str | None) -> ListedModel:
         for k in uncalibrated
         if _set_focal_length(model.camera(images.lenses[k].id), poses.focal_shares[lens_of == k])
     }
-    return ListedModel(model, frozenset(guessed))
+    return model, frozenset(guessed)
 
 
 def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:

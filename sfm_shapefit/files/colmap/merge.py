@@ -42,12 +42,9 @@ def merge_models(
     joined = pycolmap.Reconstruction(first)
     joined.tear_down()
     moved = transform_model(second, first_from_second)
-    rigs = {rig_id: rig for rig_id, rig in moved.rigs.items() if rig.num_sensors() > 1}
-    in_rigs = {sensor.id for rig in rigs.values() for sensor in rig.sensor_ids()}
-    cameras = _add_cameras(joined, moved, in_rigs)
-    rig_ids = {}
-    for rig_id, rig in sorted(rigs.items()):
-        rig_ids[rig_id] = _add_rig(joined, moved, rig, cameras)
+    cameras: dict[int, int] = {}
+    used = sorted({moved.frame(frame_id).rig_id for frame_id in moved.reg_frame_ids()})
+    rig_ids = {rig_id: _add_rig(joined, moved, moved.rig(rig_id), cameras) for rig_id in used}
     image_ids = _add_frames(joined, moved, cameras, rig_ids)
     new, same = _add_points(joined, moved, image_ids)
     renamed: dict[int, int] = {}
@@ -96,7 +93,6 @@ class _Renamed(NamedTuple):
 
     cameras: dict[int, int]
     rigs: dict[int, int]
-    """Rigs of several cameras."""
     images: dict[int, int]
 
 
@@ -117,10 +113,6 @@ def _add_frame(
         )
         for image in images
     ]
-    if before.rig_id not in renamed.rigs:
-        for copy, image in zip(copies, images, strict=True):
-            joined.add_image_with_trivial_frame(copy, image.cam_from_world())
-        return
     frame = pycolmap.Frame(frame_id=frame_id, rig_id=renamed.rigs[before.rig_id])
     for copy in copies:
         frame.add_data_id(copy.data_id)
@@ -169,34 +161,19 @@ def _have_same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
     return first.shape == second.shape and bool((np.abs(first - second) <= _SAME_PIXEL).all())
 
 
-def _add_cameras(
-    joined: pycolmap.Reconstruction, second: pycolmap.Reconstruction, in_rigs: set[int]
-) -> dict[int, int]:
-    """Add the cameras of a second model but those in rigs of several, and return their ids."""
-    ids = {}
-    for camera_id in sorted({second.image(i).camera_id for i in second.reg_image_ids()} - in_rigs):
-        ids[camera_id] = camera_id
-        if camera_id in joined.cameras:
-            if _is_same_camera(joined.camera(camera_id), second.camera(camera_id)):
-                continue
-            ids[camera_id] = _free_id(joined, second)
-        joined.add_camera_with_trivial_rig(_renamed(second.camera(camera_id), ids[camera_id]))
-    return ids
-
-
 def _add_rig(
     joined: pycolmap.Reconstruction,
     second: pycolmap.Reconstruction,
     rig: pycolmap.Rig,
     cameras: dict[int, int],
 ) -> int:
-    """Add a rig of several cameras and note the ids of these; return its id. One that is there serves."""
+    """Add a rig and note the ids of its cameras; return its id. One that is there serves."""
     own = sorted(sensor.id for sensor in rig.sensor_ids())
     for rig_id, there in joined.rigs.items():
         if _is_same_rig(there, rig) and all(_is_same_camera(joined.camera(i), second.camera(i)) for i in own):
             cameras |= {i: i for i in own}
             return int(rig_id)
-    added = pycolmap.Rig(rig_id=_free_id(joined, second))
+    added = pycolmap.Rig(rig_id=_free_id(joined, second) if rig.rig_id in joined.rigs else rig.rig_id)
     for camera_id in own:
         taken = camera_id in joined.cameras
         cameras[camera_id] = _free_id(joined, second) if taken else camera_id

@@ -16,7 +16,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.lines import is_database, is_number, lines_of_cells
+from sfm_shapefit.files.lines import is_database, named_rows
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
@@ -26,6 +26,7 @@ _SENSOR_IS_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
 """What joins pose priors to their images, of databases whose priors may be of other sensors too."""
 _TABLE_COLUMNS = (4, 5, 7)  # cells of a row; a name, a position, and no, one or three standard deviations
+_FORM = "a name, three coordinates, and none, one or three standard deviations"
 _GEODETIC = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude", "height"})
 """Names of the columns of latitude, longitude and altitude, in this order."""
 _LARGEST = 1e30  # units; sums of squares of squares of larger coordinates or sigmas overflow
@@ -121,18 +122,9 @@ def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatAr
     """
     if is_database(path):
         raise InputError(f"{path} is a database; its own pose priors are priors=database")
-    found: dict[str, tuple[FloatArray, FloatArray]] = {}
-    geodetic, first = False, True
-    for number, cells in lines_of_cells(path):
-        if first and len(cells) > 1 and not is_number(cells[1]):
-            geodetic = _is_geodetic(path, cells)
-        else:
-            row = _parse(path, number, cells)
-            if cells[0] in found:
-                raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
-            found[cells[0]] = row
-        first = False
-    return found, geodetic
+    header, rows = named_rows(path, _TABLE_COLUMNS, _FORM)
+    geodetic = bool(header) and _is_geodetic(path, header)
+    return {name: _prior_of(where, values) for name, (where, values) in rows.items()}, geodetic
 
 
 def _is_geodetic(path: Path, header: list[str]) -> bool:
@@ -169,18 +161,11 @@ def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
     return np.frombuffer(blob, dtype="<f8").astype(np.float64)
 
 
-def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Return position and covariance of a line of a table."""
-    if len(cells) not in _TABLE_COLUMNS or not all(map(is_number, cells[1:])):
-        raise InputError(
-            f"{path}, line {number}: expected a name, three coordinates, and none, one or three "
-            "standard deviations"
-        )
-    values = np.array([float(cell) for cell in cells[1:]])
+def _prior_of(where: str, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return position and covariance by the numbers of a line."""
     if not (np.abs(values) <= _LARGEST).all() or (values[3:] < 1.0 / _LARGEST).any():
         raise InputError(
-            f"{path}, line {number}: coordinates must be finite and standard deviations positive, "
-            f"all below {_LARGEST:g}"
+            f"{where}coordinates must be finite and standard deviations positive, all below {_LARGEST:g}"
         )
     if len(values) == 3:
         return values, np.full((3, 3), np.nan)
@@ -200,10 +185,7 @@ def _priors(
             positions = enu_of(positions, datum)
         except ValueError as error:
             raise InputError(f"{source}: {error}") from error
-        latitude, longitude, altitude = datum
-        statement += (
-            f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
-        )
+        statement += f", in {datum.statement}"
     return PositionPriors(
         known=KnownPositions.measured(np.array(cameras, dtype=np.int64), positions, covariances),
         statement=statement,

@@ -57,32 +57,25 @@ def quiet_stderr() -> Iterator[None]:
     That holds for the whole process: messages of other threads are lost too, so a progress display must write
     to a duplicate of descriptor 2.
     """
-    if _heard.get():
-        yield
-        return
-    if sys.stderr is not None:
-        sys.stderr.flush()
-    with _to_nowhere(2):
-        try:
-            yield
-        finally:
-            if sys.stderr is not None:
-                sys.stderr.flush()
-
-
-@contextmanager
-def _to_nowhere(descriptor: int) -> Iterator[None]:
-    """Point a file descriptor to nowhere; one that does not exist stays so."""
     try:
-        saved = os.dup(descriptor)
-    except OSError:
+        saved = None if _heard.get() else os.dup(2)
+    except OSError:  # there is no such descriptor
+        saved = None
+    if saved is None:
         yield
         return
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(nowhere, descriptor)
+        _flush_stderr()
+        os.dup2(nowhere, 2)
         yield
     finally:
-        os.dup2(saved, descriptor)
+        _flush_stderr()
+        os.dup2(saved, 2)
         os.close(saved)
         os.close(nowhere)
+
+
+def _flush_stderr() -> None:
+    if sys.stderr is not None:
+        sys.stderr.flush()

@@ -81,7 +81,7 @@ def template_of(model: ColmapModel, replaced: BoolArray | None = None) -> Templa
     return Template(
         cameras=tuple(deepcopy(camera) for camera in read.cameras.values()),
         rigs=tuple(deepcopy(rig) for rig in read.rigs.values()),
-        frames=tuple(_heads(read.frames.values())),
+        frames=heads_of(read.frames.values()),
         images=tuple(
             bare_image(image, keeps_keypoints=image.image_id not in is_replaced)
             for image in read.images.values()
@@ -98,11 +98,14 @@ def bare_image(image: pycolmap.Image, *, keeps_keypoints: bool) -> pycolmap.Imag
     )
 
 
-def _heads(frames: Iterable[pycolmap.Frame]) -> Iterable[FrameHead]:
-    for frame in frames:
-        yield FrameHead(
+def heads_of(frames: Iterable[pycolmap.Frame]) -> tuple[FrameHead, ...]:
+    """Return the heads of frames, which outlive these."""
+    return tuple(
+        FrameHead(
             id=frame.frame_id,
             rig_id=frame.rig_id,
             data_ids=tuple(deepcopy(data_id) for data_id in frame.data_ids),
             pose=deepcopy(frame.rig_from_world),
         )
+        for frame in frames
+    )
