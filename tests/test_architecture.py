@@ -49,7 +49,7 @@ MOST_LINES = {
     "refinement": 2160,
     "report": 1690,
     "rotations": 2290,
-    "scene": 2100,
+    "scene": 2120,
     "solver": 4240,
     "synthetic": 2650,
     "synthetic/fixtures": 150,

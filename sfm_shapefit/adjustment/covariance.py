@@ -245,19 +245,6 @@ def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:
     return read
 
 
-def focal_sigmas(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
-    """Return the standard deviation of each lens's focal length as a share of it, (l,); 0 for what is held.
-
-    Args:
-        problem: at its minimum, with its priors.
-        options: as it was adjusted with.
-
-    Raises:
-        UnsolvableError: if the observations leave more open than a similarity.
-    """
-    return focal_shares(problem, estimate_covariances(problem, options))
-
-
 def focal_shares(problem: AdjustmentProblem, known: FrameCovariances) -> FloatArray:
     """Return the standard deviations (l,) of focal lengths as shares of them; 0 for what is held."""
     sigmas = known.lens_sigmas[:, FOCAL_LENGTHS]

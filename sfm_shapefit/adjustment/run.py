@@ -40,7 +40,7 @@ from sfm_shapefit.adjustment import (
     frames_not_gained,
     reprojection_errors_px,
 )
-from sfm_shapefit.adjustment.covariance import focal_sigmas
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.estimate import Estimate
 from sfm_shapefit.adjustment.free_sensors import judge_sensors
 from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
@@ -52,6 +52,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
@@ -228,7 +229,8 @@ class AdjustmentRun:
         if not free.lenses.any():
             return self, free.lenses
         try:
-            sigmas = focal_sigmas(last, replace(self.options_at_optimum(), **free.overrides()))
+            known = estimate_covariances(last, self.options_at_optimum(), **free.overrides())
+            sigmas = focal_shares(last, known)
         except UnsolvableError:
             sigmas = np.full(len(lenses), np.inf)
         of_lens = zip(lenses, free.lenses.tolist(), sigmas.tolist(), strict=True)
@@ -238,7 +240,7 @@ class AdjustmentRun:
     def _knowing(self, sigmas: FloatArray) -> "AdjustmentRun":
         """Return the run with how well the focal lengths that move are known, by sigmas (l,) of all."""
         sigmas = np.where(np.isnan(sigmas), np.inf, sigmas)
-        return replace(self, focal_sigmas=np.where(self.freedom.focal, sigmas, np.nan))
+        return replace(self, focal_sigmas=np.where(self.freedom.parts[:, FOCAL], sigmas, np.nan))
 
     def holding(self, held: BoolArray) -> "AdjustmentRun":
         """Return the run with some lenses (l,) as they were given, their focal lengths held from now on.

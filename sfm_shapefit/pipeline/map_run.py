@@ -31,6 +31,7 @@ from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
 
 _MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match
@@ -131,7 +132,7 @@ class MapRun(NamedTuple):
 
     def share_of_doubted_lenses(self) -> float:
         """Return the share of images whose intrinsics are in doubt."""
-        return float(np.mean(self.intrinsics.focal[self.images.lens_of]))
+        return float(np.mean(self.intrinsics.parts[self.images.lens_of, FOCAL]))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]

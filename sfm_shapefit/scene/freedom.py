@@ -9,6 +9,14 @@ Adjust = Literal["none", "seed", "full"]
 IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
 RigFreedom = Literal["held", "free"]
 
+PARTS_FREED: dict[IntrinsicsFreedom, tuple[str, ...]] = {
+    "auto": ("focal_lengths", "distortion"),
+    "held": (),
+    "focal": ("focal_lengths",),
+    "all": ("focal_lengths", "distortion"),
+}
+"""What each choice frees of a lens, see `scene.lens.PARTS`."""
+
 _MOST_ADJUSTED_CAMERAS = 2_000  # cameras; the adjustment of more would take longer than all the rest
 
 
@@ -40,7 +48,7 @@ class FreedomOptions(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, asks in (
-            ("intrinsics", self.intrinsics in ("focal", "all")),
+            ("intrinsics", self.intrinsics not in ("auto", "held")),
             ("rigs", self.rigs == "free"),
         ):
             if asks:
