@@ -33,8 +33,7 @@ def posed_images(model):
 
 def in_doubt(lens, focal_sigma=0.3, distortion_sigma=0.1):
     """A lens that may be off as it stands."""
-    sigmas = {"focal_sigma": focal_sigma, "distortion_sigma": distortion_sigma}
-    return replace(lens, given=lens.parameters, **sigmas)
+    return replace(lens, given=lens.parameters, sigmas=(focal_sigma, distortion_sigma))
 
 
 def copy_without_points(model):

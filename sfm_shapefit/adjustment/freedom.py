@@ -25,7 +25,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
-from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.lens import FOCAL, PARTS, Lens
 
 
 class GivenPoses(NamedTuple):
@@ -59,17 +59,15 @@ class Freedom:
     They enter covariances, and nothing else."""
     noise_px: float = 0.5
     """Standard deviation of an observation per axis, which pulls are weighed against."""
-    focal: BoolArray = field(default_factory=lambda: np.zeros((), dtype=np.bool_))
-    """Lenses whose focal lengths move, (l,) or one for all; they are in doubt."""
-    distortion: BoolArray = field(default_factory=lambda: np.zeros((), dtype=np.bool_))
-    """Lenses whose distortion moves, (l,) or one for all; they are in doubt."""
+    parts: BoolArray = field(default_factory=lambda: np.zeros(len(PARTS), dtype=np.bool_))
+    """Which of `PARTS` move, (l, p) of each lens or (p,) of all; such lenses are in doubt."""
     has_sensors: bool = False
     """Whether sensors move in their rigs, all but the references."""
 
     @classmethod
-    def asked(cls, options: FreedomOptions, lenses: tuple[BoolArray, BoolArray], *, rigs: bool) -> "Freedom":
-        """Return what is asked for: focal lengths and distortion of `lenses`, sensors if there are rigs."""
-        return cls(focal=lenses[0], distortion=lenses[1], has_sensors=rigs and options.rigs == "free")
+    def asked(cls, options: FreedomOptions, parts: BoolArray, *, rigs: bool) -> "Freedom":
+        """Return what is asked for: `parts` of lenses, and sensors if there are rigs."""
+        return cls(parts=parts, has_sensors=rigs and options.rigs == "free")
 
     @property
     def holds_rotations(self) -> bool:
@@ -92,41 +90,37 @@ class Freedom:
     @property
     def lenses(self) -> BoolArray:
         """Lenses that move, (l,) or one for all; all others stay what they are to the bit."""
-        return self.focal | self.distortion
+        return np.asarray(self.parts.any(axis=-1))
 
     def over(self, num_lenses: int) -> "Freedom":
         """Return the same with the lenses one by one."""
-        focal, distortion = (np.broadcast_to(one, num_lenses) for one in (self.focal, self.distortion))
-        return replace(self, focal=focal, distortion=distortion)
+        return replace(self, parts=np.broadcast_to(self.parts, (num_lenses, len(PARTS))))
 
     def holding(self, held: BoolArray, lenses: Sequence[Lens]) -> "Freedom":
         """Return the same, the focal lengths of `held` lenses (l,) among all held; else the whole lens.
 
-        Whole: where its distortion does not move by itself, as the focal length was held already, or as it
-        has none.
+        Whole: where no other part moves by itself, as the focal length was held already, or as it has none.
         """
-        bends = np.array([lens.is_bent for lens in lenses], dtype=np.bool_)
-        distortion = self.distortion & ~(held & ~(self.focal & bends))
-        return replace(self, focal=self.focal & ~held, distortion=distortion)
+        parts = self.over(len(lenses)).parts
+        others = parts & np.array([lens.own_parts for lens in lenses], dtype=np.bool_)
+        others[:, FOCAL] = False
+        goes_on = parts[:, FOCAL] & others.any(axis=1)
+        return replace(self, parts=np.where(held[:, None], others & goes_on[:, None], parts))
 
     def without_lenses(self) -> "Freedom":
         """Return the same with all lenses held."""
-        return replace(self, focal=np.zeros_like(self.focal), distortion=np.zeros_like(self.distortion))
+        return replace(self, parts=np.zeros_like(self.parts))
 
     def overrides(self) -> dict[str, Any]:
         """Return the options of an adjustment that moves its lenses."""
-        return {
-            "free_focal_lengths": bool(self.lenses.any()),
-            "free_distortion": bool(self.distortion.any()),
-        }
+        return {f"free_{part}": bool(self.parts[..., k].any()) for k, part in enumerate(PARTS)}
 
     def of(self, frames: IntArray, lenses: IntArray) -> "Freedom":
         """Return the freedom of some of the frames and lenses."""
         pull, doubt = self.pull_rad, self.doubt_rad
         return replace(
             self,
-            focal=self.focal[lenses] if self.focal.ndim else self.focal,
-            distortion=self.distortion[lenses] if self.distortion.ndim else self.distortion,
+            parts=self.parts[lenses] if self.parts.ndim > 1 else self.parts,
             pull_rad=pull[frames] if isinstance(pull, np.ndarray) else pull,
             doubt_rad=doubt[frames] if isinstance(doubt, np.ndarray) else doubt,
         )
@@ -159,7 +153,7 @@ class Freedom:
         information, lenses = np.zeros_like(values), list(problem.lenses)
         over = self.over(len(lenses))
         for k, lens in enumerate(problem.lenses):
-            lenses[k] = replace(lens, fixed=not over.lenses[k], focal_fixed=not over.focal[k])
+            lenses[k] = replace(lens, fixed=tuple((~over.parts[k]).tolist()))
             if over.lenses[k]:
                 values[k], information[k] = lens.as_given().values(), lens.information()
         prior = LensPrior(values=values, information=information)

@@ -22,7 +22,7 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, distinct
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.base.jit import kernel
-from sfm_shapefit.scene.lens import NUM_VALUES
+from sfm_shapefit.scene.lens import NUM_VALUES, PARTS
 
 SLOTS = 6  # unknowns of a node at most; a frame has six, a lens no more
 _LEAST_SHARED = 0.1  # share of a lens's points; those that have less in common would only fill a node
@@ -191,8 +191,8 @@ def _nodes(
     """Number the nodes; return node_of_frame, node_of_lens, node_of_sensor, active and lens_slots."""
     moves = ~problem.fixed
     node_of_frame = np.where(moves, np.cumsum(moves) - 1, -1)
-    free = {"focal_lengths": options.free_focal_lengths, "distortion": options.free_distortion}
-    lens_slots = np.array([lens.slots(**free) for lens in problem.lenses]).reshape(-1, NUM_VALUES)
+    free = np.array([getattr(options, f"free_{part}") for part in PARTS])
+    lens_slots = np.array([lens.slots(free) for lens in problem.lenses]).reshape(-1, NUM_VALUES)
     sizes = lens_slots.max(axis=1, initial=-1) + 1
     packs, first_slots = _pack(problem, sizes)
     lens_slots = np.where(lens_slots >= 0, lens_slots + first_slots[:, None], -1)

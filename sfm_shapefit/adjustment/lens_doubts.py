@@ -14,6 +14,7 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import FOCAL
 
 
 def errors_of_free_lenses(
@@ -56,6 +57,6 @@ def covariances_of_open_lenses(
         seen = problem.points[problem.points_seen[image_of == k]]
         if len(seen):
             depth = float(np.median((seen - images.centers[k]) @ view))
-            sigma = images.lenses[images.lens_of[k]].focal_sigma * depth
+            sigma = images.lenses[images.lens_of[k]].sigmas[FOCAL] * depth
             found[k] = sigma**2 * np.outer(view, view)
     return found

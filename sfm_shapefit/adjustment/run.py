@@ -52,6 +52,7 @@ from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.links import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
@@ -239,7 +240,7 @@ class AdjustmentRun:
     def _knowing(self, sigmas: FloatArray) -> "AdjustmentRun":
         """Return the run with how well the focal lengths that move are known, by sigmas (l,) of all."""
         sigmas = np.where(np.isnan(sigmas), np.inf, sigmas)
-        return replace(self, focal_sigmas=np.where(self.freedom.focal, sigmas, np.nan))
+        return replace(self, focal_sigmas=np.where(self.freedom.parts[:, FOCAL], sigmas, np.nan))
 
     def holding(self, held: BoolArray) -> "AdjustmentRun":
         """Return the run with some lenses (l,) as they were given, their focal lengths held from now on.

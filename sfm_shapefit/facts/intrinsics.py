@@ -83,10 +83,8 @@ class CameraIntrinsics(Record):
 class RefinedIntrinsics:
     """What may still change of lenses in doubt, and what became of them so far; arrays over lenses."""
 
-    focal: BoolArray
-    """(l,) lenses whose focal length adjustments may change."""
-    distortion: BoolArray
-    """(l,) lenses whose distortion adjustments may change."""
+    parts: BoolArray
+    """(l, p) which `PARTS` of each lens adjustments may change."""
     by_view_graph: BoolArray
     """(l,) lenses whose focal length the view graph has changed before anything was adjusted."""
     focal_sigmas: FloatArray
@@ -100,12 +98,11 @@ class RefinedIntrinsics:
 
     def after(self, estimate: Estimate, lenses: IntArray) -> "RefinedIntrinsics":
         """Return the same after an adjustment of some lenses, by their rows; what it left open is held."""
-        focal, distortion, undetermined = self.focal.copy(), self.distortion.copy(), self.undetermined.copy()
-        focal[lenses], distortion[lenses] = estimate.freedom.focal, estimate.freedom.distortion
+        parts, sigmas, undetermined = self.parts.copy(), self.focal_sigmas.copy(), self.undetermined.copy()
+        parts[lenses] = estimate.freedom.parts
         undetermined[lenses] |= estimate.undetermined
-        sigmas = self.focal_sigmas.copy()
         sigmas[lenses] = np.where(estimate.is_tried, estimate.focal_sigmas, sigmas[lenses])
-        return RefinedIntrinsics(focal, distortion, self.by_view_graph, sigmas, undetermined)
+        return RefinedIntrinsics(parts, self.by_view_graph, sigmas, undetermined)
 
     def how(self, lens: int) -> How:
         """Return what decided about the focal length of a lens at last."""
@@ -141,12 +138,10 @@ class RefinedIntrinsics:
         return rows
 
 
-def intrinsics_in_doubt(
-    focal: BoolArray, distortion: BoolArray, by_view_graph: BoolArray
-) -> RefinedIntrinsics:
-    """Return what adjustments may change of lenses (l,), before any of them."""
-    unknown, nothing = np.full(len(focal), np.nan), np.zeros(len(focal), dtype=np.bool_)
-    return RefinedIntrinsics(focal, distortion, by_view_graph, unknown, nothing)
+def intrinsics_in_doubt(parts: BoolArray, by_view_graph: BoolArray) -> RefinedIntrinsics:
+    """Return what adjustments may change of lenses, their `PARTS` (l, p), before any of them."""
+    unknown, nothing = np.full(len(parts), np.nan), np.zeros(len(parts), dtype=np.bool_)
+    return RefinedIntrinsics(parts, by_view_graph, unknown, nothing)
 
 
 def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:

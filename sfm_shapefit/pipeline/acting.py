@@ -12,11 +12,11 @@ import numpy as np
 
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.files.colmap.intrinsics import in_doubt, with_focal_length
+from sfm_shapefit.files.colmap.intrinsics import with_focal_length
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import FOCAL, Origin
 
 
 class Remedy(NamedTuple):
@@ -73,7 +73,7 @@ def find_remedy(
     freed = {
         wrong.lens: wrong.factor
         for wrong in found.evidence.lenses
-        if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.focal[wrong.lens]
+        if may_free and images.lenses[wrong.lens].is_adjustable and not intrinsics.parts[wrong.lens, FOCAL]
     }
     # A camera that is fixed, or held by its rig, cannot go where its pairs are.
     may_move = given.rigid.groups is None and not given.rigid.fixed.any()
@@ -81,20 +81,20 @@ def find_remedy(
     moved = [place for place in places if place.num_there >= OUTNUMBERED * place.num_here]
     if not (freed or moved):
         return None
-    lenses, focal = list(images.lenses), intrinsics.focal.copy()
+    lenses, parts = list(images.lenses), intrinsics.parts.copy()
     for row, factor in freed.items():
         known = lenses[row]
         if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
-            known = replace(in_doubt(known, Origin.GUESS), origin=Origin.CALIBRATION)
+            known = replace(known.in_doubt(Origin.GUESS), origin=Origin.CALIBRATION)
         lenses[row] = with_focal_length(known, factor)
-        focal[row] = True
+        parts[row, FOCAL] = True
     pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
     names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())
     left_out = source.inputs.left_out | {(min(pair), max(pair)) for pair in names}
     inputs = replace(source.inputs, left_out=left_out)
     view = source.matches.at(images.with_lenses(lenses), left_out, source.economy.reading)
     return Remedy(
-        given._replace(inputs=inputs, intrinsics=replace(intrinsics, focal=focal)),
+        given._replace(inputs=inputs, intrinsics=replace(intrinsics, parts=parts)),
         replace(source, inputs=inputs, view=view),
         tuple(freed),
         tuple(images.names[place.camera] for place in moved),

@@ -102,7 +102,7 @@ def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
         source=source,
         directions=directions,
         placement=move_cameras(placement, locations),
-        freedom=replace(freedom, focal=intrinsics.focal, distortion=intrinsics.distortion),
+        freedom=replace(freedom, parts=intrinsics.parts),
         intrinsics=intrinsics,
         estimate=adjusted,
         scale=similarity.scale,

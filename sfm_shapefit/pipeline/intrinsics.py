@@ -3,16 +3,11 @@
 import numpy as np
 
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
-from sfm_shapefit.files.colmap.intrinsics import (
-    calibrate_view_graph,
-    find_uncalibrated,
-    in_doubt,
-    with_focal_length,
-)
+from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated, with_focal_length
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.scene.freedom import IntrinsicsFreedom
+from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import PARTS, Origin
 from sfm_shapefit.scene.matches import PairNames
 
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
@@ -32,20 +27,20 @@ def settle_intrinsics(
     """
     guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))
-    if wanted in ("focal", "all"):
-        lenses = [in_doubt(lens, Origin.CALIBRATION) for lens in lenses]
+    if wanted not in ("auto", "held"):
+        lenses = [lens.in_doubt(Origin.CALIBRATION) for lens in lenses]
     for k in (k for k, lens in enumerate(images.lenses) if lens.id in listed):
-        lenses[k] = in_doubt(images.lenses[k], Origin.GUESS)
+        lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
     for k, found in guessed.items():
-        lenses[k] = in_doubt(images.lenses[k], found.origin)
+        lenses[k] = images.lenses[k].in_doubt(found.origin)
     if file is not None and guessed and wanted != "held":
         by_database = calibrate_view_graph(file, [g.database_id for g in guessed.values()], left_out)
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
-    is_free = [lens.origin is not None and lens.is_adjustable and wanted != "held" for lens in lenses]
+    may_move = [[lens.origin is not None and lens.is_adjustable] for lens in lenses]
     by_view_graph = factors != 1.0
     for k in np.flatnonzero(by_view_graph).tolist():
         lenses[k] = with_focal_length(lenses[k], factors[k])
-    free = np.array(is_free, dtype=np.bool_)
-    return images.with_lenses(lenses), intrinsics_in_doubt(free, free & (wanted != "focal"), by_view_graph)
+    parts = np.array(may_move, dtype=np.bool_) & np.isin(list(PARTS), PARTS_FREED[wanted])
+    return images.with_lenses(lenses), intrinsics_in_doubt(parts, by_view_graph)

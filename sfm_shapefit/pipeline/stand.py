@@ -70,7 +70,7 @@ class Stand(NamedTuple):
         """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
         gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
         lenses, has_rigs = given.intrinsics, given.rigid.groups is not None
-        freedom = Freedom.asked(options.freedom, (lenses.focal, lenses.distortion), rigs=has_rigs)
+        freedom = Freedom.asked(options.freedom, lenses.parts, rigs=has_rigs)
         return cls(given, source, directions, placement, gauge, freedom, lenses)
 
     @property

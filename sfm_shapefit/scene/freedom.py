@@ -9,6 +9,14 @@ Adjust = Literal["none", "seed", "full"]
 IntrinsicsFreedom = Literal["auto", "held", "focal", "all"]
 RigFreedom = Literal["held", "free"]
 
+PARTS_FREED: dict[IntrinsicsFreedom, tuple[str, ...]] = {
+    "auto": ("focal_lengths", "distortion"),
+    "held": (),
+    "focal": ("focal_lengths",),
+    "all": ("focal_lengths", "distortion"),
+}
+"""What each choice frees of a lens, see `scene.lens.PARTS`."""
+
 _MOST_ADJUSTED_CAMERAS = 2_000  # cameras; the adjustment of more would take longer than all the rest
 
 
@@ -39,7 +47,7 @@ class FreedomOptions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.intrinsics in ("focal", "all"):
+        if self.intrinsics not in ("auto", "held"):
             self.refuse_held("intrinsics", self.intrinsics)
         if self.rigs == "free":
             self.refuse_held("rigs", self.rigs)

@@ -21,7 +21,6 @@ _FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
 
 
 NUM_VALUES = 8  # parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2
-FOCAL_LENGTHS, DISTORTION = slice(0, 2), slice(4, NUM_VALUES)  # where they are among these parameters
 
 # For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
 _PLACES = {
@@ -56,6 +55,28 @@ class Origin(Enum):
     CALIBRATION = "given"
 
 
+class LensPart(NamedTuple):
+    """Parameters of a lens that are free, or held, together."""
+
+    places: slice
+    """Where they are among those of the OPENCV model."""
+    sigmas: dict[Origin, float]
+    """Standard deviation of each as it was given."""
+    is_relative: bool = False
+    """Whether that is a share of the parameter."""
+
+
+PARTS = {
+    "focal_lengths": LensPart(
+        slice(0, 2), {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}, is_relative=True
+    ),
+    "distortion": LensPart(slice(4, 8), {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}),
+}
+"""What adjustments may free of a lens, as `AdjustmentOptions` say by the same name after free_."""
+FOCAL = 0  # which of these the focal lengths are: a lens is judged by them
+FOCAL_LENGTHS, _DISTORTION = PARTS["focal_lengths"].places, PARTS["distortion"].places
+
+
 @dataclass(frozen=True, slots=True)
 class Lens:
     """The intrinsics that one or several cameras look through."""
@@ -64,10 +85,8 @@ class Lens:
     """COLMAP's name of it. What is said of OPENCV below holds for its cases only."""
     parameters: tuple[float, ...]
     """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
-    fixed: bool = False
-    """Whether it stays what it is even where focal lengths or distortion are free."""
-    focal_fixed: bool = False
-    """Whether its focal lengths stay even where they are free."""
+    fixed: bool | tuple[bool, ...] = False
+    """Whether it stays what it is even where lenses are free, or whether each of its `PARTS` does."""
     id: int = 0
     """COLMAP's id of the camera."""
     width: int = 0
@@ -77,10 +96,8 @@ class Lens:
     """Where its parameters came from; None if they are not in doubt."""
     given: tuple[float, ...] = ()
     """Parameters as they were given, of a lens in doubt."""
-    focal_sigma: float = 0.0
-    """Standard deviation of the given focal lengths, as a share of them; positive for a lens in doubt."""
-    distortion_sigma: float = 0.0
-    """Standard deviation of each coefficient of the given distortion; positive for a lens in doubt."""
+    sigmas: tuple[float, ...] = ()
+    """Standard deviation of each of `PARTS` as it was given, of a lens in doubt."""
 
     @property
     def is_adjustable(self) -> bool:
@@ -152,34 +169,35 @@ class Lens:
         )
         return not bool(np.abs(rays - those).max() <= _SAME_RAYS)  # NaN differs too
 
-    def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
-        """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
-        slots = np.full(NUM_VALUES, -1)
-        if self.fixed:
-            return slots
-        focal_lengths = focal_lengths and not self.focal_fixed
-        unknown = 0
-        for place in _PLACES[self.model]:
-            if place in (_CX, _CY) or not (focal_lengths if place <= _FY else distortion):
-                continue
+    def slots(self, free: BoolArray) -> IntArray:
+        """Return which unknown each OPENCV parameter is, (8,), by the `PARTS` free; -1 for those held."""
+        slots, moves = np.full(NUM_VALUES, -1), np.zeros(NUM_VALUES, np.bool_)
+        for part, is_free in zip(PARTS.values(), free & ~np.array(self.fixed), strict=True):
+            moves[part.places] = is_free
+        for unknown, place in enumerate(p for p in _PLACES[self.model] if moves[max(p, 0)]):
             slots[[_FX, _FY] if place < 0 else place] = unknown
-            unknown += 1
         return slots
+
+    def in_doubt(self, origin: Origin) -> "Lens":
+        """Return the lens told how far it may be off as it stands, by where it comes from."""
+        sigmas = tuple(part.sigmas[origin] for part in PARTS.values())
+        return replace(self, origin=origin, given=self.parameters, sigmas=sigmas)
 
     def as_given(self) -> "Lens":
         """Return the lens with the parameters that were given."""
         return replace(self, parameters=self.given)
 
     @property
-    def is_bent(self) -> bool:
-        """Whether the model has a distortion."""
-        return bool(self.own_values()[DISTORTION].any())
+    def own_parts(self) -> list[bool]:
+        """Whether the model has each of `PARTS`."""
+        return [bool(self.own_values()[part.places].any()) for part in PARTS.values()]
 
     def information(self) -> FloatArray:
         """Return the inverse variances of the OPENCV parameters as given, (8,); 0 for those always held."""
         information = np.zeros(NUM_VALUES)
-        information[FOCAL_LENGTHS] = (self.focal_sigma * self.as_given().values()[FOCAL_LENGTHS]) ** -2.0
-        information[DISTORTION] = self.distortion_sigma**-2.0
+        for part, sigma in zip(PARTS.values(), self.sigmas, strict=True):
+            size = self.as_given().values()[part.places] if part.is_relative else 1.0
+            information[part.places] = (sigma * size) ** -2.0
         return information
 
     def is_credible(self, sigma: float) -> bool:
@@ -189,10 +207,10 @@ class Lens:
         beyond what any lens given so is off by, is not believed either.
         """
         ratio = self.values()[0] / self.as_given().values()[0]
-        sound = bool(np.abs(self.values()[DISTORTION]).max() <= _MOST_DISTORTION)
+        sound = bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
         sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
-        better = _SHARED_NOISE * sigma <= self.focal_sigma
-        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
+        better = _SHARED_NOISE * sigma <= self.sigmas[FOCAL]
+        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.sigmas[FOCAL])
         return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
 
 

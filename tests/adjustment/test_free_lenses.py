@@ -22,7 +22,7 @@ def doubted(problem, given_px, sigma, *, distortion=False):
     """All lenses of a problem in doubt, as given with another focal length, and the problem started there."""
     model, (_, *others) = problem.lenses[0].model, problem.lenses[0].parameters
     given = in_doubt(Lens(model, (given_px, *others)), sigma)
-    free = Freedom(focal=np.ones(1, bool), distortion=np.full(1, distortion))
+    free = Freedom(parts=np.array([True, distortion]))
     return free, free.apply(replace(problem, lenses=[given]), None)
 
 
@@ -94,7 +94,7 @@ def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
     start = replace(problem, lenses=[given, problem.lenses[1]])
     first = np.array([True, False])
     for distortion in (False, True):
-        free = Freedom(focal=first, distortion=first & distortion)
+        free = Freedom(parts=np.outer(first, [True, distortion]))
         found = adjust(free.apply(start, None), OPTIONS, **free.overrides()).problem.lenses
         assert found[1].parameters == problem.lenses[1].parameters
         assert (found[0].parameters[3] != 0.0) == distortion
@@ -102,12 +102,22 @@ def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
     assert Freedom().apply(start, None) is start
     lenses = start.lenses
     held = free.holding(first, lenses)
-    assert (held.focal.tolist(), held.distortion.tolist()) == ([False, False], [True, False])
+    assert held.parts.tolist() == [[False, True], [False, False]]
     none = {"free_focal_lengths": False, "free_distortion": False}
     assert held.holding(first, lenses).overrides() == none
-    assert Freedom(focal=first, distortion=first & False).holding(first, lenses).overrides() == none
+    assert Freedom(parts=np.outer(first, [True, False])).holding(first, lenses).overrides() == none
     flat = [in_doubt(Lens("SIMPLE_PINHOLE", (520.0, 320.0, 240.0))), lenses[1]]
     assert free.holding(first, flat).overrides() == none
+
+
+def test_a_lens_whose_focal_length_alone_is_free_does_not_bend_with_another():
+    rng = np.random.default_rng(0)
+    start = ring_problem(rng, models=("SIMPLE_RADIAL", "SIMPLE_RADIAL"), noise_px=0.3)
+    start = replace(start, lenses=[in_doubt(lens) for lens in start.lenses])
+    free = Freedom(parts=np.array([[True, False], [True, True]]))
+    bends = [lens.parameters[3] for lens in start.lenses]
+    found = adjust(free.apply(start, None), OPTIONS, **free.overrides()).problem.lenses
+    assert [lens.parameters[3] != bend for lens, bend in zip(found, bends, strict=True)] == [False, True]
 
 
 def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():

@@ -23,7 +23,7 @@ class Seen:
 
 def test_a_lens_that_was_left_open_widens_its_camera_along_its_view():
     scene = Scene()
-    lenses = [replace(lens, focal_sigma=0.1) for lens in scene.images.lenses]
+    lenses = [replace(lens, sigmas=(0.1, 0.1)) for lens in scene.images.lenses]
     images, is_open = scene.images.with_lenses(lenses), np.arange(len(lenses)) == 4
     found = covariances_of_open_lenses(images, Seen(scene), scene.points.images, is_open)
     assert np.flatnonzero(found.any(axis=(1, 2))).tolist() == [4]

@@ -289,7 +289,10 @@ def test_lenses_that_were_found_before_are_held_in_the_first_solve_and_damped_in
     truth = scene("RADIAL")
     images, links = posed_images(disturbed(truth)), links_of(truth, truth)
     (given,) = images.lenses
-    found, free = replace(given, parameters=(401.0, *given.parameters[1:])), Freedom(focal=np.ones(1, bool))
+    found, free = (
+        replace(given, parameters=(401.0, *given.parameters[1:])),
+        Freedom(parts=np.array([True, False])),
+    )
     for one, is_free in ((given, True), (found, False)):
         adjust_thinly(images.with_lenses([one]), lambda: links, StructureOptions(), free, lenses_wanted=True)
         assert frees[:2] == [is_free, True]
@@ -322,7 +325,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     start = disturbed(truth)
     start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
     tracks = start if source == "tracks" else matches_of(truth)
-    free = {"focal": np.ones(1, bool), "distortion": np.ones(1, bool)}
+    free = {"parts": np.ones(2, bool)}
     found = adjusted_thinly(start, tracks, **free)
     # 0.3 px on 7 views of 80 points
     assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
@@ -331,12 +334,12 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
     monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
     held = adjusted_thinly(start, tracks, **free)
     assert held.estimate.undetermined.all()
-    assert held.estimate.freedom.distortion.all()
+    assert held.estimate.freedom.parts.tolist() == [[False, True]]
     assert not held.estimate.is_refined.any()
     given, kept = (model.camera(1).params.tolist() for model in (start, held.reconstruction))
     assert kept[:3] == given[:3]
     assert kept[3] != 0.0  # the distortion is told, and held no more than its prior does
-    again = adjusted_thinly(start, tracks, focal=np.zeros(1, bool), distortion=np.ones(1, bool))
+    again = adjusted_thinly(start, tracks, parts=np.array([False, True]))
     assert again.reconstruction.camera(1).params.tolist()[:3] == given[:3]
     monkeypatch.setattr(lens, "_MOST_DISTORTION", 0.0)
     held = adjusted_thinly(start, tracks, **free)
@@ -348,7 +351,7 @@ def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(sour
 def test_a_placement_is_adjusted_though_its_only_lens_in_doubt_is_left_open(monkeypatch):
     truth = scene("PINHOLE")
     start = disturbed(truth)
-    free = {"focal": np.ones(1, bool), "distortion": np.ones(1, bool)}
+    free = {"parts": np.ones(2, bool)}
     monkeypatch.setattr(lens, "_SHARED_NOISE", 1e9)
     found = adjusted_placement(start, matches_of(truth), **free)
     assert found.estimate.undetermined.all()

@@ -101,6 +101,22 @@ def test_an_inner_kernel_is_compiled_once_and_only_as_a_part_of_others():
     assert not overload.library.codegen._engine.is_symbol_defined(name)  # there is no machine code of it
 
 
+def test_only_kernels_that_make_arrays_count_references_to_them():
+    def first(x):
+        return x[0]
+
+    def room(n):
+        return np.empty(n)
+
+    assert [kernel(one).targetoptions["_nrt"] for one in (first, room)] == [False, True]
+    assert (kernel(first)(np.ones(2)), kernel(room)(3).shape) == (1.0, (3,))
+    before = len(jit._inner)
+    inner_kernel(first)
+    inner_kernel(room)
+    assert [one.targetoptions["_nrt"] for one in jit._inner[before:]] == [False, True]
+    del jit._inner[before:]
+
+
 def test_a_kernel_that_closes_over_a_value_is_refused():
     """Its key in the cache on disk would hold that value: for another kernel, one of this process only."""
     factor = 2

@@ -89,19 +89,18 @@ def estimate_of(freedom, sigmas, undetermined):
 
 def test_what_adjustments_leave_open_is_held_from_then_on_and_warned_of():
     lens = Lens("SIMPLE_RADIAL", (1000.0, 600.0, 450.0, 0.0))
-    every, nan = np.ones(3, bool), np.nan
-    known = intrinsics_in_doubt(every, every, np.array([True, False, False]))
-    assert known.focal.any()
+    every, nan = np.ones((3, 2), bool), np.nan
+    known = intrinsics_in_doubt(every, np.array([True, False, False]))
+    assert known.parts.any()
     assert [known.how(k) for k in (0, 1)] == ["view graph", "held"]
-    free = Freedom(focal=every, distortion=every)
+    free = Freedom(parts=every)
     after = known.after(estimate_of(free, [0.02, 0.1, nan], [False, False, False]), np.arange(3))
     held = free.holding(np.array([False, True, True]), [lens] * 3)
     after = after.after(estimate_of(held, [0.01, nan, nan], [False, True, True]), np.arange(3))
     # The second adjustment is one of the first and the last lens alone.
     part = held.of(np.arange(0), np.array([0, 2])).holding(np.array([False, True]), [lens] * 2)
     after = after.after(estimate_of(part, [0.005, nan], [False, True]), np.array([0, 2]))
-    assert after.focal.tolist() == [True, False, False]
-    assert after.distortion.tolist() == [True, True, False]
+    assert after.parts.tolist() == [[True, True], [False, True], [False, False]]
     assert after.undetermined.tolist() == [False, True, True]
     assert [after.how(k) for k in range(3)] == ["adjusted", "undetermined", "undetermined"]
     np.testing.assert_array_equal(after.focal_sigmas, [0.005, nan, nan])

@@ -71,7 +71,8 @@ def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothi
 ):
     verdict = altered(found, observations=ObservationShares(share, contradicting)).verdict
     assert verdict.grade is grade
-    assert bool(verdict.reasons) is (grade is not Grade.GOOD)
+    told = "51% of the observations contradict the cameras"
+    assert verdict.reasons == (() if grade is Grade.GOOD else (told,))
 
 
 def test_a_model_less_than_half_of_which_agreeing_pairs_hold_is_not_to_be_used(found):
@@ -105,6 +106,12 @@ def test_one_prior_may_be_wrong_and_two_of_eight_make_a_look_worthwhile(found):
     assert verdict.reasons == ("2 of 8 position priors contradict where cameras stand",)
 
 
+def test_rejected_pairs_that_agree_on_a_second_configuration_make_a_look_worthwhile(found):
+    second = replace(found.placement, second_configuration=object())
+    verdict = altered(found, placement=second).verdict
+    assert verdict.statement == "look: many rejected pairs agree on a second configuration"
+
+
 def test_matches_that_agree_on_two_directions_make_a_look_worthwhile(found):
     twofold = tuple(
         DirectionStatus.TWO_MOTIONS if k % 3 == 0 else one for k, one in enumerate(found.directions.status)
@@ -118,7 +125,9 @@ def test_a_graph_of_noise_is_not_to_be_used():
     """Directions drawn at random agree with no placement."""
     problem = synthetic.random_graph_problem(30, 0.5, 3, q=1.0, seed=2)
     placed = place(problem.view_graph)
-    assert judge_graph(placed).is_bad
+    verdict, level_deg = judge_graph(placed), placed.assessment.level_deg
+    assert verdict.is_bad
+    assert verdict.reasons == (f"the directions are {level_deg:.0f} degrees off the cameras",)
 
 
 def test_strict_ends_with_code_4_where_the_verdict_is_do_not_use_and_writes_the_output(tmp_path):

@@ -19,6 +19,7 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import Known
+from sfm_shapefit.scene.lens import FOCAL, PARTS
 from tests.problems import exact_graph
 from tests.scenes import RING
 
@@ -45,8 +46,8 @@ def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Sta
     template = template_of(read_model(FOLDER))
     known = Known(priors=told.pop("priors", None))
     told = {"scale": "auto", "known": known, **told}
-    held = np.zeros(len(images.lenses), dtype=np.bool_)
-    lenses = intrinsics_in_doubt(held, held, held)
+    held = np.zeros((len(images.lenses), len(PARTS)), dtype=np.bool_)
+    lenses = intrinsics_in_doubt(held, held[:, FOCAL])
     given = Given(template, images, lenses, source.inputs, rigid, pull_rad, **told)
     directions, placement = directions_of(images, pairs), placement_at(locations, pairs)
     return Stand.of(given, source, directions, placement, LocateOptions())

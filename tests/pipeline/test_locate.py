@@ -285,3 +285,18 @@ def test_images_that_are_not_in_the_database_or_have_no_rotation_are_named_and_t
     np.testing.assert_array_equal(points2d_xy(found.reconstruction.image(3)), before[3])  # of no database
     for image_id, matrix in poses.items():
         np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
+
+
+def test_no_progress_is_told_of_a_stage_that_has_ended():
+    under_way, told_late = set(), []
+
+    def hear(stage, done, total):
+        if (done, total) == (0, 1):
+            under_way.add(stage)
+        elif stage not in under_way:
+            told_late.append(stage)
+        if (done, total) == (1, 1):
+            under_way.discard(stage)
+
+    sfm_shapefit.locate(RING / "sparse" / "0", progress=hear)
+    assert told_late == []

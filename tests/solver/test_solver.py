@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sfm_shapefit.base.errors import InputError, UnsolvableError
@@ -59,6 +59,8 @@ def test_objective_and_lengths_are_those_of_the_formulas():
     sigma=st.sampled_from([0.0, 1e-6, 0.01, 0.3]),
     q=st.sampled_from([0.0, 0.3, 1.0]),
 )
+@example(seed=1816, d=2, sigma=1e-6, q=0.3)  # Newton steps end at a gap of 1.007e-8
+@example(seed=4156, d=2, sigma=1e-6, q=0.3)  # and here at 3e-4
 def test_every_result_proves_what_it_claims(seed, d, sigma, q):
     graph, _ = problem(seed, n=12, p=0.9, d=d, sigma=sigma, q=q, weighted=True)
     result = solve(graph)
@@ -131,6 +133,20 @@ def test_graphs_that_determine_nothing_are_refused_with_the_reason():
 
 def box(n):
     return box_graph_problem(n, 30, sigma=0.01, q=0.2, seed=n).view_graph
+
+
+def test_where_newton_steps_stall_in_the_plane_splitting_follows_unless_newton_was_asked_for():
+    graph, _ = problem(4156, n=12, p=0.9, d=2, sigma=1e-6, q=0.3, weighted=True)
+    found, asked = solve(graph), solve(graph, solver="newton")
+    assert (found.method, found.method_reason) == (
+        "admm",
+        "Newton steps stalled above the tolerance: splitting",
+    )
+    assert found.converged
+    assert asked.status is Status.INACCURATE
+    assert not solve(graph, certified=False).converged  # where nothing is proven, nothing is solved again
+    few = solve(graph, max_iterations=3)
+    assert (few.method, few.status) == ("newton", Status.MAX_ITERATIONS)
 
 
 def test_auto_says_what_it_chose_and_why():

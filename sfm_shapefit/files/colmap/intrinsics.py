@@ -31,8 +31,6 @@ from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens, Origin
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 
-_FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}
-_DISTORTION_SIGMAS = {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
 # COLMAP's TwoViewGeometryConfiguration: essential or fundamental matrix, not a homography.
 _WITH_DEPTH = (2, 3)
 _FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3  # pairs of a camera with depth, and their share; fewer say nothing
@@ -98,17 +96,6 @@ def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Ori
     extra = camera.params[camera.extra_params_idxs()]
     is_centered = bool((principal == [0.5 * width, 0.5 * height]).all())
     return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
-
-
-def in_doubt(lens: Lens, origin: Origin) -> Lens:
-    """Return a lens of which it is told how far it may be off as it stands, by where it comes from."""
-    return replace(
-        lens,
-        origin=origin,
-        given=lens.parameters,
-        focal_sigma=_FOCAL_SIGMAS[origin],
-        distortion_sigma=_DISTORTION_SIGMAS[origin],
-    )
 
 
 def with_focal_length(lens: Lens, factor: float) -> Lens:
