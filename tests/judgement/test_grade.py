@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sfm_shapefit
 from sfm_shapefit import synthetic
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
@@ -17,12 +16,12 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
 from tests.program import run
-from tests.scenes import BUNDLED, RING
+from tests.scenes import BUNDLED
 
 
-@pytest.fixture(scope="module")
-def found():
-    return sfm_shapefit.locate(RING / "sparse" / "0")
+@pytest.fixture
+def found(ring_located):
+    return ring_located
 
 
 def altered(found, **changes):

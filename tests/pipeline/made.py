@@ -23,6 +23,28 @@ from tests.problems import exact_graph
 from tests.scenes import RING
 
 FOLDER, DATABASE = RING / "sparse" / "0", RING / "database.db"
+PAIR = 2147483647  # COLMAP's pair_id is id1 * this + id2
+
+
+def keep_few_matches(last, most, *, wrong=False):
+    """Return an edit of a database: of the pairs between images up to `last` and the others, `most` keep few.
+
+    The rest of them keep no matches; `wrong` ones are of nothing.
+    """
+
+    def edit(connection):
+        rng = np.random.default_rng(0)
+        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+        between = [row for row in rows if (row[0] // PAIR <= last) != (row[0] % PAIR <= last)]
+        for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: -row[1])):
+            matches = np.frombuffer(data, np.uint32).reshape(-1, 2)
+            matches = matches[rng.permutation(count)[: 12 * (rank < most)]].copy()
+            if wrong:
+                matches[:, 1] = rng.permutation(matches[:, 1])
+            values = len(matches), matches.tobytes(), pair
+            connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+    return edit
 
 
 @contextmanager

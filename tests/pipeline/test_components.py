@@ -37,6 +37,12 @@ def test_each_frame_of_a_component_too_small_once_averaged_is_told_so():
     assert reasons[2].startswith("no pair that can be believed ties it to the others")
 
 
+def test_frames_of_too_few_pairs_are_told_how_few():
+    _, reasons = averaged([(0, 1), (2, 3), (3, 4), (2, 4)], [SOUND] * 4)
+    few = "matched with only 1 other image (or frame of a rig); a model needs 3"
+    assert (reasons[0], reasons[1]) == (few, few)
+
+
 def test_frames_behind_unsound_pairs_are_a_component_of_their_own():
     pairs = [(0, 1), (1, 2), (0, 2), (2, 3), (3, 4), (4, 5), (3, 5)]
     groups, reasons = averaged(pairs, [SOUND, SOUND, SOUND, UNSOUND, SOUND, SOUND, SOUND])

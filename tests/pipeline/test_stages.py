@@ -23,7 +23,7 @@ from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.adjustment import adjust_placed
+from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
@@ -155,6 +155,26 @@ def test_adjust_moves_cameras_and_free_rotations_to_where_the_pixels_are_and_mea
     off_deg = [angle_between_deg(one.directions, true) for one in (stand.directions, after.directions)]
     assert np.median(off_deg[0]) > 0.01
     assert off_deg[1].max() < 1e-3
+
+
+def test_adjust_turns_cameras_as_far_as_was_asked():
+    rng, found = np.random.default_rng(0), {}
+    errors = Rotation.from_rotvec(np.radians(0.03) * rng.standard_normal((8, 3))).as_matrix()
+    turns = dict(zip(TRUTH.names, errors, strict=True))
+    off = posed(FOLDER, lambda name, rotation, center: (turns[name] @ rotation, center))
+    with opened(off) as source:
+        for rotations in ("held", 1e-4, 0.03, "free"):
+            pull_rad = pull_of_rotations(rotations)
+            stand = stand_at(source, 0.1 * TRUTH.centers, all_pairs=False, pull_rad=pull_rad)
+            after = adjust_placed(stand, LocateOptions(), Clock())
+            turned = turned_deg(source.images.rotations, after.source.images.rotations)
+            found[rotations] = after.adjustment.statement, np.median(turned)
+            assert after.adjustment.errors is None  # how far they are off is no question
+    assert found["held"][1] == 0.0
+    assert 0.0 < found[1e-4][1] < 1e-4
+    assert 0.01 < found[0.03][1] < found["free"][1]
+    assert "weighted by 0.03 deg, as asked" in found[0.03][0]
+    assert "rotations free, as asked" in found["free"][0]
 
 
 def test_judge_names_the_pairs_that_contradict_and_who_is_turned_by_what_its_pairs_say():
