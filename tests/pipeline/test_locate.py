@@ -1,6 +1,5 @@
 """`locate` end to end: from rotations and matches to a seeded model, on bundled and real scenes."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -18,12 +17,7 @@ from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, write_workspace
 from tests.models import centers_of, posed
-from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint
-
-
-def rows_of(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
+from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint, rows_of
 
 
 def true_corruption():

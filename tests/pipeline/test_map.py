@@ -28,12 +28,11 @@ from sfm_shapefit.report.results import draw_joined
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.abuse import determinism
-from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.models import by_name, write_priors
 from tests.pipeline.made import PAIR, keep_few_matches
 from tests.program import run
-from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, rows_of
 
 PAIRS = "DELETE FROM two_view_geometries WHERE"
 ACROSS = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
@@ -181,7 +180,7 @@ def test_images_that_see_few_points_are_left_out_with_the_reason_unless_pixels_c
     written = read_model(out / "0").reconstruction
     kept = {written.image(k).name: written.image(k).num_points3D for k in written.reg_image_ids()}
     assert kept == {name: count for name, count in counts.items() if name != poorest}
-    reasons = {row["name"]: row["reason"] for row in read_cameras(out / "0")}
+    reasons = {row["name"]: row["reason"] for row in rows_of(out / "0" / "cameras.csv")}
     assert [name for name, reason in reasons.items() if reason] == [poorest]
     assert f"{counts[poorest]} points" in reasons[poorest]
 
@@ -453,7 +452,9 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     sfm_shapefit.write_result(found, tmp_path / "out")
     for folder in ("0", "1"):
         assert read_model(tmp_path / "out" / folder).images.num_images == 4
-    reasons = {row["reason"] for row in read_cameras(tmp_path / "out" / "1") if row["placed"] == "false"}
+    reasons = {
+        row["reason"] for row in rows_of(tmp_path / "out" / "1" / "cameras.csv") if row["placed"] == "false"
+    }
     assert reasons == {"in a larger piece, to which this one is not rigidly tied"}
 
 

@@ -1,6 +1,5 @@
 """Scale, origin and axes: of the input's centers, of a known distance, of position priors."""
 
-import csv
 import json
 import re
 import sqlite3
@@ -36,7 +35,7 @@ from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angl
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from tests.program import run, run_refused
-from tests.scenes import BUNDLED, COURTYARD, RING, read_from
+from tests.scenes import BUNDLED, COURTYARD, RING, read_from, rows_of
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -455,8 +454,7 @@ def test_a_model_with_a_datum_is_compared_with_latitudes_where_they_stand(ring, 
     facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
     assert facts["num_common"] == len(ring.names)
     assert facts["position_error"]["max"] < 0.01
-    with (tmp_path / "out" / "pairs.csv").open() as lines:
-        assert all(float(row["prior_angle_deg"]) < 0.1 for row in csv.DictReader(lines))
+    assert all(float(row["prior_angle_deg"]) < 0.1 for row in rows_of(tmp_path / "out" / "pairs.csv"))
     higher = [f"{row.rsplit(',', 1)[0]},{float(row.rsplit(',', 1)[1]) - 2.0}" for row in rows]
     table.write_text("\n".join(["name,lat,lon,alt", *higher]))
     facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
@@ -531,8 +529,7 @@ def test_the_wrong_position_of_the_bundled_table_is_named_everywhere(tmp_path):
     (warning,) = (line for line in facts["warnings"] if "prior" in line)
     assert "0004.jpg (29" in warning
     assert not re.search(r"00(15|16)\.jpg", warning)  # a false pair, and contradicted as one
-    with (out / "cameras.csv").open() as lines:
-        off = {row["name"]: float(row["prior_off"]) for row in csv.DictReader(lines)}
+    off = {row["name"]: float(row["prior_off"]) for row in rows_of(out / "cameras.csv")}
     assert max(off, key=off.get) == "0004.jpg"
     assert np.median(list(off.values())) < 0.1
     assert "0004.jpg (29" in (out / "report.html").read_text()
