@@ -112,8 +112,6 @@ def test_a_focal_length_that_is_the_databases_guess_is_found(tmp_path):
     change = f"UPDATE cameras SET params = x'{guess.astype('<f8').tobytes().hex()}', prior_focal_length = 0"
     path = edit_database(copied(RING, tmp_path) / "database.db", change)
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
-    calibrated = sfm_shapefit.locate(model, path)
-    assert calibrated.summary()["intrinsics"] == []
     model.camera(1).params = guess
     found = sfm_shapefit.locate(model, path)
     (row,) = found.summary()["intrinsics"]
