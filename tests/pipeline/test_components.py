@@ -4,22 +4,16 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
 from sfm_shapefit.rotations.options import AveragingOptions
+from tests.problems import made_rotations
 
 
 def averaged(pairs, weight_shares, **options):
     """The groups of frames that get rotations, and the reasons of the others."""
-    k = len(pairs)
-    relative = RelativeRotations(
-        pairs=np.array(pairs),
-        rotations=np.tile(np.eye(3), (k, 1, 1)),
-        information=np.tile(1e6 * np.eye(3), (k, 1, 1)),
-        num_matches=np.full(k, 100),
-        weight_shares=np.array(weight_shares),
-    )
+    rotations = np.tile(np.eye(3), (len(pairs), 1, 1))
+    relative = made_rotations(pairs, rotations, weight_shares=np.array(weight_shares))
     reasons: dict[int, str] = {}
     components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None)
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))

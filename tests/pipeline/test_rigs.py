@@ -33,8 +33,6 @@ from sfm_shapefit.pipeline.join import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.write import write_result
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.points import number_points
 from sfm_shapefit.synthetic import (
     SceneOptions,
@@ -47,6 +45,7 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, posed, poses_of
 from tests.pipeline.made import keep_few_matches
+from tests.problems import made_priors
 from tests.scenes import RING, edit_database
 
 
@@ -194,9 +193,8 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
     distances = ((images.names[0], images.names[20], 2.0 * apart),)
-    known = KnownPositions(every, 3.0 * images.centers, np.full((36, 3, 3), np.nan))
     rigid = rigs_stage.rigid_parts(images, every < 0)
-    rule = GaugeRule(images, rigid, "unit", PositionPriors(known=known, statement="made"), distances)
+    rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
     chosen = rule.choose(every, 0.1 * images.centers, 0.1)
     assert chosen.scale == "rig"
     centers = chosen.apply(0.1 * images.centers)

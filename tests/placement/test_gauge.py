@@ -32,8 +32,8 @@ from sfm_shapefit.placement.gauge import (
 from sfm_shapefit.placement.prior_fit import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
-from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
+from tests.problems import made_priors
 from tests.program import run, run_refused
 from tests.scenes import BUNDLED, COURTYARD, RING, read_from, rows_of
 
@@ -45,16 +45,6 @@ def cameras(seed, n=12):
     return np.random.default_rng(seed).standard_normal((n, 3))
 
 
-def priors_of(positions, sigma=np.nan, rows=None):
-    rows = np.arange(len(positions)) if rows is None else np.asarray(rows)
-    return PositionPriors(
-        known=KnownPositions.measured(
-            rows, positions[rows], np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3))
-        ),
-        statement="a test",
-    )
-
-
 TOLD = 7.0 * cameras(0) + [1.0, -2.0, 3.0]
 GAUGES = {
     "unit": unit_gauge,
@@ -64,7 +54,7 @@ GAUGES = {
     ),
     "one distance": lambda t: distance_gauge(t, np.array([[3, 7]]), np.array([12.5]), ["a and b"]),
     "distances": lambda t: distance_gauge(t, np.array([[3, 7], [1, 2]]), np.array([2.0, 3.0]), ["a", "b"]),
-    "priors": lambda t: prior_gauge(t, priors_of(TOLD @ TURN.T)),
+    "priors": lambda t: prior_gauge(t, made_priors(TOLD @ TURN.T)),
     "moved": lambda t: moved_gauge(unit_gauge(t), t[4], TOLD[4], "e"),
 }
 
@@ -190,11 +180,11 @@ def test_locate_takes_several_known_distances_and_tells_each(ring, tmp_path):
 def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_stay():
     t = cameras(3)
     truth = 5.0 * t @ TURN.T + [100.0, -20.0, 3.0]
-    gauge = prior_gauge(t, priors_of(truth, rows=[0, 2, 3, 7, 9]))
+    gauge = prior_gauge(t, made_priors(truth, rows=[0, 2, 3, 7, 9]))
     np.testing.assert_allclose(gauge.apply(t), truth, atol=1e-9)
     np.testing.assert_allclose(gauge.axes, TURN, atol=1e-12)
     line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
-    gauge = prior_gauge(line, priors_of(3.0 * line + 1.0))
+    gauge = prior_gauge(line, made_priors(3.0 * line + 1.0))
     assert gauge.axes is None
     assert "lie on a line" in gauge.warning
     assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
@@ -205,11 +195,11 @@ def test_where_axes_mean_nothing_priors_on_a_line_turn_the_model_onto_it():
     line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
     turned = 3.0 * line @ np.diag([-1.0, -1.0, 1.0]) + 1.0
     for rows in (np.arange(8), np.array([1, 6])):
-        gauge = prior_gauge(line, priors_of(turned, rows=rows), axes_known=False)
+        gauge = prior_gauge(line, made_priors(turned, rows=rows), axes_known=False)
         np.testing.assert_allclose(gauge.apply(line), turned, atol=1e-9)
         assert "about it by any angle" in gauge.warning
     with pytest.raises(InputError, match="contradict"):
-        prior_gauge(line, priors_of(-line))
+        prior_gauge(line, made_priors(-line))
 
 
 def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
@@ -217,10 +207,10 @@ def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
     t, sigma = cameras(4, n=60), 0.05
     truth = 5.0 * t @ TURN.T
     measured = truth + sigma * rng.standard_normal(truth.shape)
-    clean = prior_gauge(t, priors_of(measured, sigma)).apply(t)
+    clean = prior_gauge(t, made_priors(measured, sigma)).apply(t)
     wrong = rng.permutation(60)[:12]
     measured[wrong] += 100.0 * sigma * rng.standard_normal((12, 3))
-    gauge = prior_gauge(t, priors_of(measured, sigma))
+    gauge = prior_gauge(t, made_priors(measured, sigma))
     # Least squares of 7 unknowns on 3 * 48 coordinates leaves sigma sqrt(3 * 7 / 144) = 0.38 sigma a camera.
     for placed in (clean, gauge.apply(t)):
         assert np.median(np.linalg.norm(placed - truth, axis=1)) < 2.0 * 0.38 * sigma
@@ -241,8 +231,8 @@ def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_wa
     positions, rows, message
 ):
     with pytest.raises(InputError, match=message):
-        prior_gauge(cameras(5), priors_of(positions, rows=rows))
-    assert "mean nothing: are they of this scene?" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
+        prior_gauge(cameras(5), made_priors(positions, rows=rows))
+    assert "mean nothing: are they of this scene?" in prior_gauge(cameras(7), made_priors(cameras(8))).warning
 
 
 @pytest.fixture(scope="module")
@@ -434,7 +424,7 @@ def drive(sigma):
     metric = Metric(covariance, np.zeros(len(edges), dtype=np.int64))
     found = refine_angles(graph, truth, metric, plan_refinement(graph))
     positions = truth + sigma * rng.standard_normal(truth.shape)
-    gauge = prior_gauge(found.locations, priors_of(positions, sigma))
+    gauge = prior_gauge(found.locations, made_priors(positions, sigma))
     start = gauge.similarity.apply(found.locations)
     if gauge.axes is not None:
         positions, truth = positions @ gauge.axes, truth @ gauge.axes
@@ -501,7 +491,7 @@ def test_a_wrong_prior_is_named_and_no_pair_is_blamed_for_it():
     given = truth + 0.02 * rng.standard_normal(truth.shape)
     given[4] += [0.0, 0.6, 0.0]
     given[6] += [0.0, 0.6, 0.0]
-    priors = priors_of(given, 0.02, rows=np.arange(10))
+    priors = made_priors(given, 0.02, rows=np.arange(10))
     gauge = prior_gauge(t, priors)
     pairs = np.array([(i, j) for i in range(12) for j in range(i)])
     directions = normalized(truth[pairs[:, 0]] - truth[pairs[:, 1]])
