@@ -59,13 +59,6 @@ def test_a_wrong_lens_that_is_held_is_named_with_the_right_focal_length():
     assert found.summary()["evidence"]["lenses"][0]["camera"] == wrong_id
 
 
-def test_a_sound_run_is_not_doubted():
-    truth = pycolmap.Reconstruction(RING / "sparse" / "0")
-    found = sfm_shapefit.locate(with_own_lenses(truth, {}), RING / "database.db")
-    assert found.told_evidence.statements == []
-    assert found.verdict.grade is Grade.GOOD
-
-
 def test_of_a_lens_that_took_many_images_only_some_are_asked(monkeypatch):
     images = read_model(COURTYARD / "truth").images
     n, own = images.num_images, np.arange(images.num_images) % 2 == 0
