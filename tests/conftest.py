@@ -17,7 +17,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
-from tests.scenes import COURTYARD
+from tests.scenes import COURTYARD, RING
 
 pytest_plugins = ["pytester", "sfm_shapefit.synthetic.fixtures"]
 
@@ -36,6 +36,24 @@ def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
     folder = tmp_path_factory.mktemp("drawn") / "workspace"
     write_rendered_workspace(scene, folder, WorkspaceOptions(relative_poses=True))
     return scene, folder
+
+
+@pytest.fixture(scope="session")
+def ring_located() -> sfm_shapefit.LocateResult:
+    """What `locate` makes of the ring; nobody may change it."""
+    return sfm_shapefit.locate(RING / "sparse" / "0")
+
+
+@pytest.fixture(scope="session")
+def ring_mapped() -> sfm_shapefit.MapResult:
+    """What `map` makes of the ring's database; nobody may change it."""
+    return sfm_shapefit.map_database(RING / "database.db")
+
+
+@pytest.fixture(scope="session")
+def courtyard_located() -> sfm_shapefit.LocateResult:
+    """What `locate` makes of the courtyard; nobody may change it."""
+    return sfm_shapefit.locate(COURTYARD / "sparse" / "0")
 
 
 @pytest.fixture(scope="session")

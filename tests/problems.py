@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +10,10 @@ import numpy.typing as npt
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.viewgraph import ViewGraph
+from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.engine import Goal
@@ -42,6 +47,43 @@ def exact_graph(locations: Floats, edges: npt.ArrayLike | None = None) -> ViewGr
     """Return the graph of the true directions between locations (n, d), along all pairs if none are given."""
     edges = np.array(all_pairs(len(locations)) if edges is None else edges)
     return ViewGraph(len(locations), edges, normalized(differences(locations, edges)))
+
+
+def made_directions(pairs: npt.ArrayLike, directions: Floats, **told: Any) -> PairDirections:
+    """Return directions (k, 3) of pairs (k, 2), usable, of 100 matches and a milliradian, unless told."""
+    k = len(directions)
+    usual = {
+        "status": [DirectionStatus.USABLE] * k,
+        "num_matches": np.full(k, 100),
+        "num_inliers": np.full(k, 100),
+        "num_rivals": np.zeros(k, dtype=np.int64),
+        "cheirality_fraction": np.ones(k),
+        "median_residual_px": np.full(k, 0.1),
+        "parallax_deg": np.full(k, 10.0),
+        "covariance": np.tile(1e-6 * np.eye(2), (k, 1, 1)),
+    }
+    return PairDirections(pairs=np.array(pairs), directions=directions, **(usual | told))
+
+
+def made_rotations(pairs: npt.ArrayLike, rotations: Floats, **told: Any) -> RelativeRotations:
+    """Return relative rotations (k, 3, 3) of pairs (k, 2), of 100 matches and 1e-4 radians, unless told."""
+    k = len(rotations)
+    usual = {
+        "information": np.tile(1e8 * np.eye(3), (k, 1, 1)),
+        "num_matches": np.full(k, 100),
+        "weight_shares": np.ones(k),
+    }
+    return RelativeRotations(pairs=np.array(pairs), rotations=rotations, **(usual | told))
+
+
+def made_priors(
+    positions: Floats, sigma: float = np.nan, rows: npt.ArrayLike | None = None
+) -> PositionPriors:
+    """Return priors at positions (n, 3), or at some rows of them; without a sigma it is not known."""
+    rows = np.arange(len(positions)) if rows is None else np.asarray(rows)
+    covariances = np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3))
+    known = KnownPositions.measured(rows, positions[rows], covariances)
+    return PositionPriors(known=known, statement="made")
 
 
 def draw_graph(

@@ -1,8 +1,10 @@
 """Where the scenes are, and how their files are watched."""
 
+import csv
 import hashlib
 import shutil
 import sqlite3
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -56,9 +58,18 @@ def view_of(path: Path, images: Images, **how: Any) -> Iterator[View]:
 
 
 def fingerprint(folder: Path) -> dict[str, str]:
-    """Return the hash of every file below a folder."""
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    """Return what every entry below a folder is: the hash of a file, the target of a link, or its kind."""
+    return {str(path.relative_to(folder)): _content(path) for path in sorted(folder.rglob("*"))}
+
+
+def _content(path: Path) -> str:
+    mode = path.lstat().st_mode
+    if stat.S_ISREG(mode):
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    return f"-> {path.readlink()}" if stat.S_ISLNK(mode) else f"kind {stat.S_IFMT(mode):o}"
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a table that was written."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))

@@ -4,22 +4,20 @@ Twelve cameras with a direction for every pair, one of them, or one pair, change
 """
 
 import numpy as np
-import pycolmap
 import pytest
 
 import sfm_shapefit
 from sfm_shapefit import TrustOptions
 from sfm_shapefit.base.geometry import fit_similarity_l1, normalized
-from sfm_shapefit.facts.rows import camera_rows
 from sfm_shapefit.facts.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.solver.program import differences
-from tests.models import posed, poses_of, turned
+from tests.models import turned
 from tests.problems import all_pairs
-from tests.scenes import RING, copied, edit_database
+from tests.scenes import RING
 
 N = 12
 BAD = N - 1
@@ -58,16 +56,6 @@ def assert_only_the_bad_camera_is_distrusted(placement, t, noise):
 
 
 @pytest.mark.parametrize("noise", NOISE)
-def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbor(noise):
-    edges = [*OTHERS, (0, BAD)]
-    placement = place(ViewGraph(N, edges, measured(CENTERS, edges, noise)))
-    rows = camera_rows(placement, placement.locations, 1.0)
-    assert [row.reason for row in rows if not row.placed] == ["pendant: joined by a single pair to camera 0"]
-    assert (placement.assessment.trust >= MIN_TRUST).all()
-    assert list(graph_warnings(placement)) == list(quality_warnings(placement))
-
-
-@pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("joined", [False, True], ids=["apart", "joined"])
 def test_twins_at_one_center_are_placed_at_one_center(noise, joined):
     """What a pair of twins measures is noise; it is that of no baseline at all."""
@@ -89,29 +77,12 @@ def test_twins_at_one_center_are_placed_at_one_center(noise, joined):
 
 
 @pytest.mark.parametrize("noise", NOISE)
-@pytest.mark.parametrize("seed", [12, 13, 14])
-def test_a_camera_of_wrong_pairs_only_is_not_trusted(noise, seed):
+def test_a_camera_of_wrong_pairs_only_is_not_trusted(noise):
     v = measured(CENTERS, ALL, noise)
-    v[OF_BAD] = normalized(np.random.default_rng(seed).standard_normal((len(OF_BAD), 3)))
+    v[OF_BAD] = normalized(np.random.default_rng(12).standard_normal((len(OF_BAD), 3)))
     graph = ViewGraph(N, ALL, v)
     assert_only_the_bad_camera_is_distrusted(place(graph), CENTERS, noise)
     assert [camera.name for camera in diagnose(graph).weak] == [str(BAD)]
-
-
-@pytest.mark.parametrize("noise", NOISE)
-def test_a_camera_whose_pairs_are_all_parallel_is_not_trusted(noise):
-    """It stands far off as seen from all others, in truth or by mistake: its distance is free."""
-    v = measured(CENTERS, ALL, noise)
-    parallel = np.array([0.0, 0.0, 1.0])
-    v[OF_BAD] = normalized(parallel + noise * np.random.default_rng(2).standard_normal((len(OF_BAD), 3)))
-    graph = ViewGraph(N, ALL, v)
-    placement = place(graph)
-    assert np.isfinite(placement.locations).all()
-    assert placement.assessment.trust[BAD] < MIN_TRUST
-    assert placement.assessment.reasons[BAD]
-    assert [camera.name for camera in diagnose(graph).weak] == [str(BAD)]
-    assert (placement.assessment.trust[:BAD] >= MIN_TRUST).all()
-    assert np.max(errors_of(placement, CENTERS)) < 1e-4 + 10.0 * noise
 
 
 @pytest.mark.parametrize("noise", NOISE)
@@ -141,36 +112,3 @@ def test_a_camera_whose_pairs_all_contradict_its_rotation_is_not_placed():
     assert "contradict the rotations" in row.reason or "not trusted" in row.reason
     errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0").position
     assert errors.max < 2e-6 * 5.0  # exact data, keypoints stored as float32
-
-
-def test_twin_images_stand_at_one_center_and_their_pair_has_no_parallax(tmp_path):
-    scene = copied(RING, tmp_path)
-    make_twin(scene / "database.db", of=7, twin=8)
-    rotation = poses_of(pycolmap.Reconstruction(scene / "sparse" / "0"))["0007.jpg"][:, :3]
-    model = posed(
-        scene / "sparse" / "0",
-        lambda name, own, center: (rotation if name == "0008.jpg" else own, center),
-    )
-    found = sfm_shapefit.locate(model, scene / "database.db", scale="unit")
-    (pair,) = [row for row in found.pairs if (row.name1, row.name2) == ("0007.jpg", "0008.jpg")]
-    assert pair.reason.startswith("no parallax")
-    rows = {row.name: row for row in found.cameras}
-    assert all(row.placed for row in rows.values())
-    np.testing.assert_allclose(rows["0007.jpg"].center, rows["0008.jpg"].center, atol=1e-5)
-
-
-def make_twin(database, of, twin):
-    """Give an image the keypoints of another, which is of smaller id, and its matches."""
-    rows, cols = "pair_id, rows, cols, data, config", "rows, cols, data"
-    own = np.repeat(np.arange(10_000, dtype="<u4"), 2).tobytes().hex()
-    number = f"(SELECT rows FROM keypoints WHERE image_id = {of})"
-    edit_database(
-        database,
-        f"UPDATE keypoints SET ({cols}) = (SELECT {cols} FROM keypoints WHERE image_id = {of}) "
-        f"WHERE image_id = {twin}",
-        f"DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = {twin}",
-        f"INSERT INTO two_view_geometries ({rows}) SELECT pair_id + {twin - of}, {cols}, config "
-        f"FROM two_view_geometries WHERE pair_id % 2147483647 = {of}",
-        f"INSERT INTO two_view_geometries ({rows}) "
-        f"VALUES ({of * 2147483647 + twin}, {number}, 2, substr(x'{own}', 1, 8 * {number}), 2)",
-    )

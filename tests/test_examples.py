@@ -5,7 +5,6 @@ import inspect
 import itertools
 import json
 import re
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -83,23 +82,6 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
             keypoints.append(database.read_keypoints(image_id)[:, :2])
     np.testing.assert_allclose(*keypoints, atol=1e-3)
     assert_near_truth(tmp_path / "out/models/0", folder)
-
-
-def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):
-    done = run_python("-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
-    assert done.returncode == 0, done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
-    names = set(zipfile.ZipFile(wheel).namelist())
-    package = ROOT / "sfm_shapefit"
-    sources = {
-        str(path.relative_to(ROOT))
-        for path in package.rglob("*")
-        if path.is_file() and path.suffix not in {".pyc", ".nbi", ".nbc"}
-    }
-    assert "sfm_shapefit/py.typed" in names
-    assert "sfm_shapefit/schemas/output.schema.json" in names
-    assert sources <= names
-    assert all(name.startswith(("sfm_shapefit/", "sfm_shapefit-")) for name in names)
 
 
 @pytest.mark.parametrize("name", sfm_shapefit.__all__)

@@ -95,20 +95,13 @@ def explained(text: str) -> bool:
     return len([clause for clause in re.split(r"[;:.](?:\s+|$)", text) if clause]) > 1
 
 
-def findings() -> dict[str, list[str]]:
-    """Everything that the rules forbid, by room."""
-    faults = defaultdict(list)
+def test_a_sentence_names_its_subject_and_a_constant_has_a_reason():
+    faults = []
     for path in MODULES:
         inside = path.relative_to(PACKAGE)
-        told = [f"{inside}:{line}: {fault}" for line, text in texts_of(path) for fault in faults_of(text)]
-        bare = [f"{inside}: {name} has no reason" for name, text in constants_of(path) if not explained(text)]
-        if told or bare:
-            faults[inside.parts[0].removesuffix(".py")] += told + bare
-    return faults
-
-
-def test_a_sentence_names_its_subject_and_a_constant_has_a_reason():
-    faults = [fault for those in findings().values() for fault in those]
+        faults += [f"{inside}:{line}: {fault}" for line, text in texts_of(path) for fault in faults_of(text)]
+        bare = [name for name, text in constants_of(path) if not explained(text)]
+        faults += [f"{inside}: {name} has no reason" for name in bare]
     assert not faults, "\n".join(faults)
 
 

@@ -167,7 +167,10 @@ def test_the_dockerfile_installs_what_is_there_in_five_lines(tmp_path):
     assert "\nRequires-Python: >=3.11\n" in (metadata / "METADATA").read_text(encoding="utf-8")
     here, there = ROOT / "sfm_shapefit", tmp_path / "site/sfm_shapefit"
     files = {path.relative_to(here) for path in here.rglob("*") if "__pycache__" not in path.parts}
-    assert files <= {path.relative_to(there) for path in there.rglob("*")}
+    installed = {path.relative_to(there) for path in there.rglob("*")}
+    assert files <= installed
+    assert {Path("py.typed"), Path("schemas/output.schema.json")} <= installed
+    assert {path.name.split("-")[0] for path in (tmp_path / "site").iterdir()} == {"bin", "sfm_shapefit"}
 
 
 ADDRESS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["urls"][

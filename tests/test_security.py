@@ -16,7 +16,7 @@ from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.graph_text import read_graph
-from tests.program import run, run_python
+from tests.program import run
 from tests.scenes import RING, ROOT, copied, edit_database, view_of
 from tests.test_architecture import tree_of
 
@@ -68,24 +68,6 @@ def test_the_scan_sees_what_it_looks_for():
         "imports urllib.request",
         "starts a shell",
     ]
-
-
-def test_locate_opens_no_socket_and_starts_no_process(tmp_path):
-    script = f"""
-import sys
-def refuse(event, arguments):
-    if event.startswith(("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn")):
-        print(event, arguments, file=sys.stderr)
-        sys.stderr.flush()
-        raise SystemExit(99)
-import sfm_shapefit.pipeline
-sys.addaudithook(refuse)
-from sfm_shapefit.cli import main
-sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]
-main()
-"""
-    done = run_python("-c", script)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_database_is_opened_for_reading_without_trust_and_with_limits():

@@ -24,6 +24,7 @@ from sfm_shapefit.pipeline.component import locate_components, refine_intrinsics
 from sfm_shapefit.pipeline.join_mapped import join_mapped
 from sfm_shapefit.pipeline.map_run import MapRun, start_run
 from sfm_shapefit.rotations.sequences import Videos, Visit
+from sfm_shapefit.scene.lens import FOCAL
 
 _MANY_DOUBTED = 0.25
 """Share of images with doubtful intrinsics from which relative rotations are measured twice; fewer are found
@@ -111,7 +112,7 @@ def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[V
     The run knows scores of the pairs then, and which ones are refused.
     """
     relative = run.measure()
-    doubted = run.intrinsics.focal[run.images.lens_of]
+    doubted = run.intrinsics.parts[run.images.lens_of, FOCAL]
     if run.options.freedom.adjust != "none" and doubted.mean() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
         if known.differ_in_rays(run.images):

@@ -31,7 +31,6 @@ from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import FOCAL
 from sfm_shapefit.scene.matches import PairNames, View, rows_of_pairs
 
 _MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair and 16 bytes a match

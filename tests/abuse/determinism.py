@@ -19,9 +19,8 @@ from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.write import write_result
 from tests.abuse.fuzz import STAGES_OF_MAP
 from tests.abuse.layouts import MODEL_FILES, binary_fields, cut_records, read_field
-from tests.abuse.verdicts import read_cameras
 from tests.program import run_python
-from tests.scenes import COURTYARD, FACADE, RING
+from tests.scenes import COURTYARD, FACADE, RING, rows_of
 
 _MAX_NUM_IMAGES = 2147483647
 _AGREEMENT = 1e-12
@@ -102,7 +101,7 @@ def measure_reordering(scene, work, seed, *, adjust=False):
     tables = []
     for place in (scene, copy):
         write_result(locate(place / "sparse" / "0", threads=1, adjust=adjust), out, overwrite=True)
-        tables.append({row["name"]: row for row in read_cameras(out)})
+        tables.append({row["name"]: row for row in rows_of(out / "cameras.csv")})
     shutil.rmtree(copy)
     placed = [sorted(name for name, row in table.items() if row["placed"] == "true") for table in tables]
     if placed[0] != placed[1]:

@@ -24,7 +24,7 @@ import numpy as np
 from tests.abuse import verdicts
 from tests.abuse.fuzz import caches, command_line, make_base, warm_locate
 from tests.abuse.sandbox import mapped_bytes, run_forked, start_forked
-from tests.scenes import ROOT
+from tests.scenes import ROOT, fingerprint
 
 _NOBODY = 65534
 _EXTRA_MEMORY = tuple(megabytes * 10**6 for megabytes in (0, 2, 5, 10, 20, 40, 80, 160, 320))
@@ -96,7 +96,7 @@ class Bench:
             (self.folder / name).mkdir(parents=True)
         shutil.copytree(self.base / "sparse", self.folder / "sparse")
         shutil.copyfile(self.base / "database.db", self.folder / "database.db")
-        self.before = verdicts.snapshot(self.folder)
+        self.before = fingerprint(self.folder)
 
     def arguments(self, *extra, out="place/out"):
         return ("locate", "sparse/0", out, "--database", "database.db", "--threads", "1", *extra)
@@ -124,7 +124,7 @@ class Bench:
 
     def problems(self, *, strays=False):
         """Yield what is not as it must be: the input, OUT, and, unless accepted, strays."""
-        after, out = verdicts.snapshot(self.folder), self.folder / "place" / "out"
+        after, out = fingerprint(self.folder), self.folder / "place" / "out"
         yield from (f"changed {name}" for name in self.before if after.get(name) != self.before[name])
         try:
             if out.exists():
@@ -278,6 +278,6 @@ def lock_database(bench):
                 if begin == "written":
                     connection.execute("PRAGMA cache_size = 1")  # so that it reaches the file
                     connection.execute("UPDATE keypoints SET data = zeroblob(100000)")
-                bench.before = verdicts.snapshot(bench.folder)
+                bench.before = fingerprint(bench.folder)
                 yield from bench.judge(bench.locate("-q"), f"{mode}, {begin}")
                 connection.execute("ROLLBACK")

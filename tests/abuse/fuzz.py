@@ -26,9 +26,9 @@ from tests.abuse import databases, mutations
 from tests.abuse.layouts import MODEL_FILES, binary_fields
 from tests.abuse.mutations import pick
 from tests.abuse.sandbox import run_forked
-from tests.abuse.verdicts import differs, faults, faults_of_model, faults_of_tables, positions, snapshot
+from tests.abuse.verdicts import differs, faults, faults_of_model, faults_of_tables, positions
 from tests.program import run as run_here
-from tests.scenes import ROOT
+from tests.scenes import ROOT, fingerprint
 
 _SAMPLES = Path(__file__).with_name("samples")
 _FOREIGN = "opensfm/reconstruction.json"
@@ -133,7 +133,7 @@ def try_case(base, folder, seed, expected):
     (folder / "tmp").mkdir(parents=True)
     rng = np.random.default_rng(seed)
     case = pick(rng, _KINDS)(base, folder, rng)
-    before = snapshot(folder)
+    before = fingerprint(folder)
     main = partial(command_line, case.arguments, folder / "tmp")
     encoding = "ascii" if rng.random() < 0.1 else "utf-8"
     outcome = run_forked(main, folder, [folder, *caches()], encoding=encoding)
@@ -156,7 +156,7 @@ def caches():
 
 def _judge(case, outcome, folder, before, expected):
     """Yield what is wrong with what a case left behind."""
-    after = snapshot(folder)
+    after = fingerprint(folder)
     yield from (f"changed its input {name}" for name in before if after.get(name) != before[name])
     command, source, target, *_ = (*case.arguments, "")
     writes = outcome.code == 0 and command in ("locate", "solve", "map", "convert")

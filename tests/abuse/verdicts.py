@@ -1,31 +1,17 @@
 """What every call must keep to, whatever its input: one sentence or a correct result, and no trace."""
 
-import csv
-import hashlib
 import json
 import math
-import stat
 import struct
 
 import numpy as np
 
 from tests.abuse.layouts import MODEL_FILES, binary_fields
 from tests.abuse.sandbox import MEMORY_LIMIT_BYTES
+from tests.scenes import rows_of
 
 # Share of the largest coordinate: names decide the order of images, and the solver stops at 1e-8.
 _SAME_ANSWER = 1e-6
-
-
-def snapshot(folder):
-    """Return what every entry below a folder is: the hash of a file, the target of a link, or its kind."""
-    return {str(path.relative_to(folder)): _content(path) for path in sorted(folder.rglob("*"))}
-
-
-def _content(path):
-    mode = path.lstat().st_mode
-    if stat.S_ISREG(mode):
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    return f"-> {path.readlink()}" if stat.S_ISLNK(mode) else f"kind {stat.S_IFMT(mode):o}"
 
 
 def faults(outcome):
@@ -56,7 +42,7 @@ def faults(outcome):
 def faults_of_tables(out):
     """Yield what is wrong with the tables of an output folder."""
     facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
-    rows = read_cameras(out)
+    rows = rows_of(out / "cameras.csv")
     placed = [row for row in rows if row["placed"] == "true"]
     axes = [name for name in rows[0] if name in "xyz" or name.startswith("x")] if rows else []
     if any(not math.isfinite(float(row[axis] or "nan")) for row in placed for axis in axes):
@@ -82,14 +68,9 @@ def faults_of_model(out):
             yield f"{name}.bin of the output holds a number that is not finite"
 
 
-def read_cameras(out):
-    with (out / "cameras.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
 def positions(out):
     """Return the centers of the placed cameras, sorted: they identify cameras whose names were changed."""
-    rows = (row for row in read_cameras(out) if row["placed"] == "true")
+    rows = (row for row in rows_of(out / "cameras.csv") if row["placed"] == "true")
     return sorted(tuple(float(row[axis]) for axis in "xyz") for row in rows)
 
 

@@ -162,17 +162,6 @@ def test_one_fixed_frame_leaves_the_scale_which_stays():
     assert np.sum(arms * before) / np.sum(arms * arms) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_a_rig_knows_its_scale():
-    rng = np.random.default_rng(4)
-    truth = ring_problem(rng, sensors=3, num_cameras=8)
-    start = disturb(truth, rng, center=0.02, rotation_rad=0.003, point=0.02)
-    start = replace(start, centers=1.1 * start.centers, points=1.1 * start.points)
-    found = adjust(start, TIGHT).problem
-    fit = fit_similarity(found.centers, truth.centers)
-    assert fit.scale == pytest.approx(1.0, abs=0.01)  # the start is 10 % too large
-    assert error(found, truth) < 0.1 * error(start, truth)
-
-
 def edge_px(lens):
     """Where a ray near the edge of the image meets it."""
     fx, fy, cx, cy, k1, k2, p1, p2 = lens.values()
@@ -203,14 +192,6 @@ def test_a_wrong_focal_length_and_distortion_are_found(model):
     fixed = replace(start, lenses=[replace(start.lenses[0], fixed=True)])
     stays = adjust(fixed, replace(TIGHT, free_focal_lengths=True, free_distortion=True)).problem.lenses[0]
     assert stays.parameters == start.lenses[0].parameters
-
-
-def test_cameras_share_a_lens_or_have_their_own():
-    _, start = make_start(models=("SIMPLE_PINHOLE", "SIMPLE_PINHOLE"), noise_px=0.1)
-    start = replace(start, lenses=[Lens("SIMPLE_PINHOLE", (f, 320.0, 240.0)) for f in (485.0, 515.0)])
-    free = replace(TIGHT, free_focal_lengths=True)
-    for lens in adjust(start, free).problem.lenses:
-        assert lens.parameters[0] == pytest.approx(500.0, rel=1e-3)
 
 
 def test_a_fifth_of_wrong_observations_moves_nearly_nothing_under_cauchy():
@@ -270,11 +251,10 @@ def test_threads_do_not_change_one_bit(solver):
     _, start = make_start(num_cameras=20, num_points=400, models=("OPENCV", "PINHOLE"))
     options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=8)
     one = adjust(start, options)
-    for threads in (2, 3):
-        several = adjust(start, replace(options, threads=threads))
-        np.testing.assert_array_equal(several.problem.centers, one.problem.centers)
-        np.testing.assert_array_equal(several.problem.points, one.problem.points)
-        np.testing.assert_array_equal(several.costs, one.costs)
+    several = adjust(start, replace(options, threads=3))
+    np.testing.assert_array_equal(several.problem.centers, one.problem.centers)
+    np.testing.assert_array_equal(several.problem.points, one.problem.points)
+    np.testing.assert_array_equal(several.costs, one.costs)
 
 
 def test_the_order_of_observations_matters_to_rounding_only():

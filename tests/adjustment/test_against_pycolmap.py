@@ -1,16 +1,15 @@
 """The optimum equals that of pycolmap's bundle adjustment, from the same start and under the same loss."""
 
-from dataclasses import replace
-
 import numpy as np
 import pycolmap
 import pytest
 
+import sfm_shapefit
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.base.geometry import fit_similarity
-from tests.adjustment.made import adjust_by_pycolmap, disturb, problem_of, rig_problem_of, with_values
-from tests.scenes import BUNDLED, real_scene
+from tests.adjustment.test_views import disturbed, scene
+from tests.models import centers_of
+from tests.scenes import BUNDLED
 
 LOSS_PX = 1.0
 TIGHT = AdjustmentOptions(
@@ -18,85 +17,57 @@ TIGHT = AdjustmentOptions(
 )
 
 
-def noisy_model(name, rng, noise_px=0.5):
-    """A bundled scene's true model with noise on the observed pixels."""
-    model = pycolmap.Reconstruction(BUNDLED / name / "truth")
+def adjust_by_pycolmap(model, *, free_lenses, fixed_frames):
+    """Adjust a model in place by pycolmap, in one thread; return the cost."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    if not fixed_frames:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for frame_id in fixed_frames:
+        config.set_constant_rig_from_world_pose(frame_id)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = free_lenses
+    options.refine_principal_point = options.refine_sensor_from_rig = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = LOSS_PX
+    solver = options.ceres.solver_options
+    solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = 1e-15, 1e-18, 1e-18
+    solver.max_num_iterations, solver.num_threads = TIGHT.max_iterations, 1
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    return adjuster.solve().ceres_summary.final_cost
+
+
+def assert_same_optimum(model, size, *, free_lenses=False, fixed_frames=()):
+    """Both adjust a model whose frames and points are moved, about 1e-3 of its size."""
+    start = disturbed(model, 1e-3 * size)
+    theirs, given = pycolmap.Reconstruction(start), centers_of(start)
+    cost = adjust_by_pycolmap(theirs, free_lenses=free_lenses, fixed_frames=fixed_frames)
+    free = {"free_focal_lengths": free_lenses, "free_distortion": free_lenses}
+    ours = sfm_shapefit.bundle_adjust(start, TIGHT, fixed_frames=fixed_frames, **free)
+    assert ours.adjusted.gradient_norm < 1e-7
+    assert ours.adjusted.cost == pytest.approx(cost, rel=1e-9)
+    found, expected = centers_of(ours.reconstruction), centers_of(theirs)
+    assert np.abs(found - given).max() > 1e-4 * size  # it had a way to go
+    fit = fit_similarity(expected, found)
+    np.testing.assert_allclose(fit.apply(expected), found, atol=1e-6 * size)
+    if fixed_frames:  # the rigs know the scale
+        np.testing.assert_allclose(expected, found, atol=1e-6 * size)
+
+
+@pytest.mark.parametrize(
+    ("name", "free_lenses"), [("photographed", False), ("courtyard", False), ("photographed", True)]
+)
+def test_the_optimum_is_that_of_pycolmap_on_bundled_scenes(name, free_lenses):
+    rng, model = np.random.default_rng(1), pycolmap.Reconstruction(BUNDLED / name / "truth")
     for image_id in sorted(model.reg_image_ids()):
         for point2d in model.image(image_id).points2D:
-            point2d.xy = point2d.xy + noise_px * rng.standard_normal(2)
-    return model
+            point2d.xy = point2d.xy + 0.5 * rng.standard_normal(2)
+    assert_same_optimum(model, np.ptp(centers_of(model), axis=0).max(), free_lenses=free_lenses)
 
 
-def both_answers(model, rng, options, *, free_lenses=False):
-    """Our answer, pycolmap's centers aligned to it, pycolmap's cost, and the extent, from one start."""
-    problem, images, points = problem_of(model)
-    size = np.ptp(problem.centers, axis=0).max()
-    start = disturb(problem, rng, center=1e-3 * size, rotation_rad=1e-3, point=1e-3 * size)
-    copy = with_values(model, start, images, points)
-    summary = adjust_by_pycolmap(copy, options.loss_scale_px, free_lenses=free_lenses)
-    ours = adjust(start, options)
-    centers = np.array([copy.image(image_id).projection_center() for image_id in images])
-    theirs = fit_similarity(centers, ours.problem.centers).apply(centers)
-    return ours, theirs, summary.final_cost, size
-
-
-def test_both_measure_the_same_cost():
-    model = noisy_model("photographed", np.random.default_rng(0))
-    problem, images, points = problem_of(model)
-    start = disturb(problem, np.random.default_rng(1), center=0.05, rotation_rad=1e-3, point=0.05)
-    copy = with_values(model, start, images, points)
-    copy.update_point_3d_errors()
-    errors = reprojection_errors_px(start)
-    sums = np.bincount(start.points_seen, np.nan_to_num(errors), minlength=len(points))
-    means = sums / np.bincount(start.points_seen, minlength=len(points))
-    clean = ~np.isin(np.arange(len(points)), start.points_seen[np.isnan(errors)])
-    theirs = np.array([copy.point3D(point).error for point in points])
-    np.testing.assert_allclose(means[clean], theirs[clean], rtol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["photographed", "courtyard"])
-def test_the_optimum_is_that_of_pycolmap_on_bundled_scenes(name):
-    rng = np.random.default_rng(0)
-    ours, theirs, cost, size = both_answers(noisy_model(name, rng), rng, TIGHT)
-    assert ours.gradient_norm < 1e-7
-    assert ours.cost == pytest.approx(cost, rel=1e-9)
-    np.testing.assert_allclose(theirs, ours.problem.centers, atol=1e-6 * size)
-
-
-def test_the_optimum_with_free_lenses_is_that_of_pycolmap():
-    rng = np.random.default_rng(1)
-    model = noisy_model("photographed", rng)
-    options = replace(TIGHT, free_focal_lengths=True, free_distortion=True)
-    ours, theirs, cost, size = both_answers(model, rng, options, free_lenses=True)
-    assert ours.cost == pytest.approx(cost, rel=1e-9)
-    np.testing.assert_allclose(theirs, ours.problem.centers, atol=1e-6 * size)
-
-
-def test_the_optimum_is_that_of_pycolmap_on_a_real_scene():
-    model = pycolmap.Reconstruction(real_scene("Herz-Jesus-P8") / "sparse" / "0")
-    for point in [point for point in model.point3D_ids() if point % 4]:
-        model.delete_point3D(point)
-    ours, theirs, cost, size = both_answers(model, np.random.default_rng(0), TIGHT)
-    assert ours.cost == pytest.approx(cost, rel=1e-9)
-    np.testing.assert_allclose(theirs, ours.problem.centers, atol=1e-6 * size)
-
-
-def test_the_optimum_of_a_rig_is_that_of_pycolmap():
-    pycolmap.set_random_seed(0)
-    made = pycolmap.SyntheticDatasetOptions()
-    made.num_rigs, made.num_cameras_per_rig, made.num_frames_per_rig, made.num_points3D = 1, 3, 8, 120
-    made.sensor_from_rig_translation_stddev, made.sensor_from_rig_rotation_stddev = 0.2, 5.0
-    model = pycolmap.synthesize_dataset(made)
-    noise = pycolmap.SyntheticNoiseOptions()
-    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_translation_stddev = 0.5, 0.01, 0.01
-    pycolmap.synthesize_noise(noise, model)
-    start, frames = rig_problem_of(model)
-    start = replace(start, fixed=np.arange(len(frames)) == 0)  # the rig knows the scale
-
-    adjust_by_pycolmap(model, LOSS_PX, fixed_frame=frames[0])
-    ours = adjust(start, TIGHT).problem
-    theirs = rig_problem_of(model)[0]
-    size = np.ptp(theirs.centers, axis=0).max()
-    assert np.abs(ours.centers - start.centers).max() > 1e-3 * size  # it had a way to go
-    np.testing.assert_allclose(ours.centers, theirs.centers, atol=1e-6 * size)
-    np.testing.assert_allclose(ours.rotations, theirs.rotations, atol=1e-6)
+def test_the_optimum_of_rigs_is_that_of_pycolmap():
+    model = scene(rigs=True)
+    first = min(model.reg_frame_ids())
+    assert_same_optimum(model, np.ptp(centers_of(model), axis=0).max(), fixed_frames=[first])

@@ -103,16 +103,3 @@ def test_weighted_rotations_end_nearer_to_the_truth_than_held_and_free_ones(seed
         )
         off[name] = np.sqrt(np.mean(apart**2))
     assert off["weighted"] < min(off["held"], off["free"])
-
-
-def test_freedom_follows_its_frames_when_some_are_left_out():
-    own = Freedom(pull_rad=np.array([0.1, 0.7, 0.2]), doubt_rad=np.array([0.0, 0.0, 0.3]))
-    of_all = own.among(np.array([4, 5, 9]), 10)
-    some = of_all.of(np.array([5, 8, 9]), np.arange(1))
-    assert some.pull_rad.tolist() == [0.7, 0.1, 0.2]
-    assert some.doubt_rad.tolist() == [0.0, 0.0, 0.3]
-    assert own.singled_out().tolist() == [False, True, True]
-    for pull_rad in (0.0, np.inf, None, 0.1):
-        one = Freedom(pull_rad=pull_rad)
-        assert one.among(np.array([4, 5]), 10).of(np.array([5, 9]), np.arange(1)).pull_rad == pull_rad
-        assert one.holds_rotations == (pull_rad == 0.0)

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sfm_shapefit
 from sfm_shapefit import synthetic
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
@@ -18,22 +17,17 @@ from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.prior_fit import PriorFit
 from tests.program import run
-from tests.scenes import BUNDLED, RING
+from tests.scenes import BUNDLED
 
 
-@pytest.fixture(scope="module")
-def found():
-    return sfm_shapefit.locate(RING / "sparse" / "0")
-
-
-def altered(found, **changes):
-    """Return the result with other facts, its verdict not yet made."""
-    return replace(found, **changes)
+@pytest.fixture
+def found(ring_located):
+    return ring_located
 
 
 def with_assessment(found, **changes):
     placement = found.placement
-    return altered(found, placement=replace(placement, assessment=replace(placement.assessment, **changes)))
+    return replace(found, placement=replace(placement, assessment=replace(placement.assessment, **changes)))
 
 
 def test_a_sound_model_is_good(found):
@@ -52,7 +46,7 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
     trust[[1, 2]] = 0.7, 0.65
     kept = np.ones(len(found.kept), dtype=bool)
     kept[5] = False
-    verdict = altered(with_assessment(found, trust=trust), kept=kept).verdict
+    verdict = replace(with_assessment(found, trust=trust), kept=kept).verdict
     names = found.images.names
     assert verdict.grade is Grade.LOOK
     assert verdict.cameras == (names[5], names[2], names[1])
@@ -69,7 +63,7 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
 def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothing(
     found, share, contradicting, grade
 ):
-    verdict = altered(found, observations=ObservationShares(share, contradicting)).verdict
+    verdict = replace(found, observations=ObservationShares(share, contradicting)).verdict
     assert verdict.grade is grade
     told = "51% of the observations contradict the cameras"
     assert verdict.reasons == (() if grade is Grade.GOOD else (told,))
@@ -77,8 +71,8 @@ def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothi
 
 def test_a_model_less_than_half_of_which_agreeing_pairs_hold_is_not_to_be_used(found):
     """However many pairs contradict: half of all matches permuted leave a right model right."""
-    assert altered(found, evidence=ModelEvidence(num_held=4)).verdict.grade is Grade.GOOD
-    verdict = altered(found, evidence=ModelEvidence(num_held=3)).verdict
+    assert replace(found, evidence=ModelEvidence(num_held=4)).verdict.grade is Grade.GOOD
+    verdict = replace(found, evidence=ModelEvidence(num_held=3)).verdict
     assert verdict.statement == "do not use: the pairs that agree hold only 3 of 8 cameras"
     assert found.evidence.num_held == 8
     assert with_assessment(found, level_deg=40.0).verdict.grade is Grade.GOOD
@@ -86,7 +80,7 @@ def test_a_model_less_than_half_of_which_agreeing_pairs_hold_is_not_to_be_used(f
 
 def test_a_model_most_of_whose_cameras_are_not_trusted_is_not_to_be_used(found):
     kept = np.arange(len(found.kept)) < len(found.kept) // 2 - 1
-    assert altered(found, kept=kept, placed=found.placed.without(~kept)).verdict.is_bad
+    assert replace(found, kept=kept, placed=found.placed.without(~kept)).verdict.is_bad
 
 
 def test_pairs_that_contradict_the_rotations_count_against_a_model(found):
@@ -94,21 +88,21 @@ def test_pairs_that_contradict_the_rotations_count_against_a_model(found):
     status = tuple(
         DirectionStatus.LOW_INLIER_RATIO if k % 8 else one for k, one in enumerate(found.directions.status)
     )
-    told = altered(found, directions=replace(found.directions, status=status))
+    told = replace(found, directions=replace(found.directions, status=status))
     assert told.agreeing_pairs < found.agreeing_pairs
 
 
 def test_one_prior_may_be_wrong_and_two_of_eight_make_a_look_worthwhile(found):
     for wrong, grade in ((1, Grade.GOOD), (2, Grade.LOOK)):
         fit = PriorFit(np.ones(len(found.images.names)), np.arange(wrong), np.zeros(0))
-        verdict = altered(found, prior_fit=fit).verdict
+        verdict = replace(found, prior_fit=fit).verdict
         assert verdict.grade is grade
     assert verdict.reasons == ("2 of 8 position priors contradict where cameras stand",)
 
 
 def test_rejected_pairs_that_agree_on_a_second_configuration_make_a_look_worthwhile(found):
     second = replace(found.placement, second_configuration=object())
-    verdict = altered(found, placement=second).verdict
+    verdict = replace(found, placement=second).verdict
     assert verdict.statement == "look: many rejected pairs agree on a second configuration"
 
 
@@ -116,7 +110,7 @@ def test_matches_that_agree_on_two_directions_make_a_look_worthwhile(found):
     twofold = tuple(
         DirectionStatus.TWO_MOTIONS if k % 3 == 0 else one for k, one in enumerate(found.directions.status)
     )
-    verdict = altered(found, directions=replace(found.directions, status=twofold)).verdict
+    verdict = replace(found, directions=replace(found.directions, status=twofold)).verdict
     assert verdict.grade is Grade.LOOK
     assert "facade repeats" in verdict.statement
 
@@ -158,19 +152,19 @@ def place_of(camera):
 
 def test_evidence_that_the_fit_did_not_use_names_cameras_and_lowers_the_grade(found):
     names = found.images.names
-    verdict = altered(found, evidence=ModelEvidence(places=(place_of(3),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(places=(place_of(3),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.LOOK, (names[3],))
 
     lens = WrongLens(0, 1.2, 0.01, 8, 20.0)
-    verdict = altered(found, evidence=ModelEvidence(lenses=(lens,))).verdict
+    verdict = replace(found, evidence=ModelEvidence(lenses=(lens,))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.LOOK, ())  # a lens of all images names none of them
     assert verdict.reasons == ("images contradict 1 focal length",)
 
-    verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(seams=(seam_of([1, 2]),))).verdict
     assert (verdict.grade, verdict.cameras) == (Grade.DO_NOT_USE, (names[1], names[2]))
     assert verdict.reasons == ("2 of 8 cameras stand apart from the rest",)
     assert verdict.statement == "do not use: 2 of 8 cameras stand apart from the rest"
-    verdict = altered(found, evidence=ModelEvidence(seams=(seam_of([1, 2, 3]),))).verdict
+    verdict = replace(found, evidence=ModelEvidence(seams=(seam_of([1, 2, 3]),))).verdict
     assert verdict.reasons == ("3 of 8 cameras stand apart from the rest",)  # and that is said once
 
 
@@ -181,15 +175,15 @@ def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
         (False, Grade.LOOK, "nothing checks how groups of cameras stand to one another"),
     ):
         group = Untied(np.array([1, 2]), 1, 2, 0, is_loose)
-        verdict = altered(found, evidence=ModelEvidence(untied=(group,))).verdict
+        verdict = replace(found, evidence=ModelEvidence(untied=(group,))).verdict
         assert (verdict.grade, verdict.cameras, verdict.reasons) == (grade, (names[1], names[2]), (reason,))
 
 
 def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is_looked_at(found):
     few = ModelEvidence(places=(place_of(3), place_of(4)))
     many = ModelEvidence(places=(place_of(2), place_of(3), place_of(4)))
-    assert altered(found, evidence=few).verdict.grade is Grade.LOOK
-    verdict = altered(found, evidence=many).verdict
+    assert replace(found, evidence=few).verdict.grade is Grade.LOOK
+    verdict = replace(found, evidence=many).verdict
     assert verdict.grade is Grade.DO_NOT_USE
     assert verdict.reasons == ("evidence speaks against 3 of 8 cameras",)
     images = replace(found.placed, lens_of=np.zeros(8, dtype=int))
@@ -201,9 +195,9 @@ def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is
 
 def test_images_that_are_not_placed_are_told_and_count(found):
     gone = np.arange(8) < 1
-    verdict = altered(found, placed=found.placed.without(gone)).verdict
+    verdict = replace(found, placed=found.placed.without(gone)).verdict
     assert (verdict.grade, verdict.reasons) == (Grade.LOOK, ("only 88% of the images are placed",))
-    verdict = altered(found, placed=found.placed.without(np.arange(8) < 5)).verdict
+    verdict = replace(found, placed=found.placed.without(np.arange(8) < 5)).verdict
     assert (verdict.grade, verdict.reasons) == (Grade.DO_NOT_USE, ("only 38% of the images are placed",))
 
 

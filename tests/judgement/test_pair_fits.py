@@ -8,11 +8,12 @@ import pytest
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.judgement.seams import find_cuts
-from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.scene.images import Frames
 from sfm_shapefit.scene.points import Points
 from tests.judgement.test_left_out import Scene
 from tests.judgement.test_seams import EVERY, GROUP, N
+from tests.problems import made_directions
 
 
 def measured(centers, *, off_deg=0.0, sigma_deg=0.01, status=None):
@@ -22,21 +23,10 @@ def measured(centers, *, off_deg=0.0, sigma_deg=0.01, status=None):
     across = normalized(np.cross(directions, [0.3, 0.5, 0.8]))
     angles = np.radians(np.broadcast_to(off_deg, k))[:, None]
     directions = np.cos(angles) * directions + np.sin(angles) * across
-    none = np.zeros(k, dtype=int)
     status = [DirectionStatus.USABLE] * k if status is None else status
     known = np.array([value is DirectionStatus.USABLE for value in status])[:, None]
-    return PairDirections(
-        pairs=EVERY,
-        directions=np.where(known, directions, np.nan),
-        status=status,
-        num_matches=none,
-        num_inliers=none,
-        num_rivals=none,
-        cheirality_fraction=np.ones(k),
-        median_residual_px=np.ones(k),
-        parallax_deg=np.ones(k),
-        covariance=np.tile(np.radians(sigma_deg) ** 2 * np.eye(2), (k, 1, 1)),
-    )
+    covariance = np.tile(np.radians(sigma_deg) ** 2 * np.eye(2), (k, 1, 1))
+    return made_directions(EVERY, np.where(known, directions, np.nan), status=status, covariance=covariance)
 
 
 def each_alone(centers):

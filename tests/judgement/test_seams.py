@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.seams import find_cuts, find_seams
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
+from tests.problems import made_rotations
 
 N, GROUP = 18, np.array([0, 3, 8, 11, 14, 17])
 EVERY = np.array([(i, j) for i in range(N) for j in range(i + 1, N)])
@@ -44,14 +44,7 @@ def rotations_of(pairs, rotations, turn=None, at_random=False):
     found = true[j] @ true[i].transpose(0, 2, 1)
     if at_random:
         found = Rotation.random(len(pairs), random_state=1).as_matrix()
-    k = len(pairs)
-    return RelativeRotations(
-        pairs=pairs,
-        rotations=found,
-        information=np.tile(np.eye(3), (k, 1, 1)),
-        num_matches=np.full(k, 100),
-        weight_shares=np.ones(k),
-    )
+    return made_rotations(pairs, found)
 
 
 @pytest.fixture

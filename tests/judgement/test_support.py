@@ -26,9 +26,9 @@ from tests.scenes import RING
 NO_PAIRS = np.zeros((0, 2), dtype=np.int64)
 
 
-@pytest.fixture(scope="module")
-def found():
-    return sfm_shapefit.locate(RING / "sparse" / "0", RING / "database.db")
+@pytest.fixture
+def found(ring_located):
+    return ring_located
 
 
 def counted_at(images, points, apart=NO_PAIRS):

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.judgement.turns import Doubt, PairTurns, find_turned, weigh_pairs
-from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from tests.problems import all_pairs, random_rotations, turn
+from sfm_shapefit.pairs.pair_directions import DirectionStatus
+from tests.problems import all_pairs, made_directions, made_rotations, random_rotations, turn
 
 SIGMA_RAD = np.radians(0.2)
 
@@ -118,27 +117,13 @@ def test_pairs_are_weighed_by_rotation_fit_and_direction():
     true = rotations[pairs[:, 1]] @ rotations[0].T
     own = true.copy()
     own[:2] = rotations[pairs[:2, 1]] @ wrong @ rotations[0].T  # so that E is the turn
-    k = len(pairs)
-    usable = [DirectionStatus.LOW_INLIER_RATIO, *[DirectionStatus.USABLE] * 4]
-    directions = PairDirections(
-        pairs=pairs,
-        directions=np.tile([1.0, 0.0, 0.0], (k, 1)),
-        status=usable,
-        num_matches=np.full(k, 100),
+    directions = made_directions(
+        pairs,
+        np.tile([1.0, 0.0, 0.0], (5, 1)),
+        status=[DirectionStatus.LOW_INLIER_RATIO, *[DirectionStatus.USABLE] * 4],
         num_inliers=np.array([20, 100, 100, 100, 100]),
-        num_rivals=np.zeros(k, dtype=np.int64),
-        cheirality_fraction=np.ones(k),
-        median_residual_px=np.full(k, 0.1),
-        parallax_deg=np.full(k, 10.0),
-        covariance=np.tile(1e-6 * np.eye(2), (k, 1, 1)),
     )
-    relative = RelativeRotations(
-        pairs=pairs[:4],
-        rotations=own[:4],
-        information=np.tile(1e8 * np.eye(3), (4, 1, 1)),
-        num_matches=np.full(4, 100),
-        weight_shares=np.ones(4),
-    )
+    relative = made_rotations(pairs[:4], own[:4])
     agreements = np.array([np.nan, 1.0, 1.0, 0.0, 1.0])
     found = weigh_pairs(directions, agreements, relative, rotations)
     np.testing.assert_allclose(found.turns[0], wrong, atol=1e-12)

@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
+import sfm_shapefit
 from harness.graphs import laplacian_matrix
 from sfm_shapefit.base.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.correlated_errors import sample_direction_errors
 from sfm_shapefit.judgement.uncertainty import propagate
+from sfm_shapefit.pipeline import measure
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import SceneOptions, box_graph_problem, make_scene
+from tests.scenes import RING
 
 SIGMA = 0.01  # rad, per axis
 
@@ -149,3 +152,16 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
     between = np.kron(np.eye(scene.num_pairs), np.ones((2, 2))) == 0
     assert np.corrcoef(predicted[between], measured[between])[0, 1] > 0.8
     assert np.polyfit(measured[between], predicted[between], 1)[0] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("limit", ["_MAX_SAMPLED_PAIRS", "_MOST_PAIRS"])
+def test_independent_pairs_count_what_their_tracks_say_once(limit, monkeypatch):
+    def sizes():
+        found = sfm_shapefit.locate(RING / "sparse" / "0", adjust="none")
+        return np.linalg.norm([row.sigma for row in found.cameras if row.placed], axis=1)
+
+    sampled = sizes()
+    monkeypatch.setattr(measure, limit, 0)
+    counted = sizes()
+    assert 0.75 < np.median(counted / sampled) < 1.25
+    assert (counted != sampled).all()

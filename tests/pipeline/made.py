@@ -10,7 +10,7 @@ from sfm_shapefit.facts.intrinsics import intrinsics_in_doubt
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.pairs.pair_directions import PairDirections
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.pipeline.rigs import find_rigid_parts
@@ -20,10 +20,32 @@ from sfm_shapefit.placement.place import Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import Known
 from sfm_shapefit.scene.lens import FOCAL, PARTS
-from tests.problems import exact_graph
+from tests.problems import exact_graph, made_directions
 from tests.scenes import RING
 
 FOLDER, DATABASE = RING / "sparse" / "0", RING / "database.db"
+PAIR = 2147483647  # COLMAP's pair_id is id1 * this + id2
+
+
+def keep_few_matches(last, most, *, wrong=False):
+    """Return an edit of a database: of the pairs between images up to `last` and the others, `most` keep few.
+
+    The rest of them keep no matches; `wrong` ones are of nothing.
+    """
+
+    def edit(connection):
+        rng = np.random.default_rng(0)
+        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+        between = [row for row in rows if (row[0] // PAIR <= last) != (row[0] % PAIR <= last)]
+        for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: -row[1])):
+            matches = np.frombuffer(data, np.uint32).reshape(-1, 2)
+            matches = matches[rng.permutation(count)[: 12 * (rank < most)]].copy()
+            if wrong:
+                matches[:, 1] = rng.permutation(matches[:, 1])
+            values = len(matches), matches.tobytes(), pair
+            connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+    return edit
 
 
 @contextmanager
@@ -56,16 +78,4 @@ def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Sta
 def directions_of(images, pairs=None) -> PairDirections:
     """Return the exact directions of pairs of images, of all if None, with 100 matches each."""
     graph = exact_graph(images.centers, pairs)
-    k = graph.num_edges
-    return PairDirections(
-        pairs=graph.edges,
-        directions=graph.directions,
-        status=[DirectionStatus.USABLE] * k,
-        num_matches=np.full(k, 100),
-        num_inliers=np.full(k, 100),
-        num_rivals=np.zeros(k, np.int64),
-        cheirality_fraction=np.ones(k),
-        median_residual_px=np.full(k, 0.1),
-        parallax_deg=np.full(k, 10.0),
-        covariance=np.tile(1e-6 * np.eye(2), (k, 1, 1)),
-    )
+    return made_directions(graph.edges, graph.directions)

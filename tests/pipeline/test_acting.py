@@ -39,13 +39,6 @@ def test_a_lens_that_is_wrong_is_freed_and_the_cameras_stand_right(truth):
     assert sfm_shapefit.evaluate(found.reconstruction, truth).position.max < 1e-3
 
 
-def test_intrinsics_held_forbid_it_and_the_lens_is_named(truth):
-    name = truth.image(5).name
-    found = sfm_shapefit.locate(with_own_lenses(truth, {name: 1.1}), DATABASE, intrinsics="held")
-    assert found.verdict.grade is Grade.LOOK
-    assert [told.camera for told in found.told_evidence.lenses] == [truth.image(5).image_id]
-
-
 def test_map_frees_a_lens_too(truth, tmp_path):
     """The database says that the lens of one image was calibrated, and it is wrong."""
     path = tmp_path / "database.db"
@@ -75,11 +68,10 @@ def test_a_lens_whose_image_is_left_out_is_found_too():
 
 
 @pytest.mark.parametrize(("here", "moves"), [(3, True), (4, False)])
-def test_a_camera_goes_where_twice_as_many_pairs_put_it(truth, here, moves):
-    found = sfm_shapefit.locate(truth, DATABASE)
+def test_a_camera_goes_where_twice_as_many_pairs_put_it(ring_located, here, moves):
     pairs = np.array([(0, 2), (1, 2), (2, 3), (2, 4)])[:here]
     place = OtherPlace(2, here, 6, np.ones(3), pairs)
-    found = replace(found, evidence=ModelEvidence(places=(place,)))
+    found = replace(ring_located, evidence=ModelEvidence(places=(place,)))
     model = read_model(RING / "sparse" / "0")
     inputs, options = choose_inputs(RING / "sparse" / "0", DATABASE), LocateOptions()
     with closing(open_matches(model, inputs)) as matches:

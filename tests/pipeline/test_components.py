@@ -4,22 +4,16 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
 from sfm_shapefit.rotations.options import AveragingOptions
+from tests.problems import made_rotations
 
 
 def averaged(pairs, weight_shares, **options):
     """The groups of frames that get rotations, and the reasons of the others."""
-    k = len(pairs)
-    relative = RelativeRotations(
-        pairs=np.array(pairs),
-        rotations=np.tile(np.eye(3), (k, 1, 1)),
-        information=np.tile(1e6 * np.eye(3), (k, 1, 1)),
-        num_matches=np.full(k, 100),
-        weight_shares=np.array(weight_shares),
-    )
+    rotations = np.tile(np.eye(3), (len(pairs), 1, 1))
+    relative = made_rotations(pairs, rotations, weight_shares=np.array(weight_shares))
     reasons: dict[int, str] = {}
     components = ComponentAveraging(AveragingOptions(**options), Clock(), gravity=None)
     found = list(components.average(int(np.max(pairs)) + 1, relative, reasons))
@@ -35,6 +29,12 @@ def test_each_frame_of_a_component_too_small_once_averaged_is_told_so():
     few = "pairs that can be believed tie it to only 1 other image (or frame of a rig); a model needs 3"
     assert (reasons[0], reasons[1]) == (few, few)
     assert reasons[2].startswith("no pair that can be believed ties it to the others")
+
+
+def test_frames_of_too_few_pairs_are_told_how_few():
+    _, reasons = averaged([(0, 1), (2, 3), (3, 4), (2, 4)], [SOUND] * 4)
+    few = "matched with only 1 other image (or frame of a rig); a model needs 3"
+    assert (reasons[0], reasons[1]) == (few, few)
 
 
 def test_frames_behind_unsound_pairs_are_a_component_of_their_own():

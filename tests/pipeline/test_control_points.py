@@ -12,6 +12,7 @@ from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.placement.control_points import fit_control_points
 from sfm_shapefit.scene.given import ControlPoints
+from tests.models import write_priors
 from tests.scenes import RING
 
 TURN = pycolmap.Rotation3d(np.array([0.3, -0.2, 0.1])).matrix()
@@ -47,8 +48,7 @@ def centers_of(model):
     return {image.name: image.projection_center() for image in model.images.values() if image.has_pose}
 
 
-@pytest.mark.parametrize("options", [{}, {"adjust": "full"}], ids=["placed", "adjusted"])
-def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp_path, options):
+def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp_path):
     lines = marks_of(ring, CORNERS)
     for k, line in enumerate(lines):  # P6 checks only; P4 is a meter too high
         cells = line.split()
@@ -59,7 +59,7 @@ def test_the_model_stands_where_the_points_are_and_check_points_say_so(ring, tmp
     wrong = lines[0].split()
     lines[0] = " ".join([*wrong[:3], repr(float(wrong[3]) + 300.0), *wrong[4:]])
     path = written(tmp_path, lines)
-    found = sfm_shapefit.locate(ring, RING / "database.db", control_points=path, **options)
+    found = sfm_shapefit.locate(ring, RING / "database.db", control_points=path, adjust="full")
     assert found.gauge.scale == "control points"
     assert found.gauge.statement.startswith(f"control points: 7 points of {path}; 5 of 6 agree")
     for name, center in centers_of(found.reconstruction).items():
@@ -85,6 +85,27 @@ def test_map_stands_where_the_points_are(ring, tmp_path):
     for name, center in centers_of(found.reconstruction).items():
         true = WORLD.apply(ring.find_image_with_name(name).projection_center()[None])[0]
         np.testing.assert_allclose(center, true, atol=1e-3)
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_control_points_come_before_distances_and_priors_and_only_check_what_is_fixed(ring, tmp_path, fixed):
+    centers = centers_of(ring)
+    first, second = centers["0001.jpg"], centers["0004.jpg"]
+    told = {
+        "control_points": written(tmp_path, marks_of(ring, CORNERS)),
+        "known_distance": ("0001.jpg", "0004.jpg", 1.1 * float(np.linalg.norm(first - second))),
+        "priors": write_priors(tmp_path / "priors.txt", centers),
+    }
+    if fixed:
+        (tmp_path / "names.txt").write_text("\n".join(sorted(centers)[:3]))
+        told["fix"] = str(tmp_path / "names.txt")
+    found = sfm_shapefit.locate(ring, RING / "database.db", **told)
+    unused = [warning for warning in found.warnings if "not used" in warning]
+    assert found.gauge.scale == ("fixed" if fixed else "control points")
+    others = ["known distances", "position priors", *(["control points"] if fixed else [])]
+    assert [warning.split(" were")[0] for warning in unused] == others
+    assert all("; they differ by " in warning for warning in unused)
+    assert {row.use for row in found.control_points} == {"check" if fixed else "control"}
 
 
 ORIGIN = np.array([48.1, 11.5, 520.0])

@@ -67,13 +67,6 @@ def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(tiny_
     assert seen[-1] == (len(found.pairs), len(found.pairs))
 
 
-@pytest.mark.slow
-def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(tiny_ring, model):
-    with open_executor("processes", 2) as pool:
-        found, _ = shared(tiny_ring, model, pool)
-    assert_same_bits(found, serial(tiny_ring, model))
-
-
 def _die(*_given):
     os._exit(1)
 
@@ -154,19 +147,15 @@ def test_an_interrupt_while_a_cluster_opens_comes_when_it_can_be_closed():
 
 
 @pytest.mark.slow
-def test_a_second_cluster_on_a_machine_opens_without_a_word(recwarn):
+def test_a_second_cluster_on_a_machine_opens_without_a_word_and_each_is_found_by_its_address(recwarn):
     pytest.importorskip("distributed")
     with open_executor("dask", 1) as first, open_executor("dask", 1) as second:
         assert [pool.submit(abs, -2).result() for pool in (first, second)] == [2, 2]
+        address = second._client.scheduler_info()["address"]
+        with open_executor(f"dask:{address}", 1) as found:
+            assert found.submit(abs, -2).result() == 2
+            assert found._client.scheduler_info()["id"] == second._client.scheduler_info()["id"]
     assert [str(warning.message) for warning in recwarn if "Port" in str(warning.message)] == []
-
-
-@pytest.mark.slow
-def test_a_cluster_that_runs_already_is_found_by_its_address():
-    distributed = pytest.importorskip("distributed")
-    local = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0")
-    with local, open_executor(f"dask:{local.scheduler_address}", 1) as pool:
-        assert pool.submit(abs, -2).result() == 2
 
 
 def test_no_scheduler_at_an_address_is_reported():

@@ -28,13 +28,12 @@ from sfm_shapefit.report.results import draw_joined
 from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.abuse import determinism
-from tests.abuse.verdicts import read_cameras
 from tests.facts.test_schema import problems
 from tests.models import by_name, write_priors
+from tests.pipeline.made import PAIR, keep_few_matches
 from tests.program import run
-from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint, rows_of
 
-PAIR = 2147483647
 PAIRS = "DELETE FROM two_view_geometries WHERE"
 ACROSS = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
 """Pairs between the first four images of the ring and the others."""
@@ -46,10 +45,17 @@ def changed(scene, folder, *statements):
     return edit_database(copied(scene, folder) / "database.db", *statements)
 
 
-def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
+@pytest.fixture(scope="module")
+def by_pairs():
+    """The courtyard, placed by pairs alone."""
     before = fingerprint(COURTYARD)
-    found = sfm_shapefit.map_database(COURTYARD / "database.db", sfm_shapefit.MapOptions(points="never"))
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", sfm_shapefit.MapOptions(**FAST))
     assert fingerprint(COURTYARD) == before
+    return found
+
+
+def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path, by_pairs):
+    found = by_pairs
     (model,) = found.models
     assert (found.num_placed, found.left_out, found.warnings) == (25, {}, ())
     errors = sfm_shapefit.evaluate(model.located.reconstruction, COURTYARD / "truth")
@@ -68,8 +74,8 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     assert not (tmp_path / "out" / "0" / "doubtful_pairs.csv").exists()
 
 
-def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
-    found = sfm_shapefit.map_database(COURTYARD / "database.db", points="never")
+def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path, by_pairs):
+    found = by_pairs
     located = found.models[0].located
     scores, row = located.scores.copy(), next(r for r in located.pairs if r.verdict == "inlier")
     names = [(pair.name1, pair.name2) for pair in located.pairs]
@@ -110,6 +116,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
     assert first.call_count == 2  # priors that are given up leave what came before them
     scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
     assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
+    assert found.joins == ()
     said = "the scale is not that of position priors: the position priors coincide"
     assert any(warning.startswith(said) for warning in scales[True].warnings)
 
@@ -131,13 +138,12 @@ def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize("shape", ["ring", "facade"])
-def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, shape):
+def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path):
     """All tracks of so few images are adjusted, as in bundle adjustment: the likeliest answer, but for the
     loss. Averaged rotations are that of pairs, each of which sees its own matches only: every track of k
     images is cut into pairs, and no two of them need agree on a point."""
     size = {"num_images": 10, "num_points": 400, "max_pairs_per_image": 6, "max_keypoints_per_image": 200}
-    write_workspace(make_scene(SceneOptions(shape=shape, seed=2, **size)), tmp_path / "made")
+    write_workspace(make_scene(SceneOptions(shape="facade", seed=2, **size)), tmp_path / "made")
 
     def errors(**options):
         found = sfm_shapefit.map_database(tmp_path / "made" / "database.db", min_trust=0.0, **options)
@@ -154,9 +160,9 @@ def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, 
 
 
 def test_images_that_see_few_points_are_left_out_with_the_reason_unless_pixels_confirm_them(
-    tmp_path, monkeypatch
+    tmp_path, monkeypatch, ring_mapped
 ):
-    everyone = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=0).models[0].located
+    everyone = ring_mapped.models[0].located
     model = everyone.reconstruction
     counts = {image.name: image.num_points3D for image in model.images.values()}
     assert everyone.kept.all()
@@ -174,7 +180,7 @@ def test_images_that_see_few_points_are_left_out_with_the_reason_unless_pixels_c
     written = read_model(out / "0").reconstruction
     kept = {written.image(k).name: written.image(k).num_points3D for k in written.reg_image_ids()}
     assert kept == {name: count for name, count in counts.items() if name != poorest}
-    reasons = {row["name"]: row["reason"] for row in read_cameras(out / "0")}
+    reasons = {row["name"]: row["reason"] for row in rows_of(out / "0" / "cameras.csv")}
     assert [name for name, reason in reasons.items() if reason] == [poorest]
     assert f"{counts[poorest]} points" in reasons[poorest]
 
@@ -184,10 +190,7 @@ def test_threads_repetition_and_hashes_change_no_byte(tmp_path):
     assert list(determinism.differing_files(RING, tmp_path, command="map", always=flags)) == []
 
 
-STAGES = ("relative rotations", "rotation averaging", "first placement", "locate")
-
-
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ["relative rotations", "locate"])
 def test_an_interrupt_in_any_stage_leaves_nothing_and_whoever_watches_may_cancel_there(
     tmp_path, monkeypatch, stage
 ):
@@ -231,24 +234,17 @@ def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, wor
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("executor", [None, "processes"])
-def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor):
+def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_in_an_executor(tmp_path):
     truth = read_model(RING / "sparse" / "0").images
     listed, ids = [(0, 1), (4, 3)], truth.ids.tolist()
     gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
     without = tmp_path / "without.csv"
     without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
     database = changed(RING, tmp_path / "edited", f"{PAIRS} {' OR '.join(gone)}")
-    if executor is None:
-        given = (
-            sfm_shapefit.map_database(RING / "database.db", without=str(without), **FAST).models[0].located
-        )
-        gone = sfm_shapefit.map_database(database, **FAST).models[0].located
-    else:
-        with ThreadPoolExecutor(2) as pool:
-            model = RING / "sparse" / "0"
-            given = sfm_shapefit.locate(model, without=str(without), executor=pool, **FAST)
-            gone = sfm_shapefit.locate(model, database, **FAST)
+    with ThreadPoolExecutor(2) as pool:
+        left_out = {"without": str(without), "executor": pool}
+        given = sfm_shapefit.map_database(RING / "database.db", **left_out, **FAST).models[0].located
+    gone = sfm_shapefit.map_database(database, **FAST).models[0].located
     np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
     assert len(given.directions.pairs) > 0
     centers = [found.table("cameras")["x"] for found in (given, gone)]
@@ -368,19 +364,6 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
 
 
-def test_images_in_no_model_are_told_their_own_reason(tmp_path):
-    group = f"(pair_id / {PAIR} > 4) + (pair_id / {PAIR} > 6) + (pair_id / {PAIR} > 7)"
-    cut = f"{group} != {group.replace('/', '%')}"
-    path = changed(RING, tmp_path, f"{PAIRS} {cut}")
-    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
-    assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
-    assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
-    assert {found.left_out[name] for name in ("0005.jpg", "0006.jpg")} == {
-        "matched with only 1 other image (or frame of a rig); a model needs 3"
-    }
-    assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
-
-
 def wrong_focal_length(factor):
     """A statement that makes a factor's worth of the focal length of the ring's camera COLMAP's guess."""
     params = np.array([1000.0 * factor, 1000.0 * factor, 600.0, 450.0], dtype="<f8").tobytes().hex()
@@ -415,27 +398,9 @@ def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
     assert located.summary()["intrinsics"][0]["decided_by"] == "held"
 
 
-def keep_few_matches(wrong):
-    """Of the pairs between the first images and the others, leave few matches of six and none of the rest."""
-
-    def edit(connection):
-        rng = np.random.default_rng(0)
-        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
-        between = [row for row in rows if (row[0] // PAIR <= 4) != (row[0] % PAIR <= 4)]
-        for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: -row[1])):
-            matches = np.frombuffer(data, np.uint32).reshape(-1, 2)
-            matches = matches[rng.permutation(count)[: 12 * (rank < 6)]].copy()
-            if wrong:
-                matches[:, 1] = rng.permutation(matches[:, 1])
-            values = len(matches), matches.tobytes(), pair
-            connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
-
-    return edit
-
-
 @pytest.mark.parametrize("wrong", [False, True])
 def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tmp_path, wrong):
-    database = changed(RING, tmp_path, keep_few_matches(wrong))
+    database = changed(RING, tmp_path, keep_few_matches(4, 6, wrong=wrong))
     taped = ("0001.jpg", "0008.jpg", 3.0)  # from one model to the other
     found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST), known_distance=(taped,))
     (told,) = found.joins
@@ -487,7 +452,9 @@ def test_a_second_rigid_piece_is_a_model_and_what_keeps_it_apart_is_told(tmp_pat
     sfm_shapefit.write_result(found, tmp_path / "out")
     for folder in ("0", "1"):
         assert read_model(tmp_path / "out" / folder).images.num_images == 4
-    reasons = {row["reason"] for row in read_cameras(tmp_path / "out" / "1") if row["placed"] == "false"}
+    reasons = {
+        row["reason"] for row in rows_of(tmp_path / "out" / "1" / "cameras.csv") if row["placed"] == "false"
+    }
     assert reasons == {"in a larger piece, to which this one is not rigidly tied"}
 
 
@@ -532,7 +499,7 @@ def check_joined_folder(folder, found):
     )  # its models are adjusted
 
 
-def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
+def test_models_are_joined_by_position_priors(tmp_path):
     truth, out = read_model(RING / "sparse" / "0").images, tmp_path / "out"
     database = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
     table = write_priors(tmp_path / "priors.txt", by_name(truth, truth.centers))
@@ -552,6 +519,3 @@ def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path
     )
     run(*arguments, "--overwrite")
     assert "join no models: " in json.loads((out / "map.json").read_text())["warnings"][-1]
-    facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
-    assert facts["joins"] == []
-    assert not (out / "joined_0").exists()

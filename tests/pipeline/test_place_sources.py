@@ -1,6 +1,5 @@
 """`solve` on 1DSfM folders, and what its objectives and formats write."""
 
-import csv
 import json
 import re
 from collections import Counter
@@ -16,7 +15,7 @@ from sfm_shapefit.pipeline.place import place_graph_file
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.files.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene
 from tests.program import run
-from tests.scenes import BUNDLED, real_scene
+from tests.scenes import BUNDLED, real_scene, rows_of
 
 
 def solve(*arguments, code=0):
@@ -24,12 +23,8 @@ def solve(*arguments, code=0):
 
 
 def centers_of(out):
-    with (out / "cameras.csv").open() as stream:
-        return {
-            row["name"]: [float(row[axis]) for axis in "xyz"]
-            for row in csv.DictReader(stream)
-            if row["placed"] == "true"
-        }
+    rows = [row for row in rows_of(out / "cameras.csv") if row["placed"] == "true"]
+    return {row["name"]: [float(row[axis]) for axis in "xyz"] for row in rows}
 
 
 def worst_error(found, truth):
@@ -120,8 +115,7 @@ def test_every_objective_writes_the_same_files_with_a_certificate(tmp_path, obje
     order = np.array([found[str(k)] for k in range(14)])
     assert worst_error(order, problem.locations) < 0.01  # noise of 0.001
     assert facts["solve"]["status"] == "converged"
-    with (tmp_path / "out" / "pairs.csv").open() as stream:
-        assert all(row["dual_norm"] != "" for row in csv.DictReader(stream))
+    assert all(row["dual_norm"] != "" for row in rows_of(tmp_path / "out" / "pairs.csv"))
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ from sfm_shapefit.pipeline import measure as measure_stage
 from sfm_shapefit.pipeline import rigs as rigs_stage
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.convert import convert
+from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.join import judge_joins
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
@@ -42,9 +43,10 @@ from sfm_shapefit.synthetic import (
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.tracks.options import NodeOptions
-from tests.models import by_name, centers_of, posed, poses_of, write_priors
-from tests.program import run
-from tests.scenes import RING, copied, edit_database
+from tests.models import centers_of, posed, poses_of
+from tests.pipeline.made import keep_few_matches
+from tests.problems import made_priors
+from tests.scenes import RING, edit_database
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def workspace(rig_drive):
 
 @pytest.fixture(scope="module")
 def found(workspace):
-    return sfm_shapefit.locate(workspace / "sparse" / "0")
+    return sfm_shapefit.locate(workspace / "sparse" / "0", scale="unit")
 
 
 def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(rigs, workspace):
@@ -121,6 +123,7 @@ def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wro
     assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
     assert found.certified.gap <= 1e-8
     assert found.gauge.statement.startswith("rig: ")
+    assert "the scale unit was not used, but that of the rigs" in found.warnings
     assert_rigs_equal(found.reconstruction, pycolmap.Reconstruction(workspace / "sparse" / "0"))
 
 
@@ -186,23 +189,20 @@ def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_tog
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
 
 
-def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace, rigs, tmp_path):
-    model = read_model(workspace / "truth")
-    images = model.images
+def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace):
+    images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
-    priors = write_priors(tmp_path / "priors.txt", by_name(images, 3.0 * images.centers))
-    known = (images.names[0], images.names[20], 2.0 * apart)
-    told = {"known_distance": known, "priors": priors, "scale": "unit"}
-    found = sfm_shapefit.locate(workspace / "sparse" / "0", points="never", **told)
-    assert found.gauge.scale == "rig"
-    unused = [warning for warning in found.warnings if "not used" in warning]
-    assert [warning.rpartition(" ")[0].partition("; ")[0] for warning in unused][:2] == [
-        f"{what} were not used for the scale, which is that of the rigs"
-        for what in ("known distances", "position priors")
+    distances = ((images.names[0], images.names[20], 2.0 * apart),)
+    rigid = rigs_stage.rigid_parts(images, every < 0)
+    rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
+    chosen = rule.choose(every, 0.1 * images.centers, 0.1)
+    assert chosen.scale == "rig"
+    centers = chosen.apply(0.1 * images.centers)
+    np.testing.assert_allclose(centers - centers[0], images.centers - images.centers[0], atol=1e-9)
+    assert list(rule.check(chosen, every, centers)) == [
+        f"{what} not used for the scale, which is that of the rigs; they differ by {percent} %"
+        for what, percent in (("known distances were", 100), ("position priors were", 200))
     ]
-    off = [float(warning.split(" by ")[1].split()[0]) for warning in unused[:2]]
-    np.testing.assert_allclose(off, [100.0, 200.0], atol=1.0)
-    assert unused[2] == "the scale unit was not used, but that of the rigs"
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
@@ -226,11 +226,10 @@ def moved_ring(tmp_path):
     return model, centers, names, truth.names
 
 
-@pytest.mark.parametrize("adjust", ["seed", "full"])
-def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring, adjust):
+def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring):
     model, centers, names, all_names = moved_ring
     given = poses_of(model)
-    options = LocateOptions(fix=str(names), adjust=adjust)
+    options = LocateOptions(fix=str(names), adjust="full")
     found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     after = poses_of(found.reconstruction)
     for name in all_names[:5]:
@@ -238,6 +237,7 @@ def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(
     errors = np.linalg.norm(centers_of(found.reconstruction) - centers, axis=1) * 0.37
     assert errors.max() < 0.02  # meters; half a pixel at 4 m is 2 mm
     assert found.summary()["rigid_groups"]["num_fixed"] == 5
+    assert ", 5 cameras fixed" in found.facts.rigid_groups.statement
     assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
     assert found.certified.gap <= 1e-8
 
@@ -293,12 +293,11 @@ def test_a_placement_with_loose_cameras_stays_where_points_determine_none(monkey
     assert list(rigs_stage.place_cameras(measured, PlacementOptions(), NodeOptions(), Clock())) == [loose]
 
 
-@pytest.mark.parametrize("adjust", ["seed", "full"])
-def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring, adjust):
+def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
     model, _, names, all_names = moved_ring
     names.write_text(all_names[2])
     given = poses_of(model)[all_names[2]]
-    options = LocateOptions(fix=str(names), scale="unit", adjust=adjust)
+    options = LocateOptions(fix=str(names), scale="unit", adjust="full")
     found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     np.testing.assert_array_equal(poses_of(found.reconstruction)[all_names[2]], given)
     own = centers_of(found.reconstruction)
@@ -358,18 +357,6 @@ def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_pa
         sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
 
 
-def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
-    scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
-    names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
-    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
-    done = run(*arguments, names, code=0)
-    assert "3 cameras fixed" in " ".join(done.output.replace("│", " ").split())
-    given, after = (poses_of(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
-    for k in (1, 2, 3):
-        np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
-    run(*arguments, tmp_path / "none.txt", "--overwrite", code=3)
-
-
 @pytest.fixture(scope="module")
 def mapped(workspace):
     return sfm_shapefit.map_database(workspace / "database.db")
@@ -385,30 +372,6 @@ def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspac
     assert errors.position.max < 0.01
     truth = pycolmap.Reconstruction(workspace / "truth")
     assert_rigs_equal(model.located.reconstruction, truth, atol=1e-12)
-
-
-def assert_mapped_as_well_as_located(scene, workspace, largest_scale_error=1e-3, **options):
-    """`map` has no rotations: `locate` starts at the true ones and frees them."""
-    (model,) = sfm_shapefit.map_database(workspace / "database.db", **options).models
-    located = sfm_shapefit.locate(workspace / "sparse" / "0", rotations="free", **options)
-    mean_errors = []
-    for found in (model.located, located):
-        own = centers_of(found.reconstruction)
-        assert len(own) == scene.num_images
-        fit = fit_similarity(own, scene.centers)
-        assert abs(fit.scale - 1.0) < largest_scale_error
-        metric = replace(fit, scale=1.0, translation=np.zeros(3)).apply(own - own.mean(axis=0))
-        mean_errors.append(
-            np.linalg.norm(metric - (scene.centers - scene.centers.mean(axis=0)), axis=1).mean()
-        )
-    assert mean_errors[0] < 1.2 * mean_errors[1]
-
-
-def test_a_rig_of_four_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
-    options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1500, seed=3)
-    scene = make_scene(replace(options, wrong_match_fraction=0.05))
-    write_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
-    assert_mapped_as_well_as_located(scene, tmp_path / "yard")
 
 
 @pytest.fixture(scope="module")
@@ -486,10 +449,7 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
     # The two that look to the sides see nothing of a facade.
     scene = make_scene(SceneOptions(rig="four", shape="facade", num_images=24, num_points=1500, seed=2))
     write_workspace(scene, tmp_path / "facade")
-    sentence = r"the matches do not tell where camera [34] is in its rig"
-    with pytest.raises(InputError, match=sentence):
-        sfm_shapefit.map_database(tmp_path / "facade" / "database.db", rigs="free")
-    with pytest.raises(InputError, match=sentence):
+    with pytest.raises(InputError, match=r"the matches do not tell where camera [34] is in its rig"):
         sfm_shapefit.locate(tmp_path / "facade" / "sparse" / "0", rigs="free")
     for call in (
         lambda: sfm_shapefit.map_database(RING / "database.db", rigs="free"),
@@ -501,26 +461,11 @@ def test_rigs_that_cannot_be_refined_are_refused(tmp_path):
         LocateOptions(rigs="free", adjust="none")
 
 
-def keep_few_matches(connection):
-    """Leave few matches of eight pairs between the first four frames and the others, and none of the rest."""
-    rng, first = np.random.default_rng(0), 16
-    rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
-    ends = {row[0]: divmod(row[0], 2147483647) for row in rows}
-    between = [pair for pair, (i, j) in ends.items() if (i <= first) != (j <= first)]
-    query = "SELECT rows, data FROM two_view_geometries WHERE pair_id = ?"
-    found = [(pair, *connection.execute(query, (pair,)).fetchone()) for pair in between]
-    for rank, (pair, count, data) in enumerate(sorted(found, key=lambda row: -row[1])):
-        kept = rng.permutation(count)[: 12 * (rank < 8)]
-        matches = np.frombuffer(data, np.uint32).reshape(-1, 2)[kept]
-        values = len(matches), matches.tobytes(), pair
-        connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
-
-
 def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_together(tmp_path):
     options = SceneOptions(rig="four", shape="courtyard", num_images=32, num_points=1200, seed=3)
     scene = make_scene(options)
     write_workspace(scene, tmp_path / "yard")
-    database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches)
+    database = edit_database(tmp_path / "yard" / "database.db", keep_few_matches(16, 8))
     found = sfm_shapefit.map_database(database)
     assert [len(model.names) for model in found.models] == [16, 16]
     (told,) = found.joins
@@ -539,13 +484,15 @@ def test_models_of_rigs_are_joined_in_their_common_scale_and_their_frames_stay_t
     assert abs(fit.scale - 1.0) < 2e-3
 
 
-@pytest.mark.slow
-def test_a_photographed_pair_back_to_back_is_mapped_as_well_as_from_its_true_rotations(tmp_path):
-    size = {"image_width": 320, "image_height": 240, "focal_length_px": 240.0, "num_images": 16}
+def test_photographs_of_a_pair_back_to_back_have_its_frames(tmp_path):
+    size = {"image_width": 160, "image_height": 120, "focal_length_px": 120.0, "num_images": 4}
     scene = make_rendered_scene(SceneOptions(rig="back-to-back", shape="courtyard", seed=5, **size))
-    write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions(model="rotations"))
-    # Eight frames of images this small know the scale to 0.5 %; 48 images of 640 x 480 to 0.1 %.
-    assert_mapped_as_well_as_located(scene, tmp_path / "yard", 5e-3, adjust="full")
+    write_rendered_workspace(scene, tmp_path / "yard", WorkspaceOptions())
+    images = read_model(tmp_path / "yard" / "sparse" / "0").images
+    np.testing.assert_array_equal(images.frame_of, scene.rigs.frame_of_image)
+    np.testing.assert_allclose(images.centers, scene.centers, atol=1e-12)
+    with pycolmap.Database.open(tmp_path / "yard" / "database.db") as database:
+        assert (database.num_rigs(), database.num_frames()) == (1, 2)
 
 
 def test_models_with_rigs_are_joined_at_the_scale_that_they_have(rigs, workspace):

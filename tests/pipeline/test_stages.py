@@ -22,8 +22,7 @@ from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.judgement.judged import judge
 from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.pairs.options import DirectionOptions
-from sfm_shapefit.pairs.relative_rotations import RelativeRotations
-from sfm_shapefit.pipeline.adjustment import adjust_placed
+from sfm_shapefit.pipeline.adjustment import adjust_placed, pull_of_rotations, turned_deg
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.doubts import doubt_cameras
 from sfm_shapefit.pipeline.gauge_choice import GaugeRule
@@ -33,12 +32,10 @@ from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.tracks.options import NodeOptions
 from tests.models import centers_of, only, posed
 from tests.pipeline.made import DATABASE, FOLDER, directions_of, opened, placement_at, stand_at
-from tests.problems import all_pairs, exact_graph, turn
+from tests.problems import all_pairs, exact_graph, made_priors, made_rotations, turn
 from tests.scenes import view_of
 
 MODEL = read_model(FOLDER)
@@ -51,14 +48,8 @@ def relative_rotations(model, turned=()):
     rotations = model.rotations.copy()
     rotations[list(turned)] = turn([0.0, 0.6, 0.8], 10.0) @ rotations[list(turned)]
     pairs = np.array(all_pairs(model.num_images))
-    k, (i, j) = len(pairs), pairs.T
-    return RelativeRotations(
-        pairs=pairs,
-        rotations=rotations[j] @ rotations[i].transpose(0, 2, 1),
-        information=np.tile(1e8 * np.eye(3), (k, 1, 1)),
-        num_matches=np.full(k, 100),
-        weight_shares=np.ones(k),
-    )
+    i, j = pairs.T
+    return made_rotations(pairs, rotations[j] @ rotations[i].transpose(0, 2, 1))
 
 
 def test_measure_tells_directions_tracks_and_errors_of_one_pass_and_makes_a_graph_of_them():
@@ -157,6 +148,26 @@ def test_adjust_moves_cameras_and_free_rotations_to_where_the_pixels_are_and_mea
     assert off_deg[1].max() < 1e-3
 
 
+def test_adjust_turns_cameras_as_far_as_was_asked():
+    rng, found = np.random.default_rng(0), {}
+    errors = Rotation.from_rotvec(np.radians(0.03) * rng.standard_normal((8, 3))).as_matrix()
+    turns = dict(zip(TRUTH.names, errors, strict=True))
+    off = posed(FOLDER, lambda name, rotation, center: (turns[name] @ rotation, center))
+    with opened(off) as source:
+        for rotations in ("held", 1e-4, 0.03, "free"):
+            pull_rad = pull_of_rotations(rotations)
+            stand = stand_at(source, 0.1 * TRUTH.centers, all_pairs=False, pull_rad=pull_rad)
+            after = adjust_placed(stand, LocateOptions(), Clock())
+            turned = turned_deg(source.images.rotations, after.source.images.rotations)
+            found[rotations] = after.adjustment.statement, np.median(turned)
+            assert after.adjustment.errors is None  # how far they are off is no question
+    assert found["held"][1] == 0.0
+    assert 0.0 < found[1e-4][1] < 1e-4
+    assert 0.01 < found[0.03][1] < found["free"][1]
+    assert "weighted by 0.03 deg, as asked" in found[0.03][0]
+    assert "rotations free, as asked" in found["free"][0]
+
+
 def test_judge_names_the_pairs_that_contradict_and_who_is_turned_by_what_its_pairs_say():
     graph = exact_graph(TRUTH.centers)
     wrong = graph.directions.copy()
@@ -191,20 +202,12 @@ def test_seed_has_the_points_that_kept_cameras_see_and_leaves_the_others_unregis
     assert set(some.points.images) == set(np.flatnonzero(kept))
 
 
-def known(positions, rows=slice(None)):
-    """Exact position priors of some cameras, of unknown standard deviations."""
-    rows = np.arange(len(positions))[rows]
-    return PositionPriors(
-        known=KnownPositions(rows, positions[rows], np.full((len(rows), 3, 3), np.nan)), statement="made"
-    )
-
-
 PAIR = (TRUTH.names[0], TRUTH.names[2])
 APART = float(np.linalg.norm(TRUTH.centers[0] - TRUTH.centers[2]))
 DISTANCE = {"distances": ((*PAIR, 1.5 * APART),)}
-PRIORS = {"priors": known(2.0 * TRUTH.centers)}
+PRIORS = {"priors": made_priors(2.0 * TRUTH.centers)}
 OFF = 0.01 * np.random.default_rng(1).standard_normal(TRUTH.centers.shape)
-TURNED_PRIORS = {"priors": known(2.0 * (TRUTH.centers + OFF) @ TURN.T + 100.0)}
+TURNED_PRIORS = {"priors": made_priors(2.0 * (TRUTH.centers + OFF) @ TURN.T + 100.0)}
 
 
 @pytest.mark.parametrize(
@@ -280,7 +283,11 @@ def models():
 
 @pytest.mark.parametrize("by", ["matches", "priors"])
 def test_join_brings_models_into_the_world_of_the_first(models, by):
-    priors = [] if by == "matches" else [known(7.0 * TRUTH.centers[half]) for half in (slice(4), slice(4, 8))]
+    priors = (
+        []
+        if by == "matches"
+        else [made_priors(7.0 * TRUTH.centers[half]) for half in (slice(4), slice(4, 8))]
+    )
     with view_of(DATABASE, TRUTH) as view:
         tied = tie_pieces(models, view.matches if by == "matches" else None, frozenset())
     (told,) = judge_joins(models, tied, priors)

@@ -14,7 +14,8 @@ from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.placement.conditioning import direction_spread
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.refinement.options import PlacementOptions
-from tests.problems import all_pairs, exact_graph
+from tests.models import turned
+from tests.problems import all_pairs, exact_graph, turn
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, fingerprint
 
@@ -142,6 +143,20 @@ def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
 def test_inspect_sees_as_many_wrong_pairs_as_locate_rejects():
     seen = sfm_shapefit.inspect(COURTYARD / "sparse" / "0").diagnosis
     assert seen.corruption.share == pytest.approx(44 / 176, abs=0.05)  # self-consistent in part: too low
+
+
+def test_a_right_camera_before_a_repeated_facade_is_not_weak():
+    """7 of the 10 pairs of 0007.jpg contradict their triangles, and its own relative rotations do not."""
+    seen = sfm_shapefit.inspect(COURTYARD / "sparse" / "0", COURTYARD / "database.db")
+    assert seen.diagnosis.weak == ()
+    assert seen.diagnosis.corruption.share > 0.1
+
+
+def test_a_turned_camera_is_named():
+    model = turned(COURTYARD / "sparse" / "0", ["0010.jpg"], turn([0.0, 1.0, 0.0], 20.0))
+    seen = sfm_shapefit.inspect(model, COURTYARD / "database.db")
+    told = {camera.name for camera in seen.diagnosis.weak} | set(seen.diagnosis.left_out)
+    assert told == {"0010.jpg"}
 
 
 def test_json_has_the_same_content():

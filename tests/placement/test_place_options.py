@@ -19,12 +19,10 @@ from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
-from tests.problems import rig_problem
+from tests.problems import made_priors, rig_problem
 
 NUM_FRAMES, SENSORS = 12, 3
 N = NUM_FRAMES * SENSORS
@@ -140,14 +138,6 @@ def test_rejected_pairs_that_agree_on_another_placement_are_warned_of(usual):
     assert any("agree with one another" in sentence for sentence in quality_warnings(found))
 
 
-def priors_for(rows, positions):
-    """Exact positions of some cameras, of a standard deviation of 0.01."""
-    return PositionPriors(
-        known=KnownPositions(np.asarray(rows), positions[rows], np.tile(1e4 * np.eye(3), (len(rows), 1, 1))),
-        statement="made",
-    )
-
-
 @pytest.fixture(scope="module")
 def reset() -> tuple[Placement, np.ndarray]:
     """A placement whose refinement threw cameras out, and the positions of all."""
@@ -172,7 +162,7 @@ def pull(placement, priors, **options):
 
 def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):
     placement, positions = reset
-    pulled, gauge, _ = pull(placement, priors_for(np.arange(40), positions))
+    pulled, gauge, _ = pull(placement, made_priors(positions, 0.01, np.arange(40)))
     assert "the priors moved cameras by" in gauge.statement
     assert np.isinf(pulled.assessment.sigmas[40]).all()
     assert pulled.assessment.trust[40] == 0.0
@@ -183,19 +173,19 @@ def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_o
 
 def test_a_camera_that_was_put_back_is_determined_where_its_prior_holds_it(reset):
     placement, positions = reset
-    gauge = prior_gauge(placement.locations, priors_for(np.arange(40), positions))
+    gauge = prior_gauge(placement.locations, made_priors(positions, 0.01, np.arange(40)))
     positions = np.concatenate([positions[:40], gauge.apply(placement.locations)[40:]])
-    held = pull(placement, priors_for(np.arange(41), positions))
+    held = pull(placement, made_priors(positions, 0.01))
     assert held.placement.refined.reset_nodes.tolist() == []
     positions[40] += 100.0
-    lost = pull(placement, priors_for(np.arange(41), positions))
+    lost = pull(placement, made_priors(positions, 0.01))
     assert lost.placement.refined.reset_nodes.tolist() == [40]
 
 
 def test_what_the_rejected_pairs_agree_on_is_asked_anew_after_priors_pulled():
     other = 4.0 * np.random.default_rng(8).normal(size=(N, 3))
     placement = place(measure("plain", 0.3, other))
-    pulled = pull(placement, priors_for(np.arange(N), placement.locations)).placement
+    pulled = pull(placement, made_priors(placement.locations, 0.01)).placement
     assert placement.second_configuration is not None
     assert pulled.second_configuration is not None
     assert pulled.second_configuration is not placement.second_configuration
@@ -204,4 +194,4 @@ def test_what_the_rejected_pairs_agree_on_is_asked_anew_after_priors_pulled():
 def test_priors_do_not_pull_with_a_larger_factor_than_is_allowed(reset):
     placement, positions = reset
     with pytest.raises(UnsolvableError, match="more than the 0 MB allowed for one"):
-        pull(placement, priors_for(np.arange(40), positions), factor_memory_mb=NO_FACTOR)
+        pull(placement, made_priors(positions, 0.01, np.arange(40)), factor_memory_mb=NO_FACTOR)
