@@ -17,20 +17,13 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.reduction import Pin, Reduction, factor_pinned
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.tied import largest_tied
-from tests.problems import outer, rig_problem
+from tests.problems import lud_over, outer, rig_problem
 
 
 def centered(t):
     return t - t.mean(axis=0)
-
-
-def lud_over(graph, groups, steps=150):
-    """LUD's locations over groups, which its splitting sees through the linear solve alone."""
-    factor = Reduction.over(graph.edges, groups.normalize())
-    return solve_lud(graph, steps, tol=1e-8, certified=False, resources=Resources(factor=factor)).locations
 
 
 def test_reducing_is_the_adjoint_of_expanding_and_fitting_its_inverse():
