@@ -38,8 +38,6 @@ class BundledScene(NamedTuple):
     """How its images are drawn; None for made-up keypoints."""
 
 
-GRAPH, GPS, GCP, NAMES, GRAVITY = "graph40.txt", "gps.csv", "gcp_list.txt", "names.txt", "gravity.txt"
-ACROSS = "across.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -97,12 +95,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the scenes")
     out = parser.parse_args().out
-    (out / GRAPH).write_text(bundled_graph_text(), encoding="utf-8")
-    (out / GPS).write_text(measured_positions_text(), encoding="utf-8")
-    (out / GCP).write_text(control_points_text(), encoding="utf-8")
-    (out / NAMES).write_text(names_text(), encoding="utf-8")
-    (out / GRAVITY).write_text(gravity_text(), encoding="utf-8")
-    (out / ACROSS).write_text(across_text(), encoding="utf-8")
+    for name, text in TABLES.items():
+        (out / name).write_text(text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
@@ -174,6 +168,17 @@ def names_text() -> str:
 def across_text() -> str:
     """Return the pairs between the halves of ring8, as a file for --without: two models are left."""
     return "".join(f"{image_name(i)},{image_name(j)}\n" for i in range(4) for j in range(4, 8))
+
+
+TABLES = {
+    "graph40.txt": bundled_graph_text,
+    "gps.csv": measured_positions_text,
+    "gcp_list.txt": control_points_text,
+    "gravity.txt": gravity_text,
+    "names.txt": names_text,
+    "across.txt": across_text,
+}
+"""Files beside the scenes, and what writes each."""
 
 
 def write_scene(name: str, folder: Path) -> None:

@@ -27,11 +27,8 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="folder with a report.html")
     parser.add_argument("picture", type=Path, help="PNG to write")
     parser.add_argument("--camera", help="name of a camera that is clicked on first")
-    parser.add_argument("--width", type=int, default=SIZE[0], help="pixels")
-    parser.add_argument("--height", type=int, default=SIZE[1], help="pixels")
-    parser.add_argument("--dark", action="store_true", help="in dark colors")
     args = parser.parse_args()
-    with chromium(args.width, args.height, dark=args.dark) as driver:
+    with chromium(*SIZE) as driver:
         page = args.out / "report.html"
         page = page if page.exists() else args.out / "0/report.html"  # of `map`
         opened(driver, page.resolve())

@@ -24,7 +24,7 @@ _PATIENCE_S = 90.0  # drawing WebGL without a graphics card on a busy machine
 
 
 @contextmanager
-def chromium(width=1400, height=1000, dark=False):
+def chromium(width=1400, height=1000):
     """Yield a driver of Chromium, or skip the test with a reason."""
     paths = {name: shutil.which(name) for name in ("chromium", "chromedriver")}
     missing = [name for name, path in paths.items() if path is None]
@@ -42,7 +42,7 @@ def chromium(width=1400, height=1000, dark=False):
         try:
             size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
             driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-            scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+            scheme = {"name": "prefers-color-scheme", "value": "light"}
             driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
             yield driver
         finally:

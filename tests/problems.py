@@ -16,8 +16,10 @@ from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.engine import Goal
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import AdmmResult, Splitting
 
 Floats = npt.NDArray[np.float64]
@@ -197,3 +199,9 @@ def solve_admm(
         return splitting.run(Goal(tol, 0.0, max_iterations), on_iteration)
     finally:
         splitting.close()
+
+
+def lud_over(graph: ViewGraph, groups: RigidGroups, steps: int = 150) -> Floats:
+    """LUD's locations over groups, which its splitting sees through the linear solve alone."""
+    factor = Reduction.over(graph.edges, groups.normalize())
+    return solve_lud(graph, steps, certified=False, resources=Resources(factor=factor)).locations

@@ -109,16 +109,8 @@ class Runner:
         run = self.run([sys.executable, "-m", "sfm_shapefit.cli", *words])
         said = [line for line in run.stderr.splitlines() if line.strip()]
         answer: Answer = {"exit": run.code, "verdict": "", "said": said[-1] if said else ""}
-        answer |= {
-            "files": [],
-            "printed": "",
-            "models": {},
-            "tables": {},
-            "json": {},
-            "texts": {},
-            "pages": {},
-        }
-        answer |= {"digests": {}}
+        parts = ("models", "tables", "json", "texts", "pages", "digests")
+        answer |= {"files": [], "printed": "", **{part: {} for part in parts}}
         if run.stdout.startswith("{"):
             answer["json"]["stdout"] = json.loads(run.stdout)
         else:

@@ -31,11 +31,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pycolmap
+from scipy.cluster.vq import kmeans2
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from harness.driver import Benchmark, Case, if_there
 from harness.record import Row, at_least, at_most
 from harness.scenes import write_scene
+from sfm_shapefit.base.errors import ShapeFitError
+from sfm_shapefit.base.geometry import Similarity, fit_similarity, invert, normalized
+from sfm_shapefit.files.colmap.database import open_database
+from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.seed import transform_model
+from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
+from sfm_shapefit.placement.join import PieceJoin, join_pieces
 
 SCENES = ("castle-P30", "Herz-Jesus-P25", "lego100", "kitti-turn")
 RING = {"shape": "ring", "num_images": 300, "num_points": 6000, "wrong_match_fraction": 0.05, "seed": 1}
@@ -126,20 +136,9 @@ def cut(
 
     A piece has the first images of the next one too, if they are to overlap.
     """
-    import pycolmap
-    from scipy.spatial.transform import Rotation
-
-    from sfm_shapefit.base.geometry import Similarity, fit_similarity
-    from sfm_shapefit.files.colmap.database import open_database
-    from sfm_shapefit.files.colmap.model import read_model
-    from sfm_shapefit.files.colmap.seed import transform_model
-    from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-
     images, rng = read_model(model).images, np.random.default_rng(count)
     labels = np.arange(images.num_images) * count // images.num_images
     if by_place:
-        from scipy.cluster.vq import kmeans2
-
         labels = kmeans2(images.centers, count, seed=1, minit="++")[1]
     pieces = []
     for label in range(count):
@@ -183,10 +182,6 @@ def measure_shared(name: str, scene: Path, args: argparse.Namespace) -> list[Row
 
 def shared_trials(whole: Cut, count: int, wrong: int, beside: int, seeds: int) -> "Iterator[Outcome]":
     """Yield what comes of the second piece, in draws of shared images, of those wrong, and of pairs."""
-    from scipy.spatial.transform import Rotation
-
-    from sfm_shapefit.base.geometry import normalized
-
     ties, size = whole.tied.ties, whole.extent / whole.truth[1].scale
     for seed in range(seeds):
         rng, cameras = np.random.default_rng([seed, count, wrong]), whole.tied.cameras
@@ -209,8 +204,6 @@ def shared_row(name: str, count: int, wrong: int, beside: int, found: "Sequence[
 
 def measure_fragments(name: str, scene: Path, counts: Sequence[int]) -> list[Row]:
     """Let COLMAP map a scene of which few pairs between its halves are left, and join what it leaves."""
-    import pycolmap
-
     rows = []
     for k in counts:
         with tempfile.TemporaryDirectory() as work:
@@ -251,8 +244,6 @@ def keep_pairs(database: Path, count: int) -> None:
 
 def fragments_row(name: str, k: int, models: Sequence[Any], database: Path, truth: Any) -> Row:
     """Return the row of the models that a mapper left, joined where that is safe."""
-    from sfm_shapefit.base.errors import ShapeFitError
-
     cells = {"scene": name, "k": k, "models of COLMAP": [model.num_reg_images() for model in models]}
     joined, error, told, seconds = "-", np.nan, "one model: nothing to join", np.nan
     if len(models) > 1:
@@ -296,8 +287,6 @@ def trials(whole: Cut, count: int, kind: str, seeds: int) -> Iterator[Outcome]:
 
 def outcomes(whole: Cut, cameras: Any, ties: Any) -> Iterator[Outcome]:
     """Yield what comes of each piece."""
-    from sfm_shapefit.placement.join import PieceJoin, join_pieces
-
     start = time.process_time()
     joins = join_pieces(cameras, ties)
     seconds = time.process_time() - start
@@ -310,8 +299,6 @@ def outcomes(whole: Cut, cameras: Any, ties: Any) -> Iterator[Outcome]:
 
 def plant(whole: Cut, ties: Any, kind: str, rng: np.random.Generator) -> Any:
     """Return the ties with a share of their pairs made wrong."""
-    from sfm_shapefit.base.geometry import invert, normalized
-
     cameras, points = whole.tied.cameras, ties.points.copy()
     pairs, rays = ties.matches.pairs.copy(), [ties.matches.rays_i.copy(), ties.matches.rays_j.copy()]
     pieces = cameras.piece_of[pairs]

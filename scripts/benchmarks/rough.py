@@ -13,17 +13,21 @@ import argparse
 import shutil
 import sqlite3
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from harness.driver import ROOT, Benchmark, Case, if_there
+from harness.process import Timed, time_call
 from harness.record import Row, at_least, at_most, ratio
+from sfm_shapefit.facts.warnings import wrong_rotations
+from sfm_shapefit.pipeline.convert import convert
 
 BUNDLED = {"courtyard": "truth", "photographed": "truth", "ring8": "sparse/0"}
 REAL = ("castle-P30", "Herz-Jesus-P25", "fountain-P11", "lego100")
@@ -52,7 +56,7 @@ def measure(name: str, folder: Path, truth: str, args: argparse.Namespace) -> li
         database = Path(work) / "database.db"
         shutil.copyfile(folder / "database.db", database)
         guess_focal_lengths(database, 1.0 + OFF)
-        mapped, seconds = timed(lambda: sfm_shapefit.map_database(database, threads=args.threads))
+        mapped, _, seconds = warm(lambda: sfm_shapefit.map_database(database, threads=args.threads))
         error = sfm_shapefit.evaluate(mapped.models[0].located, folder / truth).position.mean
         poses, rows, exact = Path(work) / "transforms.json", [], exact_error(folder / truth)
         for sigma_deg in SIGMAS_DEG[:1] if args.quick else SIGMAS_DEG:
@@ -66,8 +70,6 @@ def measure(name: str, folder: Path, truth: str, args: argparse.Namespace) -> li
 
 def exact_error(truth: Path) -> float:
     """Return the position error that moves no pixel of a scene by more than what counts as exact."""
-    import pycolmap
-
     model = pycolmap.Reconstruction(truth)
     centers = [image.projection_center() for image in model.images.values() if image.has_pose]
     focal = max(camera.mean_focal_length() for camera in model.cameras.values())
@@ -76,8 +78,6 @@ def exact_error(truth: Path) -> float:
 
 def guess_focal_lengths(database: Path, factor: float) -> None:
     """Let the focal lengths of a database be guesses, some factor too long."""
-    import pycolmap
-
     connection = sqlite3.connect(database)
     for camera, model, params in connection.execute(
         "SELECT camera_id, model, params FROM cameras"
@@ -95,11 +95,6 @@ def guess_focal_lengths(database: Path, factor: float) -> None:
 
 def spoil(truth: Path, poses: Path, sigma_deg: float, seed: int) -> set[str]:
     """Write the spoiled poses of a model, and return the names of those that are wrong."""
-    import pycolmap
-    from scipy.spatial.transform import Rotation
-
-    from sfm_shapefit.pipeline.convert import convert
-
     rng, model = np.random.default_rng(seed), pycolmap.Reconstruction(truth)
     posed = sorted(image.name for image in model.images.values() if image.has_pose)
     wrong = set(rng.permutation(posed)[: max(1, round(GROSS * len(posed)))].tolist())
@@ -123,10 +118,10 @@ def one_run(
     truth: Path, database: Path, poses: Path, sigma_deg: float, seed: int, threads: int
 ) -> dict[str, Any]:
     """Return what comes of one spoiled list."""
-    from sfm_shapefit.facts.warnings import wrong_rotations
-
     wrong = spoil(truth, poses, sigma_deg, seed)
-    found, seconds = timed(lambda: sfm_shapefit.locate(poses, database, rotations=sigma_deg, threads=threads))
+    found, _, seconds = warm(
+        lambda: sfm_shapefit.locate(poses, database, rotations=sigma_deg, threads=threads)
+    )
     named = {found.images.names[k] for k in wrong_rotations(found.turned_deg, sigma_deg).tolist()}
     return {
         "error": sfm_shapefit.evaluate(found, truth).position.mean,
@@ -139,12 +134,10 @@ def one_run(
     }
 
 
-def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Return what a function gives and its processor seconds, kernels loaded."""
+def warm(run: Callable[[], Any]) -> Timed:
+    """Call a function a second time, its kernels loaded."""
     run()
-    start = time.process_time()
-    found = run()
-    return found, time.process_time() - start
+    return time_call(run)
 
 
 def row_of(

@@ -27,7 +27,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.record import Row, at_least, at_most, table
 from harness.scenes import temporary_scene
 from sfm_shapefit.files.colmap.quiet import quiet_log
@@ -83,16 +83,14 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     found |= {f"two sides, {num} pairs": partial(judge_two_sides, num) for num in FALSE_PAIRS}
     for name in REAL:
         scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
-        found[name] = partial(judge_scene, name, scene) if scene.model.is_dir() else NOT_FOUND
+        found[name] = if_there(scene.model, partial(judge_scene, name, scene))
     found["cut courtyard"] = partial(judge_cuts, "cut courtyard", bundled["courtyard"])
     for name in CUT_REAL:
         scene = Scene(args.data / name / "sparse" / "0", args.data / name / "database.db")
-        found[f"cut {name}"] = (
-            partial(judge_cuts, f"cut {name}", scene) if scene.model.is_dir() else NOT_FOUND
-        )
+        found[f"cut {name}"] = if_there(scene.model, partial(judge_cuts, f"cut {name}", scene))
     name = f"cut {CUT_REAL[-1]}, priors"  # of the scene that the loop ends with
     by_priors = partial(judge_cuts, name, scene, cuts=CUTS[1:2], prior_share=PRIOR_SHARE)
-    return found | {name: by_priors if scene.model.is_dir() else NOT_FOUND}
+    return found | {name: if_there(scene.model, by_priors)}
 
 
 def judge_cuts(

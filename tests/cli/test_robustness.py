@@ -14,6 +14,8 @@ import pytest
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.tables import read_trust
 from sfm_shapefit.files.colmap import model as models
+from tests.models import posed
+from tests.problems import random_rotations
 from tests.program import run, run_python, run_refused
 from tests.scenes import COURTYARD, RING, ROOT
 
@@ -22,36 +24,23 @@ COMMAND = [sys.executable, "-m", "sfm_shapefit.cli"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
-def posed(tmp_path, rotate, place):
-    """The ring with other rotations and centers."""
-    model = pycolmap.Reconstruction(RING / "sparse/0")
-    for k, image in enumerate(model.images.values()):
-        rotation = rotate(k, image.cam_from_world().rotation)
-        pose = pycolmap.Rigid3d(rotation, -rotation.matrix() @ place(image.projection_center()))
-        image.frame.set_cam_from_world(image.camera_id, pose)
-    folder = tmp_path / "posed"
-    folder.mkdir()
-    model.write(folder)
-    return folder
-
-
-def turn_at_random(k, _rotation):
-    quaternion = np.random.default_rng(k).normal(size=4)
-    return pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion))
-
-
 @pytest.mark.parametrize("with_database", [False, True])
 @pytest.mark.parametrize(
-    ("rotate", "place"),
+    "change",
     [
-        (lambda _k, rotation: rotation, np.negative),
-        (turn_at_random, lambda center: center),
-        (lambda _k, rotation: rotation, np.zeros_like),
+        lambda _name, rotation, center: (rotation, -center),
+        lambda name, _rotation, center: (
+            random_rotations(np.random.default_rng(int(name[:4])), 1)[0],
+            center,
+        ),
+        lambda _name, rotation, center: (rotation, 0.0 * center),
     ],
     ids=["mirrored", "random rotations", "all at one place"],
 )
-def test_a_model_without_a_usable_direction_gets_a_verdict_and_a_page(tmp_path, rotate, place, with_database):
-    folder, page = posed(tmp_path, rotate, place), tmp_path / "page.html"
+def test_a_model_without_a_usable_direction_gets_a_verdict_and_a_page(tmp_path, change, with_database):
+    folder, page = tmp_path / "posed", tmp_path / "page.html"
+    folder.mkdir()
+    posed(RING / "sparse/0", change).write(folder)
     database = ["--database", RING / "database.db"] if with_database else []
     assert "verdict: do not use" in run("check", folder, "--report", page, *database, code=0).stdout
     assert page.exists()

@@ -25,7 +25,7 @@ from sfm_shapefit.files.colmap.points import observed_points
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.pipeline.evaluate import evaluate
 from sfm_shapefit.scene.matches import PLENTY, Reading
-from tests.scenes import COURTYARD, edit_database, fingerprint, real_scene, view_of
+from tests.scenes import COURTYARD, edit_database, fingerprint, view_of
 
 EPS = np.finfo(np.float64).eps
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
@@ -811,21 +811,6 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
     (model / "database.db").unlink()
     assert find_database(Path(".")) == model.parent / "database.db"
     assert find_database(Path("../../sparse/0")) == model.parent / "database.db"
-
-
-def test_a_real_scene_is_read_in_well_under_ten_seconds():
-    folder = real_scene("castle-P30") / "sparse" / "0"
-    start = time.process_time()
-    model = read_model(folder)
-    with view_of(find_database(folder), model.images) as view:
-        (batch,) = view.batches()
-    own = track_batches(model)
-    # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
-    assert time.process_time() - start < 10.0
-    assert model.images.num_images == 30
-    assert len(batch.pairs) == 378
-    assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
-    assert sum(np.sum(np.diff(batch.offsets) >= 15) for batch in own) == 273
 
 
 def test_images_observe_what_pycolmap_says():

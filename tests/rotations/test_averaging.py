@@ -7,8 +7,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from harness.scenes import errors_deg
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.rotations import annealing, averaging_system, averaging_uncertainty, dual_certificate
 from sfm_shapefit.rotations.annealing import Linearized
 from sfm_shapefit.rotations.average import average_relative_rotations, average_rotations, check_pairs
@@ -32,12 +32,6 @@ def made(family, **options):
 
 def average(problem):
     return average_relative_rotations(len(problem.rotations), problem.relative)
-
-
-def errors_deg(rotations, truth):
-    """Angles to the truth after the best common rotation of the world."""
-    difference = rotations.transpose(0, 2, 1) @ truth
-    return rotation_angles_deg(difference @ mean_rotation_l1(difference).T)
 
 
 def covariances(problem):

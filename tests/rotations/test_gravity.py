@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from harness.scenes import errors_deg
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized, rotation_angles_deg
+from sfm_shapefit.base.geometry import angle_between_deg, mean_rotation_l1, normalized
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.components import refine_with_gravity
@@ -35,17 +36,12 @@ def drifting_chain(num_images=60, wrong_gravities=0.0):
     return problem, Gravity(np.arange(num_images), directions, sigmas), wrong
 
 
-def median_error_deg(rotations, truth):
-    turn = mean_rotation_l1(rotations.transpose(0, 2, 1) @ truth)
-    return np.median(rotation_angles_deg((rotations @ turn).transpose(0, 2, 1) @ truth))
-
-
 @pytest.mark.parametrize("share", [0.0, 0.2])
 def test_gravity_halves_the_errors_of_a_drifting_chain_and_wrong_ones_are_found(share):
     problem, gravity, wrong = drifting_chain(wrong_gravities=share)
     without = average_relative_rotations(60, problem.relative)
     found = refine_with_gravity(without, problem.relative, gravity)
-    before, after = (median_error_deg(one.rotations, problem.rotations) for one in (without, found))
+    before, after = (np.median(errors_deg(one.rotations, problem.rotations)) for one in (without, found))
     assert after < 0.5 * before
     # A gravity that is off by sigma about two axes tilts by 1.18 sigma in the median; neighbors share theirs.
     tilts = angle_between_deg(found.rotations @ DOWN, problem.rotations @ DOWN)

@@ -247,32 +247,13 @@ def test_cameras_that_all_stand_at_one_point_are_refused(point):
         evaluate_poses(good, collapsed)
 
 
-def test_the_dictionary_survives_json_and_has_stable_keys():
+def test_the_dictionary_survives_json():
     reference = scene(20)
     found = evaluate_poses(reference.taken(np.arange(2, 20)), reference, thresholds=[1.0])
     text = json.dumps(found.summary(), allow_nan=False)
     parsed = json.loads(text)
-    assert list(parsed) == [
-        "num_reference",
-        "num_model",
-        "num_common",
-        "num_missing",
-        "num_extra",
-        "missing",
-        "extra",
-        "extent",
-        "position_error",
-        "rotation_error_deg",
-        "recall",
-        "relative_pose_auc",
-        "trajectory",
-        "worst",
-        "ref_from_model",
-        "rotation_ref_from_model",
-        "degenerate",
-        "warnings",
-    ]
-    assert [parsed[k] for k in list(parsed)[:7]] == [20, 18, 18, 2, 0, ["img000.jpg", "img001.jpg"], []]
+    counts = ["num_reference", "num_model", "num_common", "num_missing", "num_extra", "missing", "extra"]
+    assert [parsed[name] for name in counts] == [20, 18, 18, 2, 0, ["img000.jpg", "img001.jpg"], []]
     assert list(parsed["position_error"]) == ["median", "mean", "rms", "max"]
     last = parsed["recall"][-1]
     assert last.pop("auc") == pytest.approx(0.9, abs=1e-9)

@@ -12,11 +12,9 @@ from sfm_shapefit.refinement.angular import plan_refinement, refine_angles
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import solve_newton_sparse
 from sfm_shapefit.solver.options import SolverOptions
-from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
-from tests.problems import outer, rig_problem, shape
+from tests.problems import lud_over, outer, rig_problem, shape
 
 
 class Problem(NamedTuple):
@@ -34,21 +32,14 @@ def refine(problem):
     return refine_angles(MeasuredGraph(graph), solve(graph).locations, plan_refinement(graph)).locations
 
 
-def lud_over(graph, groups):
-    factor = Resources(factor=Reduction.over(graph.edges, groups.normalize()))
-    return solve_lud(graph, 5000, certified=False, resources=factor).locations
-
-
 METHODS = {
     "newton dense": lambda p: solve_newton_dense(p.graph, 1e-9, 100)[0],
     "newton sparse": lambda p: solve_newton_sparse(p.graph, 1e-9, 100)[0],
     "admm": lambda p: solve(p.graph, SolverOptions(solver="admm", tol=1e-9)).locations,
-    "conic": lambda p: solve(p.graph, SolverOptions(solver="conic", tol=1e-9)).locations,
     "lud": lambda p: solve_lud(p.graph, 5000, tol=1e-12, certified=False).locations,
     "angles": refine,
     "groups, newton": lambda p: solve(p.graph, SolverOptions(tol=1e-9), groups=p.groups).locations,
-    "groups, conic": lambda p: solve(p.graph, SolverOptions(solver="conic"), groups=p.groups).locations,
-    "groups, lud": lambda p: lud_over(p.graph, p.groups),
+    "groups, lud": lambda p: lud_over(p.graph, p.groups, 5000),
 }
 
 

@@ -17,20 +17,13 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.reduction import Pin, Reduction, factor_pinned
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.tied import largest_tied
-from tests.problems import outer, rig_problem
+from tests.problems import lud_over, outer, rig_problem
 
 
 def centered(t):
     return t - t.mean(axis=0)
-
-
-def lud_over(graph, groups, steps=150):
-    """LUD's locations over groups, which its splitting sees through the linear solve alone."""
-    factor = Reduction.over(graph.edges, groups.normalize())
-    return solve_lud(graph, steps, tol=1e-8, certified=False, resources=Resources(factor=factor)).locations
 
 
 def test_reducing_is_the_adjoint_of_expanding_and_fitting_its_inverse():
@@ -167,17 +160,6 @@ def test_a_scale_that_nothing_holds_is_refused():
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
     assert 0.0 < factor.smallest_pivot <= 1.0
-
-
-def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
-    graph, groups, t = rig_problem(1)
-    result = solve(graph, groups=groups)
-    x, apart = groups.fit(result.locations)
-    assert result.status is Status.CONVERGED
-    assert result.unique
-    assert apart < 1e-12
-    # Certified to 1e-8 in an objective of 0.1; errors are of that order.
-    np.testing.assert_allclose(centered(result.locations) / groups.split(x)[1], centered(t), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])

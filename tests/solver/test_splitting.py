@@ -1,13 +1,13 @@
 """Splitting for ShapeFit and LUD: agreement with the conic reference, exactness, and how it ends."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.approximate import conjugate_gradients
 from sfm_shapefit.solver.certificate import certify
@@ -34,31 +34,14 @@ from sfm_shapefit.solver.splitting.linear import (
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
 from tests.graph_families import comm, er, geo, seq
-from tests.problems import shape, solve_admm
+from tests.problems import draw_graph, measure_graph, shape, solve_admm
 
-
-def view_graph(edges, t, *, sigma, q, seed, weights=None):
-    """Directions with noise sigma, each replaced by a random one with probability q."""
-    rng = np.random.default_rng(seed)
-    v = normalized(differences(t, edges))
-    random = normalized(rng.normal(size=v.shape))
-    wrong = rng.uniform(size=(len(edges), 1)) < q
-    return ViewGraph(len(t), edges, normalized(np.where(wrong, random, v + sigma * random)), weights)
-
-
-def small_problem(seed, d, *, sigma=0.05, q=0.2, n=24):
-    """A dense weighted random problem and its true locations."""
-    rng = np.random.default_rng(seed)
-    t = rng.normal(size=(n, d))
-    edges = np.stack(np.triu_indices(n, 1), axis=1)
-    edges = edges[rng.uniform(size=len(edges)) < 0.7]
-    weights = rng.uniform(0.3, 3.0, size=len(edges))
-    return view_graph(edges, t, sigma=sigma, q=q, seed=seed, weights=weights), t
+small_problem = partial(draw_graph, n=24, p=0.7, sigma=0.05, weighted=True)  # dense, and its true locations
 
 
 @pytest.mark.parametrize("d", [3, 5])
 def test_noisy_weighted_problems_have_the_optimum_of_the_conic_reference_and_a_dual_that_certifies_it(d):
-    graph, _ = small_problem(d, d)
+    graph, _ = small_problem(d, d=d)
     result = solve_admm(graph, 1e-13, 3000)
     reference, _, _ = solve_conic(graph, 1e-10, 200)
     assert result.stop is Stop.ACCURATE
@@ -73,7 +56,7 @@ def test_noisy_weighted_problems_have_the_optimum_of_the_conic_reference_and_a_d
 
 def test_in_the_plane_the_noisy_optimum_is_approached_and_the_limit_is_not_hidden():
     # With d = 2 the objective is polyhedral and splitting slows down near a vertex: 1e-4 after 300 steps.
-    graph, _ = small_problem(2, 2)
+    graph, _ = small_problem(2, d=2)
     reference = objective(graph, solve_conic(graph, 1e-10, 200)[0])
     rough, strict = solve_admm(graph, 1e-3, 1000), solve_admm(graph, 1e-10, 600)
     assert rough.stop is Stop.ACCURATE
@@ -83,7 +66,7 @@ def test_in_the_plane_the_noisy_optimum_is_approached_and_the_limit_is_not_hidde
 
 
 def test_dual_and_locations_are_feasible_however_early_the_iteration_ends():
-    graph, _ = small_problem(1, 3)
+    graph, _ = small_problem(1, d=3)
     for iterations in (1, 3, 12):
         result = solve_admm(graph, 1e-12, iterations)
         assert (np.linalg.norm(result.dual, axis=1) <= graph.weights * (1.0 + 1e-12)).all()
@@ -93,7 +76,7 @@ def test_dual_and_locations_are_feasible_however_early_the_iteration_ends():
 
 
 NOISE_FREE = {
-    **{f"{d} dimensions": lambda d=d: small_problem(60 + d, d, sigma=0.0, q=0.1) for d in (2, 3, 5)},
+    **{f"{d} dimensions": lambda d=d: small_problem(60 + d, d=d, sigma=0.0, q=0.1) for d in (2, 3, 5)},
     "geo": lambda: corrupted(*geo(400, 40, 3)),
     "er": lambda: corrupted(*er(300, 60, 3)),
 }
@@ -101,7 +84,7 @@ NOISE_FREE = {
 
 def corrupted(edges, t):
     """Exact directions, a fifth of them replaced, and the true locations."""
-    return view_graph(edges, t, sigma=0.0, q=0.2, seed=3), t
+    return measure_graph(edges, t, sigma=0.0, q=0.2, seed=3), t
 
 
 @pytest.mark.parametrize("name", NOISE_FREE)
@@ -113,7 +96,7 @@ def test_noise_free_problems_are_solved_to_the_last_digits_in_spite_of_corruptio
 
 def test_acceleration_saves_more_than_half_of_the_iterations_without_noise(monkeypatch):
     edges, t = geo(400, 40, 3)
-    graph = view_graph(edges, t, sigma=0.0, q=0.2, seed=3)
+    graph = measure_graph(edges, t, sigma=0.0, q=0.2, seed=3)
     accelerated = solve_admm(graph, 1e-8, 2000).iterations
     monkeypatch.setattr("sfm_shapefit.solver.splitting.engine._ANDERSON_INTERIOR", 2.0)
     assert accelerated < 0.5 * solve_admm(graph, 1e-8, 2000).iterations
@@ -123,7 +106,7 @@ def test_the_number_of_iterations_does_not_grow_with_the_number_of_cameras():
     counts = []
     for n in (1000, 4000):
         edges, t = geo(n, 40, 1)
-        graph = view_graph(edges, t, sigma=0.01, q=0.2, seed=1)
+        graph = measure_graph(edges, t, sigma=0.01, q=0.2, seed=1)
         result = solve_admm(graph, 1e-6, 500)
         assert result.stop is Stop.ACCURATE
         counts.append(result.iterations)
@@ -132,7 +115,7 @@ def test_the_number_of_iterations_does_not_grow_with_the_number_of_cameras():
 
 def test_a_factor_that_would_not_fit_is_replaced_by_conjugate_gradients_with_the_same_answer():
     edges, t = comm(600, 40, 1)
-    graph = view_graph(edges, t, sigma=0.01, q=0.2, seed=1)
+    graph = measure_graph(edges, t, sigma=0.01, q=0.2, seed=1)
     iterative = laplacian_factor(graph, Resources(memory_bytes=1000))
     assert isinstance(iterative, IterativeSolver)
     assert not isinstance(laplacian_factor(graph), IterativeSolver)
@@ -156,14 +139,14 @@ class _Useless:
 
 def test_solves_that_are_too_inexact_are_reported_as_a_stall():
     edges, t = seq(200, 12, 1)
-    graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
+    graph = measure_graph(edges, t, sigma=0.01, q=0.1, seed=1)
     result = solve_admm(graph, 1e-8, 2000, Resources(factor=_Useless()))
     assert result.stop is Stop.STALLED
     assert "allow more memory" in result.stop.value
 
 
 def test_the_callback_sees_every_iteration_and_can_cancel():
-    graph, _ = small_problem(6, 3)
+    graph, _ = small_problem(6, d=3)
     seen = []
 
     def watch(info):
@@ -193,7 +176,7 @@ def lud_reference(graph):
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_lud_has_the_optimum_of_a_conic_reference_and_its_bound_closes(d):
-    graph, _ = small_problem(20 + d, d, n=16)
+    graph, _ = small_problem(20 + d, d=d, n=16)
     value, locations = lud_reference(graph)
     result = solve_lud(graph, 3000, tol=1e-12)
     assert result.objective == pytest.approx(value, rel=1e-7)
@@ -207,7 +190,7 @@ def test_lud_has_the_optimum_of_a_conic_reference_and_its_bound_closes(d):
 
 def test_the_bound_of_lud_is_found_in_few_steps_whatever_the_weights(monkeypatch):
     """What restores the balance of the dual has no weights: nor has what conditions it, unlike the run."""
-    graph, _ = small_problem(23, 3, n=16)
+    graph, _ = small_problem(23, d=3, n=16)
     weights, steps = 10.0 ** np.random.default_rng(23).uniform(-2.0, 2.0, graph.num_edges), []
 
     def counted(*words, **settings):
@@ -224,7 +207,7 @@ def test_the_bound_of_lud_is_found_in_few_steps_whatever_the_weights(monkeypatch
 
 def test_lud_stands_on_a_chain_where_the_optimum_of_shapefit_collapses():
     edges, t = seq(300, 36, 1)
-    graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
+    graph = measure_graph(edges, t, sigma=0.01, q=0.1, seed=1)
     stretched = solve_lud(graph, 50, certified=False)
     collapsed, _, _ = solve_conic(graph, 1e-6, 200)
     assert solve_admm(graph, 1e-6, 500).stop in (Stop.STALLED, Stop.MAX_ITERATIONS)
@@ -264,7 +247,7 @@ def plain_step(graph, least, x, t, rho, relaxation):
 @pytest.mark.parametrize("least", [-np.inf, 1.0])
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
-    graph, t = small_problem(40 + d, d)
+    graph, t = small_problem(40 + d, d=d)
     rng = np.random.default_rng(d)
     rho = rng.uniform(0.2, 5.0, size=graph.num_edges)
     x = rng.normal(size=graph.directions.shape)
@@ -285,7 +268,7 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
 
 
 def test_new_penalties_keep_the_split_point_and_the_dual():
-    graph, _ = small_problem(50, 3)
+    graph, _ = small_problem(50, d=3)
     rng = np.random.default_rng(50)
     passes = EdgePasses(edge_data(graph, -np.inf), 1)
     x, rho = rng.normal(size=graph.directions.shape), rng.uniform(0.2, 5.0, size=graph.num_edges)
@@ -434,7 +417,7 @@ def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
 def test_newton_begins_where_splitting_ended_and_anew_where_that_costs_nothing(
     monkeypatch, cheap_flops, starts
 ):
-    graph, _ = small_problem(7, 3)
+    graph, _ = small_problem(7, d=3)
     factor, seen = laplacian_factor(graph), []
     first = solve_hybrid(graph, 1e-9, 1)
     monkeypatch.setattr(split_then_newton, "_CHEAP_FLOPS", cheap_flops)

@@ -9,7 +9,6 @@ from sfm_shapefit.base.forests import connected_components
 from sfm_shapefit.base.geometry import normalized
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.pairs.estimate import estimate_directions
-from sfm_shapefit.pipeline.place import place
 from sfm_shapefit.scene.matches import MatchBatch
 from sfm_shapefit.tracks.node_tracks import TrackJoiner, Tracks, covering_set, join_points
 
@@ -213,40 +212,3 @@ def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     np.testing.assert_allclose(joint.graph.directions[len(batch.pairs) :], truth, atol=1e-12)
     np.testing.assert_allclose(joint.covariance[-1], (2.0 * PIXEL) ** 2 * np.eye(2))
     assert joint.graph.names[6] == "point 0"
-
-
-def street(cameras=12, seed=0):
-    """A straight street: cameras exactly on a line, points beside it, each seen by six cameras in a row."""
-    rng = np.random.default_rng(seed)
-    centers = np.zeros((cameras, 3))
-    centers[:, 0] = np.cumsum(rng.uniform(0.5, 1.5, cameras))
-    pairs = np.array([(i, j) for i in range(cameras) for j in range(i + 1, min(i + 5, cameras))])
-    directions = normalized(centers[pairs[:, 0]] - centers[pairs[:, 1]])
-    first = np.repeat(np.arange(cameras - 5), 8)
-    points = centers[first + 2] + rng.uniform(3, 8, (len(first), 1)) * normalized(
-        rng.standard_normal((len(first), 3)) * [0.2, 1.0, 1.0]
-    )
-    seen = (first[:, None] + np.arange(6)).ravel()
-    noise = 1e-4 * rng.standard_normal((len(seen), 3))
-    rays = normalized(np.repeat(points, 6, axis=0) - centers[seen] + noise * 5.0)
-    tracks = Tracks(offsets=6 * np.arange(len(first) + 1), cameras=seen, rays=rays)
-    return centers, pairs, directions, tracks
-
-
-def test_a_camera_that_the_points_do_not_determine_is_left_out():
-    centers, pairs, directions, tracks = street()
-    alone = tracks.cameras == len(centers) - 1
-    with_last, with_other = ((pairs == len(centers) - k).any(axis=1) for k in (1, 2))
-    keep = ~with_last | with_other  # one pair is left
-    rows = np.repeat(np.arange(tracks.num_tracks), 6)[~alone]
-    lengths = np.bincount(rows, minlength=tracks.num_tracks)
-    without = Tracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]),
-        cameras=tracks.cameras[~alone],
-        rays=tracks.rays[~alone],
-    )
-    graph = ViewGraph(len(centers), pairs[keep], directions[keep])
-    covariance = np.broadcast_to(1e-6 * np.eye(2), (graph.num_edges, 2, 2))
-    joint = join_points(graph, covariance, without, np.full(len(centers), 1e-3))
-    placement = place(joint)
-    np.testing.assert_array_equal(placement.cameras, np.arange(len(centers) - 1))
