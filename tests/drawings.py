@@ -7,8 +7,9 @@ import numpy as np
 from sfm_shapefit.facts.model import EvidenceShares, ModelFacts, ModelInputs
 from sfm_shapefit.facts.placed import Delivered, Finish, KeyFigures, LooseGroup, Piece, Solve
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
-from sfm_shapefit.report.drawing import DrawnPoints, Poses, build_drawing
+from sfm_shapefit.report.drawing import Poses, build_drawing
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 
@@ -43,11 +44,11 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
         half_sizes=halves,
         focal_lengths_px=np.full(num_cameras, 1000.0),
     )
-    points = DrawnPoints(
-        positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
-        colors=rng.integers(60, 220, (num_points, 3)),
+    points = PickedPoints(
+        xyz=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
+        colors=rng.integers(60, 220, (num_points, 3)).astype(np.uint8),
         num_all=3 * num_points,
-        track_lengths=rng.integers(2, 12, num_points),
+        lengths=rng.integers(2, 12, num_points),
         errors_px=rng.gamma(2.0, 0.3, num_points),
     )
     pairs = replace(drawing.pairs, input_deg=drawing.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))

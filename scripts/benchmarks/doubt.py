@@ -151,7 +151,7 @@ def measured(model: ColmapModel, scene: Scene) -> Iterator[tuple[Any, Measured]]
 
 def judge(model: ColmapModel, scene: Scene) -> tuple[PairDirections, Judged]:
     """Place the cameras of a model and judge them: `locate` without points."""
-    rigid = find_rigid_parts(model.images, OPTIONS.placement)
+    rigid = find_rigid_parts(model.images)
     with measured(model, scene) as (source, told):
         graph = add_evidence(rigid.apply(build_graph(source.images, told, OPTIONS.nodes)), told)
         placed = next(place_cameras(graph, OPTIONS.placement, OPTIONS.nodes, Clock(threads=THREADS)))

@@ -16,6 +16,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
+def counted_are(number: int, noun: str) -> str:
+    """Return a number with its noun and the verb that follows: is for one, else are."""
+    return f"{counted(number, noun)} {'is' if number == 1 else 'are'}"
+
+
 def rounded(value: float, smallest: float = 1e-9, digits: int = 4) -> str:
     """Return a number in so many digits; one that is smaller than `smallest` is 0."""
     if 10.0**digits <= abs(value) < 1e6:

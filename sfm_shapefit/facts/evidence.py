@@ -167,17 +167,15 @@ class ToldEvidence(Record):
     @property
     def statements(self) -> list[str]:
         """A sentence for each."""
-        seams, places = (told.statement for told in self.seams), (told.statement for told in self.places)
-        lenses, second = (told.statement for told in self.lenses), self.second
-        differs = second is not None and (second.wrong or second.undecided or second.ambiguous)
-        untied = (told.statement for told in self.untied)
         told = [
-            *seams,
-            *untied,
-            *places,
-            *lenses,
-            *([second.statement] if second is not None and differs else []),
+            *(one.statement for one in self.seams),
+            *(one.statement for one in self.untied),
+            *(one.statement for one in self.places),
+            *(one.statement for one in self.lenses),
         ]
+        second = self.second
+        if second is not None and (second.wrong or second.undecided or second.ambiguous):
+            told.append(second.statement)
         if self.contradicted:
             told.append(
                 f"{_cameras(self.contradicted)} where many pairs contradict, and no points confirm it"

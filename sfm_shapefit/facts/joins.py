@@ -18,12 +18,12 @@ class JoinFacts(Record):
     joined: Annotated[bool, "Whether it was."]
     folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."]
     statement: Annotated[str, "How and how surely, or why not, in words."]
-    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."]
-    turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."] = None
+    turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."] = None
     center_sigma: Annotated[
         float | None,
         "Standard deviation of where its cameras come to lie, in units of the model that it is joined to.",
-    ]
+    ] = None
     similarity: Annotated[
         Alignment | None,
         "From its world to that of the model that it is joined to; of a refused join what most pairs want.",
@@ -76,17 +76,16 @@ class Joined:
     def facts(self, folder: str | None) -> JoinFacts:
         """Return what stands in the files of the result; `folder` is where both stand in one world."""
         found = self.found
-        return JoinFacts(
+        solved = found and found.solved
+        return JoinFacts.taken_from(
+            found,
             model=self.labels[0].removeprefix("model "),
             to=self.labels[1].removeprefix("model "),
             joined=self.join is not None,
             folder=folder,
             statement=self.statement,
-            scale_sigma=None if found is None else found.scale_sigma,
-            turn_sigma_deg=None if found is None else found.turn_sigma_deg,
-            center_sigma=None if found is None else found.center_sigma,
-            similarity=None if found is None else found.to_from_piece.facts,
-            solve=None if found is None or found.solved is None else Solve(**found.solved.summary()),
+            similarity=found and found.to_from_piece.facts,
+            solve=solved and Solve(**solved.summary()),
             agreeing_pairs=0 if found is None else len(found.agreeing),
             contradicting_pairs=0 if found is None else len(found.contradicting),
             rival_pairs=list(self.rivals),

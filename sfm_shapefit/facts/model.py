@@ -329,7 +329,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             Row("not placed", left_out),
             *self.piece_rows(),
             *self.scene_rows(),
-            *self.warning_rows(),
+            Row("warning", self.warnings),
         ]
         nodes = f"{counted(self.num_points_as_nodes, 'track')} helped to place cameras"
         details = [

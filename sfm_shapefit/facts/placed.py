@@ -341,10 +341,6 @@ class Facts(Record):
         """Return what is told of lenses, rigs, control points and the scene, where there is something."""
         return []
 
-    def warning_rows(self) -> list[Row]:
-        """Return the warnings."""
-        return [Row("warning", self.warnings)]
-
     def expert_sentences(self) -> list[str]:
         """Return what only those who know the method ask for."""
         level = self.residual_level_deg
@@ -486,5 +482,5 @@ class GraphFacts(PlacedFacts):
             row("certificate", self.delivered.statement),
             row("right pairs", self.right_pairs.statement),
         ]
-        rows = [Row("not placed", left_out), *self.piece_rows(), *self.warning_rows()]
+        rows = [Row("not placed", left_out), *self.piece_rows(), Row("warning", self.warnings)]
         return Telling(lines, rows, details, step=self.next_step)

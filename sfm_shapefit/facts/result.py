@@ -46,7 +46,6 @@ from sfm_shapefit.facts.rows import camera_rows, own_camera_rows, pair_rows, wit
 from sfm_shapefit.facts.scene import Loop, told_distances
 from sfm_shapefit.facts.tables import CameraRow, PairRow, Tabled
 from sfm_shapefit.facts.warnings import graph_warnings, match_warnings
-from sfm_shapefit.graph.rigidity import RigidPiece
 from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import (
     ModelVerdict,
@@ -58,6 +57,7 @@ from sfm_shapefit.judgement.grade import (
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.judgement.straight import find_line, sigma_along
+from sfm_shapefit.judgement.support import ObservationShares
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
@@ -136,7 +136,8 @@ class _Placed(Written, Tabled):
         return self.placement.certified
 
     @property
-    def _dimension(self) -> int:
+    def dimension(self) -> int:
+        """Number of coordinates of a location."""
         return self.placement.graph.dimension
 
 
@@ -188,10 +189,9 @@ class LocateResult(_Placed):
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     distances: tuple[KnownDistance, ...] = ()
     """Distances that the user gave between its images."""
-    triplet_scores: FloatArray | None = None
-    """(m,) scores of the `directions`, NaN where a pair has none; None where `map` did not average."""
-    matched_shares: FloatArray | None = None
-    """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
+    scores: FloatArray | None = None
+    """(m, 2) scores of the `directions` by their triangles, and matched shares, see `pairs.missing_matches`;
+    NaN where a pair has none; None where `map` did not average."""
     loops: tuple[Loop, ...] = ()
     """Loops of the videos among the images, where `map` looked for some."""
     prior_fit: PriorFit | None = None
@@ -202,11 +202,8 @@ class LocateResult(_Placed):
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
-    agreeing_observations: float = math.nan
-    """Share that sees a 3D point, of the keypoints of images in the output that are matched in two or more of
-    the others; NaN where there is no database."""
-    contradicting_observations: float = math.nan
-    """Share of the same keypoints that sees none, and most of whose matches miss the epipolar lines."""
+    observations: ObservationShares
+    """Shares of keypoints that agree and contradict; NaN where there is no database."""
     evidence: ModelEvidence = field(default_factory=ModelEvidence)
     """What speaks against it although it fits, by images of it."""
 
@@ -257,8 +254,8 @@ class LocateResult(_Placed):
             | {"outlier": len(placement.rejected_pairs)},
             agreement=EvidenceShares(
                 pairs=self.agreeing_pairs,
-                observations=self.agreeing_observations,
-                contradicting=self.contradicting_observations,
+                observations=self.observations.agreeing,
+                contradicting=self.observations.contradicting,
             ),
             num_points=model.num_points3D(),
             mean_reprojection_error_px=model.compute_mean_reprojection_error(),
@@ -298,7 +295,7 @@ class LocateResult(_Placed):
         """Whether the model can be used, and why."""
         is_posed, elsewhere = self.placed.is_posed, self.elsewhere
         shares = Shares(
-            self.contradicting_observations,
+            self.observations.contradicting,
             placed=float(np.mean(is_posed if elsewhere is None else is_posed[~elsewhere])),
             here=float(np.mean(is_posed)),
         )
@@ -320,11 +317,6 @@ class LocateResult(_Placed):
     def database(self) -> Path | None:
         """The database whose matches were used, if any."""
         return self.inputs.database
-
-    @property
-    def pieces(self) -> list[RigidPiece]:
-        """The parallel-rigid pieces of the view graph, largest first."""
-        return self.placement.pieces
 
     @cached_property
     def _centers(self) -> FloatArray:
@@ -409,21 +401,16 @@ class LocateResult(_Placed):
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
         carried = self.placed.is_posed
         carried[self.placement.cameras[self.kept]] = False
-        return dict(
-            zip(
-                np.flatnonzero(carried).tolist(),
-                map(tuple, self.placed.centers[carried].tolist()),
-                strict=True,
-            )
-        )
+        rows = np.flatnonzero(carried).tolist()
+        return dict(zip(rows, map(tuple, self.placed.centers[carried].tolist()), strict=True))
 
     @cached_property
     def pairs(self) -> list[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
         columns: dict[str, FloatArray] = {}
-        if self.triplet_scores is not None and self.matched_shares is not None:
-            columns |= {"triplet_score": self.triplet_scores, "matched_share": self.matched_shares}
-            columns["pair_score"] = score_pairs(self.triplet_scores, self.matched_shares)
+        if self.scores is not None:
+            columns |= {"triplet_score": self.scores[:, 0], "matched_share": self.scores[:, 1]}
+            columns["pair_score"] = score_pairs(*self.scores.T)
         if self.prior_fit is not None:
             columns["prior_angle_deg"] = self.prior_fit.angles_deg
         added = zip(*(column.tolist() for column in columns.values()), strict=True)

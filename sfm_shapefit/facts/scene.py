@@ -1,11 +1,10 @@
 """What is told of a scene: loops of videos, straight drives, repeated structure, and known distances."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import counted
 from sfm_shapefit.scene.images import Images
@@ -50,15 +49,15 @@ def told_distances(known: "Sequence[KnownDistance]", images: Images) -> tuple[Di
     centers = {images.names[k]: images.centers[k] for k in posed}
     return tuple(
         DistanceFacts(
-            first=first, second=second, known=float(distance), found=_distance(centers, first, second)
+            first=first,
+            second=second,
+            known=float(distance),
+            found=float(np.linalg.norm(centers[first] - centers[second]))
+            if {first, second} <= centers.keys()
+            else None,
         )
         for first, second, distance in known
     )
-
-
-def _distance(centers: Mapping[str, FloatArray], first: str, second: str) -> float | None:
-    both = first in centers and second in centers
-    return float(np.linalg.norm(centers[first] - centers[second])) if both else None
 
 
 def describe_loops(loops: Sequence[Loop]) -> str:
@@ -71,13 +70,10 @@ def describe_loops(loops: Sequence[Loop]) -> str:
     if not lost:
         return f"{said}, taken as the frames between say the same"
     worst = max(loops, key=lambda loop: (loop.num_refused, loop.num_matches))
-    (are, them), ends = (
-        ("is", "it") if lost == 1 else ("are", "them"),
-        map(_stretch, (worst.first, worst.second)),
-    )
+    are, them = ("is", "it") if lost == 1 else ("are", "them")
     return (
         f"{said}, of which {lost} {are} not used because the frames between contradict {them}: "
-        f"above all from {' to '.join(ends)}"
+        f"above all from {_stretch(worst.first)} to {_stretch(worst.second)}"
     )
 
 

@@ -102,15 +102,22 @@ def write_rows(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
-    columns: dict[str, Sequence[object]] = {}
+    _write_csv(_values_of(rows, row_type, dimension), path)
+
+
+def _values_of(
+    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int
+) -> dict[str, list[Any]]:
+    """Return the values of each column; NaN along the axes of a vector that is not known."""
+    found: dict[str, list[Any]] = {}
     for item in fields(row_type):
         values, names = [getattr(row, item.name) for row in rows], columns_of_field(item.name, dimension)
         if names == [item.name]:
-            columns[item.name] = values
+            found[item.name] = values
         else:
-            whole = [value or ("",) * len(names) for value in values]
-            columns |= {name: [value[k] for value in whole] for k, name in enumerate(names)}
-    _write_csv(columns, path)
+            whole = [value or (math.nan,) * len(names) for value in values]
+            found |= {name: [value[k] for value in whole] for k, name in enumerate(names)}
+    return found
 
 
 def read_trust(path: Path) -> dict[str, float]:
@@ -188,7 +195,8 @@ class Tabled:
     __slots__ = ()
 
     @property
-    def _dimension(self) -> int:
+    def dimension(self) -> int:
+        """Number of coordinates of a location."""
         return 3
 
     def table(self, name: TableName) -> dict[str, Column]:
@@ -199,7 +207,7 @@ class Tabled:
         """
         if name not in _ROW_TYPES:
             raise ValueError(f"there is no table {name!r}; there are 'cameras' and 'pairs'")
-        return columns_of(getattr(self, name), _ROW_TYPES[name], self._dimension)
+        return columns_of(getattr(self, name), _ROW_TYPES[name], self.dimension)
 
 
 def columns_of(
@@ -216,22 +224,13 @@ def columns_of(
         n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
         none; texts are objects.
     """
-    found: dict[str, Column] = {}
-    for item in fields(row_type):
-        values = [getattr(row, item.name) for row in rows]
-        names = columns_of_field(item.name, dimension)
-        if names != [item.name]:
-            nothing = (math.nan,) * len(names)
-            whole = np.array([value or nothing for value in values], dtype=np.float64)
-            whole = whole.reshape(-1, len(names))
-            found |= {name: whole[:, k] for k, name in enumerate(names)}
-        else:
-            found[item.name] = _column(values, item.type)
-    return found
+    kinds = {item.name: item.type for item in fields(row_type)}
+    values = _values_of(rows, row_type, dimension)
+    return {name: _column(column, kinds.get(name)) for name, column in values.items()}
 
 
 def _column(values: list[Any], kind: Any) -> Column:
-    """Return values of a field's type as an array."""
+    """Return values of a field's type as an array; those along an axis have no field of their own."""
     if kind is str:
         return np.array(values, dtype=object)
     if kind in (bool, int):

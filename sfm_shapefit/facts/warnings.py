@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted_are, first_of
 from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, MOST_LEVEL_DEG, largest_sigmas, uncertain_cameras
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.limits import RARE
@@ -47,7 +47,7 @@ def rotation_warnings(turned_deg: FloatArray, names: Sequence[str], sigma_deg: f
     wrong = [f"{names[k]} (turned by {turned_deg[k]:.3g} deg)" for k in rows]
     if wrong:
         most = f"the others are off by {np.nanmedian(turned_deg):.2g} deg; see turned_deg in cameras.csv"
-        yield f"{counted(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
+        yield f"{counted_are(len(wrong), 'given rotation')} wrong and corrected: {first_of(wrong)}; {most}"
 
 
 def rotation_suspicions(turned_deg: FloatArray, sigma_deg: float) -> Iterator[str]:
@@ -87,14 +87,11 @@ def _uncertainty_warnings(placement: Judged) -> Iterator[str]:
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        share, see = f"{RARE:.0%}", "see sigma and trust in cameras.csv"
-        if len(uncertain) == 1:
-            yield f"{worst} is uncertain by more than {share} of the extent; {see}"
-        else:
-            yield (
-                f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
-                f"{worst}; {see}"
-            )
+        above_all = "above all " if len(uncertain) > 1 else ""
+        yield (
+            f"{counted_are(len(uncertain), 'camera')} uncertain by more than {RARE:.0%} of the extent, "
+            f"{above_all}{worst}; see sigma and trust in cameras.csv"
+        )
 
 
 def match_warnings(directions: PairDirections) -> Iterator[str]:
@@ -120,28 +117,22 @@ def trust_warnings(placement: Judged, kept: BoolArray) -> Iterator[str]:
     lost = np.flatnonzero(~kept)
     if len(lost):
         worst = _least_trusted(placement, lost)
-        if len(lost) == 1:
-            yield f"1 camera is left out because it is not trusted: {worst}; min_trust=0 keeps it"
-        else:
-            yield (
-                f"{len(lost)} cameras are left out because they are not trusted, above all {worst}; "
-                "min_trust=0 keeps them"
-            )
+        why, above_all = ("they are", "above all ") if len(lost) > 1 else ("it is", "")
+        yield (
+            f"{counted_are(len(lost), 'camera')} left out because {why} not trusted, {above_all}{worst}; "
+            "min_trust=0 keeps what is left out"
+        )
 
 
 def support_warnings(names: Sequence[str], *, is_kept: bool) -> Iterator[str]:
     """Yield which cameras are left out, or kept as was asked, though their matches make no points, if any."""
     if names:
-        subject, rest = (
-            ("1 camera is", "its pose is")
-            if len(names) == 1
-            else (f"{len(names)} cameras are", "their poses are")
-        )
+        rest = "its pose is" if len(names) == 1 else "their poses are"
         what = "kept, as min_trust=0 asks, though" if is_kept else "left out because"
         remedy = "" if is_kept else "; min_trust=0 keeps what is left out"
         yield (
-            f"{subject} {what} hardly any match makes a point with a third image: {first_of(names)}; "
-            f"{rest} wrong, or the scene repeats itself{remedy}"
+            f"{counted_are(len(names), 'camera')} {what} hardly any match makes a point with a third image: "
+            f"{first_of(names)}; {rest} wrong, or the scene repeats itself{remedy}"
         )
 
 
@@ -184,8 +175,7 @@ def prior_warnings(fit: PriorFit | None, names: Sequence[str]) -> Iterator[str]:
     """Yield which position priors of the images `names` (n,) are wrong, if any are."""
     if fit is not None and len(fit.wrong):
         wrong = [f"{names[k]} ({fit.off[k]:.3g} off)" for k in fit.wrong.tolist()]
-        are = "is" if len(wrong) == 1 else "are"
         yield (
-            f"{counted(len(wrong), 'position prior')} {are} wrong, most likely: {first_of(wrong)}, in the "
+            f"{counted_are(len(wrong), 'position prior')} wrong, most likely: {first_of(wrong)}, in the "
             f"priors' units; half of all are within {np.nanmedian(fit.off):.2g}; see prior_off in cameras.csv"
         )

@@ -24,7 +24,7 @@ from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.rigs import rigid_parts
+from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
@@ -94,7 +94,7 @@ def adjust_placed(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
         turns = source.images.rotations.transpose(0, 2, 1) @ images.rotations
         measured = _turn(placement.measured, directions, turns)
         if adjusted.refines_sensors:  # which stand elsewhere in their frames now
-            measured = rigid_parts(source.images, stand.given.rigid.fixed).apply(measured)
+            measured = find_rigid_parts(source.images, stand.given.rigid.fixed).apply(measured)
         placement = replace(placement, measured=measured)
     intrinsics = stand.intrinsics.after(adjusted, posed.lenses)
     freedom = adjusted.freedom.among(posed.frames, len(images.frames.ids))

@@ -15,11 +15,7 @@ from sfm_shapefit.facts.scene import Loop
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.components import pairs_among
-from sfm_shapefit.pipeline.first_placement import (
-    FirstPlacement,
-    adjust_first_placement,
-    start_from_first,
-)
+from sfm_shapefit.pipeline.first_placement import adjust_first_placement, start_from_first
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, see_matches
 from sfm_shapefit.pipeline.map_run import MapRun
@@ -103,11 +99,9 @@ def _locate_component(
         inputs = replace(inputs, left_out=inputs.left_out | _false_pairs(images, among, averaging))
     source = replace(see_matches(run.matches, images, inputs, run.options), alone=among)
     found = act(partial(_place, run, members), _given(run, images, inputs), source, run.options)
-    scores = run.scores.of(members[found.directions.pairs])
     return replace(
         found,
-        triplet_scores=scores[:, 0],
-        matched_shares=scores[:, 1],
+        scores=run.scores.of(members[found.directions.pairs]),
         suspicions=(*found.suspicions, *_suspicions(averaging)),
     )
 
@@ -117,27 +111,21 @@ def _place(run: MapRun, members: IntArray, given: Given, source: MatchSource) ->
     first = None
     if run.options.freedom.adjust != "none":
         given, source, first = start_from_first(given, source, run.options, run.clock)
+    given = _with_told(run, given, members)
     with run.clock("locate"):
-        return _settle(run, source, _with_told(run, given, members), first)
-
-
-def _settle(run: MapRun, source: MatchSource, given: Given, first: FirstPlacement | None) -> LocateResult:
-    """Settle a component on the position priors of its images, if they can set a scale."""
-    try:
-        return settle(given, source, run.options, run.clock.anew(), first)
-    except UselessPriorsError as error:  # which other components need not share
-        without = given._replace(known=replace(given.known, priors=None))
-        found = settle(without, source, run.options, run.clock.anew(), first)
-        return replace(
-            found, warnings=(*found.warnings, f"the scale is not that of position priors: {error}")
-        )
+        try:
+            return settle(given, source, run.options, run.clock.anew(), first)
+        except UselessPriorsError as error:  # which other components need not share
+            given = given._replace(known=replace(given.known, priors=None))
+            found = settle(given, source, run.options, run.clock.anew(), first)
+            warning = f"the scale is not that of position priors: {error}"
+            return replace(found, warnings=(*found.warnings, warning))
 
 
 def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
     """Return what is known of a component's images before they are placed: nothing that sets a scale."""
-    rigid = find_rigid_parts(images, run.options.placement)
     intrinsics = run.intrinsics.part(run.images.lenses_of(images))
-    return Given(run.read.template(images), images, intrinsics, inputs, rigid, np.inf)
+    return Given(run.read.template(images), images, intrinsics, inputs, find_rigid_parts(images), np.inf)
 
 
 def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:

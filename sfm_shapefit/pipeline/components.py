@@ -95,15 +95,6 @@ class ComponentAveraging(NamedTuple):
             inside: the pairs among them.
             local: the same by their place among these.
         """
-        answer = self._arrange(len(members), local, self._evidence_of(inside))
-        if self.gravity is None:
-            return answer
-        return refine_with_gravity(answer, local, self.gravity.of(members))
-
-    def _arrange(
-        self, num_frames: int, relative: RelativeRotations, evidence: FloatArray
-    ) -> AveragedRotations:
-        """Average rotations, by the arrangement of the frames that the matches speak for."""
 
         def average(some: RelativeRotations) -> AveragedRotations:
             used = some.num_matches >= self.options.min_matches
@@ -112,21 +103,17 @@ class ComponentAveraging(NamedTuple):
                     f"none of {counted(len(used), 'pair')} has {self.options.min_matches} inlier matches; "
                     "lower min_matches"
                 )
-            return average_relative_rotations(num_frames, some.subset(used), self.clock.threads)
+            return average_relative_rotations(len(members), some.subset(used), self.clock.threads)
 
-        averaged = average(relative)
-        if not evidence.any():
-            return averaged
-        chosen = choose_arrangement(relative, evidence, averaged, average)
-        return replace(
-            chosen.averaged,
-            num_repeated=int(chosen.refused.sum()),
-            num_rivals=int(chosen.rival.sum()),
-        )
-
-    def _evidence_of(self, relative: RelativeRotations) -> FloatArray:
-        """Return how much speaks for each pair of frames."""
-        return evidence_of(relative, self.scores.of(relative.pairs)[:, 1])
+        answer = average(local)
+        evidence = evidence_of(inside, self.scores.of(inside.pairs)[:, 1])
+        if evidence.any():
+            chosen = choose_arrangement(local, evidence, answer, average)
+            repeated, rivals = int(chosen.refused.sum()), int(chosen.rival.sum())
+            answer = replace(chosen.averaged, num_repeated=repeated, num_rivals=rivals)
+        if self.gravity is None:
+            return answer
+        return refine_with_gravity(answer, local, self.gravity.of(members))
 
 
 def pairs_among(

@@ -110,7 +110,7 @@ def start_from_first(
     if adjusted.refines_sensors:
         images = images.with_sensors_of(adjusted.images)
     source = source.at(images.turned_to(first.rotations))
-    rigid = find_rigid_parts(source.images, options.placement)
+    rigid = find_rigid_parts(source.images)
     return given._replace(rigid=rigid, intrinsics=intrinsics), source, first
 
 

@@ -16,7 +16,7 @@ from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
 from sfm_shapefit.pipeline.memory import describe_work, forecast
-from sfm_shapefit.pipeline.rigs import group_frames, rigs_statement
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, rigs_statement
 from sfm_shapefit.placement.diagnosis import diagnose
 
 
@@ -70,7 +70,7 @@ def inspect(
             directions = measured.directions
         with clock("diagnosis"):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
-            grouped = group_frames(images, with_points)
+            grouped = find_rigid_parts(images).apply(with_points)
             work = count_work(matches, directions)
             work = describe_work(grouped, work, options.placement, options.freedom)
             confirmed = confirm_rotations(matches, directions, clock.threads)

@@ -31,6 +31,7 @@ from sfm_shapefit.pipeline.known import read_known
 from sfm_shapefit.pipeline.rigs import find_rigid_parts, read_fixed_images
 from sfm_shapefit.pipeline.rough import settle_rough
 from sfm_shapefit.pipeline.settle import settle
+from sfm_shapefit.solver.solve import refuse_admm
 
 _ROUGH_RAD = np.radians(0.3)  # radians; directions of pairs are not measured by rotations farther off
 _NOT_CORRECTED = "rough rotations beside fixed images are not corrected; --fix needs better ones"
@@ -94,7 +95,9 @@ def locate(
             wanted = options.freedom.intrinsics
             images, intrinsics = settle_intrinsics(given, matches.file, wanted, inputs.left_out, listed)
             known = read_known(images, matches.file, priors, options.gauge.control_points)
-            rigid = find_rigid_parts(images, options.placement, read_fixed_images(model, options.fix))
+            rigid = find_rigid_parts(images, read_fixed_images(model, options.fix))
+            if rigid.groups is not None:
+                refuse_admm(options.placement.solver)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
             del model  # whose points and keypoints are large

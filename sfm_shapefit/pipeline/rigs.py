@@ -27,7 +27,6 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, is_scaled, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.solver.solve import refuse_admm
 from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -56,28 +55,18 @@ class Rigid(NamedTuple):
         return replace(measured, groups=groups, fixed_group=self.fixed_group)
 
 
-def find_rigid_parts(images: Images, options: PlacementOptions, fixed: BoolArray | None = None) -> Rigid:
+def find_rigid_parts(images: Images, fixed: BoolArray | None = None) -> Rigid:
     """Return what moves together and what not at all: the frames of rigs, and `fixed` images (n,).
 
     Raises:
-        InputError: if the fixed images stand at one place, or the options are none that rigid groups go with.
+        InputError: if the fixed images stand at one place.
     """
-    rigid = rigid_parts(images, np.zeros(images.num_images, np.bool_) if fixed is None else fixed)
-    if rigid.groups is not None:
-        refuse_admm(options.solver)
-    return rigid
-
-
-def rigid_parts(images: Images, fixed: BoolArray) -> Rigid:
-    """Return what moves together of images, of which some (n,) are fixed.
-
-    Raises:
-        InputError: if these stand at one place.
-    """
+    fixed = np.zeros(images.num_images, dtype=np.bool_) if fixed is None else fixed
     count = int(np.sum(fixed))
     if not images.has_rigs and count < 2:
         return Rigid(fixed, None, None)
-    groups = groups_of(images) if images.has_rigs else separate(images.num_images, 3)
+    frames = RigidGroups(group_of=images.frame_of, offsets=images.offsets)
+    groups = frames if images.has_rigs else separate(images.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
     centers = images.centers[fixed]
@@ -87,17 +76,6 @@ def rigid_parts(images: Images, fixed: BoolArray) -> Rigid:
             f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )
     return Rigid(fixed, groups.with_fixed(fixed, images.centers), 0)
-
-
-def group_frames(images: Images, measured: MeasuredGraph) -> MeasuredGraph:
-    """Return the measured graph of images with the frames of their rigs, if they have any."""
-    groups = groups_of(images) if images.has_rigs else None
-    return Rigid(np.zeros(images.num_images, dtype=np.bool_), groups, None).apply(measured)
-
-
-def groups_of(images: Images) -> RigidGroups:
-    """Return the frames as rigid groups of images."""
-    return RigidGroups(group_of=images.frame_of, offsets=images.offsets)
 
 
 def rigs_statement(images: Images, measured: MeasuredGraph) -> str:

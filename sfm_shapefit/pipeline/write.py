@@ -60,15 +60,11 @@ def write_result(
     protect = [*_inputs_of(found), *options.protect]
     with atomic_folder(out, overwrite=options.overwrite, protect=protect) as folder:
         if isinstance(found, MapResult):
-            for number, model in enumerate(found.models):
-                (folder / str(number)).mkdir()
-                _write_files(model.located, folder / str(number), options)
-            for joined in found.joined:
-                (folder / joined.folder).mkdir()
-                _write_joined(joined, folder / joined.folder, options)
+            models = {str(number): model.located for number, model in enumerate(found.models)}
+            for name, one in (models | {joined.folder: joined for joined in found.joined}).items():
+                (folder / name).mkdir()
+                _write_files(one, folder / name, options)
             write_json(found.summary(), folder / MAP_MARKER)
-        elif isinstance(found, JoinedModel):
-            _write_joined(found, folder, options)
         else:
             _write_files(found, folder, options)
 
@@ -82,12 +78,15 @@ def _inputs_of(found: LocateResult | GraphResult | MapResult | JoinedModel) -> l
     return [found.database if isinstance(found, MapResult) else found.path]
 
 
-def _write_files(found: LocateResult | GraphResult, folder: Path, options: WriteOptions) -> None:
-    """Write the files of one placed model or graph."""
-    dimension = found.placement.graph.dimension
+def _write_files(
+    found: LocateResult | GraphResult | JoinedModel, folder: Path, options: WriteOptions
+) -> None:
+    """Write the files of one placed model or graph, or of models that were joined."""
     if isinstance(found, LocateResult):
         write_model(found.model, folder)
-    for piece in found.further:
+    elif isinstance(found, JoinedModel):
+        write_model(found.reconstruction, folder)
+    for piece in () if isinstance(found, JoinedModel) else found.further:
         placement = piece.placement if isinstance(piece, LocateResult) else piece
         subfolder = folder / folder_of(placement.piece)
         subfolder.mkdir(parents=True)
@@ -96,21 +95,11 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
             rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)
-        write_rows(rows, CameraRow, dimension, subfolder / "cameras.csv")
-    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
-    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+        write_rows(rows, CameraRow, found.dimension, subfolder / "cameras.csv")
+    write_rows(found.cameras, CameraRow, found.dimension, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, found.dimension, folder / "pairs.csv")
     if isinstance(found, LocateResult) and found.doubtful_pairs:
-        write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
-    write_json(found.facts.summary(), folder / MARKER)
-    if options.report:
-        _write_report(found, folder / "report.html", options.images)
-
-
-def _write_joined(found: JoinedModel, folder: Path, options: WriteOptions) -> None:
-    """Write the files of models that were joined."""
-    write_model(found.reconstruction, folder)
-    write_rows(found.cameras, CameraRow, 3, folder / "cameras.csv")
-    write_rows(found.pairs, PairRow, 3, folder / "pairs.csv")
+        write_rows(found.doubtful_pairs, PairRow, found.dimension, folder / "doubtful_pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
         _write_report(found, folder / "report.html", options.images)
@@ -163,11 +152,12 @@ def _drawing_of(found: Any) -> "Drawing":
 def _write_report(found: Any, page: Path, images: Path | str) -> bool:
     """Write a report, of several models that of the largest; False if pictures were asked for in vain."""
     from sfm_shapefit.report.page import write_report
-    from sfm_shapefit.report.thumbnails import thumbnails_of
+    from sfm_shapefit.report.thumbnails import read_thumbnails
 
     shown = found.models[0].located if isinstance(found, MapResult) else found
     drawing = _drawing_of(shown)
-    pictures = thumbnails_of(drawing, images)
+    cameras = drawing.cameras
+    pictures = read_thumbnails(Path(images), cameras.names, cameras.trust) if str(images) else None
     write_report(drawing, shown.facts, page, pictures, images)
     return pictures is None or bool(pictures)
 

@@ -1,10 +1,12 @@
-"""The numbers behind the charts that look at everything: histograms, and the view-graph matrix."""
+"""The charts that look at everything, as JSON values: histograms, and the view-graph matrix."""
 
+import base64
 import itertools
 import math
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.report.drawing import PairClass, Pairs
@@ -18,45 +20,20 @@ _ERROR_QUANTILE = 0.98  # quantile of the reprojection errors; all larger ones s
 MOST_CELLS = 200
 """Cells per side of the matrix; with more cameras, several share a cell."""
 _UNBINNED_RANK = np.array([1, 4, 2, 3])  # rank of each PairClass; a cell shows the worst of its pairs
+_NO_PAIR = 255  # byte of a cell without a pair; no rank comes near
+_TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Histogram:
-    """Residuals of the pairs that the solve used, in logarithmic bins."""
-
-    edges_deg: FloatArray
-    """(k + 1,)"""
-    counts: dict[str, IntArray]
-    """(k,) for each state of the locations, in the order in which they came about."""
-    medians_deg: dict[str, float]
+def pack_array(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
+    """Return an array as base64 of little-endian numbers, which the page decodes."""
+    raw = np.ascontiguousarray(values, dtype=np.dtype(_TYPES[kind]).newbyteorder("<")).tobytes()
+    return {"type": kind, "bytes": base64.b64encode(raw).decode("ascii")}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Matrix:
-    """The view graph as a symmetric matrix; rows and columns are cameras in the order of cameras.csv."""
+def track_length_bars(lengths: IntArray) -> dict[str, Any] | None:
+    """Return counts, texts and ticks of the histogram of track lengths; None if there are no points.
 
-    cells: FloatArray
-    """(k, k) With one camera a cell: 0 no pair, 1 agrees, 2 undetermined, 3 no direction, 4 contradicts. With
-    several: the share of pairs that contradict the solution. NaN without a pair."""
-    counts: IntArray
-    """(k, k) pairs in each cell."""
-    cameras_per_cell: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Bars:
-    """A histogram of bars of one width, whatever they hold."""
-
-    counts: IntArray
-    """(k,)"""
-    texts: tuple[str, ...]
-    """What each bar holds."""
-    ticks: tuple[tuple[float, str], ...]
-    """Places, in bars from the left, and their text."""
-
-
-def track_length_bars(lengths: IntArray) -> Bars | None:
-    """Return the histogram of track lengths; None if there are no points.
+    Ticks are places, in bars from the left, and their text.
 
     Args:
         lengths: (s,) number of images that see each point.
@@ -69,15 +46,15 @@ def track_length_bars(lengths: IntArray) -> Bars | None:
     names = [
         str(low) if low == high else f"{low}-{high}" for low, high in zip(edges.tolist(), ends, strict=True)
     ]
-    return Bars(
-        counts=np.bincount(bar_of, minlength=len(edges)),
-        texts=tuple(f"seen by {name} images" for name in names),
-        ticks=tuple((k + 0.5, str(low)) for k, low in enumerate(edges.tolist())),
-    )
+    return {
+        "counts": np.bincount(bar_of, minlength=len(edges)).tolist(),
+        "texts": [f"seen by {name} images" for name in names],
+        "ticks": [[k + 0.5, str(low)] for k, low in enumerate(edges.tolist())],
+    }
 
 
-def reprojection_error_bars(errors_px: FloatArray) -> Bars | None:
-    """Return the histogram of the points' errors in pixels; None if none is known.
+def reprojection_error_bars(errors_px: FloatArray) -> dict[str, Any] | None:
+    """Return the same of the points' errors in pixels; None if none is known.
 
     Args:
         errors_px: (s,) mean reprojection error of each point; NaN where it is not known.
@@ -93,17 +70,17 @@ def reprojection_error_bars(errors_px: FloatArray) -> Bars | None:
     every = max(bars // 6, 1)
     edges = [f"{k * width:.3g}" for k in range(bars + 1)]
     texts = [f"{low} to {high} px" for low, high in itertools.pairwise(edges)]
-    return Bars(
-        counts=np.bincount(bar_of, minlength=bars + 1),
-        texts=(*texts, f"{edges[-1]} px or more"),
-        ticks=tuple((float(k), edges[k]) for k in range(0, bars + 1, every)),
-    )
+    return {
+        "counts": np.bincount(bar_of, minlength=bars + 1).tolist(),
+        "texts": [*texts, f"{edges[-1]} px or more"],
+        "ticks": [[float(k), edges[k]] for k in range(0, bars + 1, every)],
+    }
 
 
-def residual_histogram(pairs: Pairs) -> Histogram:
-    """Return the residuals at the input's centers, at the convex optimum and at the output's centers.
+def residuals_of_states(pairs: Pairs) -> dict[str, FloatArray]:
+    """Return the residuals in degrees at the input's centers, at the convex optimum and at the output's.
 
-    All count the same pairs: those with a residual at the output and, where it is known, at the optimum.
+    All are of the same pairs: those with a residual at the output and, where it is known, at the optimum.
     """
     used = np.isfinite(pairs.residuals_deg)
     if np.isfinite(pairs.certified_deg).any():
@@ -114,29 +91,44 @@ def residual_histogram(pairs: Pairs) -> Histogram:
         "output": pairs.residuals_deg[used],
     }
     known = {name: values[np.isfinite(values)] for name, values in states.items()}
-    known = {name: values for name, values in known.items() if len(values)}
+    return {name: values for name, values in known.items() if len(values)}
+
+
+def residual_histogram(residuals_deg: dict[str, FloatArray]) -> dict[str, Any]:
+    """Return the edges of logarithmic bins in degrees, and how many residuals of each state are in each."""
     edges = np.geomspace(*_RANGE_DEG, _BINS + 1)
-    return Histogram(
-        edges_deg=edges,
-        counts={name: np.histogram(np.clip(v, *_RANGE_DEG), edges)[0] for name, v in known.items()},
-        medians_deg={name: float(np.median(v)) for name, v in known.items()},
-    )
+    counts = {
+        name: np.histogram(np.clip(values, *_RANGE_DEG), edges)[0].tolist()
+        for name, values in residuals_deg.items()
+    }
+    return {"edges": edges.tolist(), "counts": counts}
 
 
-def view_graph_matrix(pairs: Pairs, num_cameras: int) -> Matrix:
-    """Return the matrix of pairs, of at most 200 x 200 cells."""
-    per_cell = max(-(-num_cameras // MOST_CELLS), 1)
-    side = -(-num_cameras // per_cell)
+def view_graph_matrix(pairs: Pairs, rank: IntArray) -> dict[str, Any]:
+    """Return the symmetric matrix of pairs, of at most 200 x 200 cells, in the order of cameras.csv.
+
+    With one camera a cell, what became of its pair: 1 agrees, 2 undetermined, 3 no direction, 4 contradicts.
+    With several, how many pairs contradict the solution, and how many there are.
+
+    Args:
+        pairs: all of them.
+        rank: (n,) rows of the cameras on the page.
+    """
+    per_cell = max(-(-len(rank) // MOST_CELLS), 1)
+    side = -(-len(rank) // per_cell)
+    known = {"side": side, "perCell": per_cell, "rowOf": pack_array(rank, "i4")}
     i, j = (pairs.cameras // per_cell).T
-    cells, counts = np.zeros((side, side)), np.zeros((side, side), dtype=np.int64)
     # A pair inside a cell counts once, any other in two cells.
     inside = i == j
-    rows, columns = np.concatenate([i, j[~inside]]), np.concatenate([j, i[~inside]])
+    cells = np.concatenate([i, j[~inside]]), np.concatenate([j, i[~inside]])
     classes = np.concatenate([pairs.classes, pairs.classes[~inside]])
-    np.add.at(counts, (rows, columns), 1)
     if per_cell == 1:
-        np.maximum.at(cells, (rows, columns), _UNBINNED_RANK[classes].astype(np.float64))
-    else:
-        np.add.at(cells, (rows, columns), (classes == PairClass.CONTRADICTS).astype(np.float64))
-        cells = cells / np.maximum(counts, 1)
-    return Matrix(cells=np.where(counts > 0, cells, np.nan), counts=counts, cameras_per_cell=per_cell)
+        worst = np.zeros((side, side), dtype=np.int64)
+        np.maximum.at(worst, cells, _UNBINNED_RANK[classes])
+        return known | {"cells": pack_array(np.where(worst > 0, worst, _NO_PAIR), "u1")}
+    against, counts = np.zeros((2, side, side), dtype=np.int64)
+    np.add.at(against, cells, classes == PairClass.CONTRADICTS)
+    np.add.at(counts, cells, 1)
+    largest = np.iinfo(np.uint16).max
+    shown = {"against": against, "counts": counts}
+    return known | {name: pack_array(np.minimum(values, largest), "u2") for name, values in shown.items()}

@@ -8,8 +8,8 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,12 +18,9 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.facts.rows import covariance_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow
+from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.scene.images import Images
-
-if TYPE_CHECKING:
-    from sfm_shapefit.files.colmap.seed import PickedPoints
-
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
@@ -148,28 +145,13 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DrawnPoints:
-    """The 3D points that are drawn."""
-
-    positions: FloatArray
-    """(k, 3)"""
-    colors: IntArray
-    """(k, 3) in 0..255."""
-    num_all: int
-    """How many the model has."""
-    track_lengths: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """(s,) by how many images points are seen: of all, or of evenly picked ones."""
-    errors_px: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(s,) mean reprojection errors of the same points; NaN where it is not known."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drawing:
     """Everything that is drawn."""
 
     cameras: Cameras
     pairs: Pairs
-    points: DrawnPoints
+    points: PickedPoints
+    """The points that are drawn; lengths and errors, NaN where not known, are of those far outside too."""
     axes: FloatArray
     """(3, 3) rows: to the right, forward and up as seen by the cameras, in the output's axes."""
     frustum_depth: float
@@ -207,7 +189,7 @@ def build_drawing(
     pairs: Sequence[PairRow],
     *,
     poses: Poses | None = None,
-    points: "PickedPoints | None" = None,
+    points: PickedPoints | None = None,
     certified: FloatArray | None = None,
 ) -> Drawing:
     """Return the drawing of a result's rows; what does not follow from these has its default.
@@ -373,21 +355,17 @@ def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatAr
     return angles
 
 
-def _points(picked: "PickedPoints | None", cameras: FloatArray) -> DrawnPoints:
+def _points(picked: PickedPoints | None, cameras: FloatArray) -> PickedPoints:
     """Return points without those far out that would shrink the rest."""
     if picked is None or not len(picked.xyz):
-        return DrawnPoints(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
+        nothing = np.zeros((0, 3))
+        return PickedPoints(nothing, nothing.astype(np.uint8), np.zeros(0, np.int64), np.zeros(0), 0)
     both = np.concatenate([picked.xyz, cameras])
     middle = np.median(both, axis=0)
     limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(picked.xyz - middle, axis=1) <= limit
-    return DrawnPoints(
-        positions=picked.xyz[near],
-        colors=picked.colors[near].astype(np.int64),
-        num_all=picked.num_all,
-        track_lengths=picked.lengths,
-        errors_px=np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan),
-    )
+    errors_px = np.where(picked.errors_px >= 0.0, picked.errors_px, np.nan)
+    return picked._replace(xyz=picked.xyz[near], colors=picked.colors[near], errors_px=errors_px)
 
 
 def _frustum_depth(positions: FloatArray) -> float:

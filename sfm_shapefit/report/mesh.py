@@ -45,8 +45,8 @@ def _scene(drawing: Drawing) -> "trimesh.Scene":
     scene = trimesh.Scene()
     if len(faces):
         scene.add_geometry(_mesh((vertices - middle) @ turn, faces, colors), geom_name="cameras")
-    if len(points.positions):
-        cloud = trimesh.PointCloud((points.positions - middle) @ turn, colors=_opaque(points.colors))
+    if len(points.xyz):
+        cloud = trimesh.PointCloud((points.xyz - middle) @ turn, colors=_opaque(points.colors))
         scene.add_geometry(cloud, geom_name="points")
     return scene
 
@@ -56,9 +56,9 @@ def _one_mesh(drawing: Drawing) -> "trimesh.Trimesh":
     vertices, faces, colors = _camera_mesh(drawing)
     points = drawing.points
     return _mesh(
-        np.concatenate([vertices, points.positions]),
+        np.concatenate([vertices, points.xyz]),
         faces,
-        np.concatenate([colors, points.colors.astype(np.uint8)]),
+        np.concatenate([colors, points.colors]),
     )
 
 

@@ -13,30 +13,31 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.record import plain
 from sfm_shapefit.base.settings import flat_values
 from sfm_shapefit.facts.evidence import ToldEvidence
-from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts, ModelFacts
+from sfm_shapefit.facts.model import FactsOfModel, JoinedFacts
 from sfm_shapefit.facts.options import LocateOptions, MapOptions
 from sfm_shapefit.facts.placed import Facts, GraphFacts, Piece
+from sfm_shapefit.files.colmap.seed import PickedPoints
 from sfm_shapefit.report.charts import (
     MOST_CELLS,
-    Bars,
+    pack_array,
     reprojection_error_bars,
     residual_histogram,
+    residuals_of_states,
     track_length_bars,
     view_graph_matrix,
 )
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, DrawnPoints, input_centers
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.sentences import (
     MAX_TEXT,
@@ -51,11 +52,8 @@ _HIGH_TRUST = 0.95  # trust; the chart of trust leaves out cameras above, which 
 _NOTED_SHARE = 0.05  # share of points that only two images see; less is not worth a word
 _MAX_HINGES = 20  # hinges named per piece; locate.json has all
 _STARTING_ITERATIONS = 2  # iterations left out of the chart; their objectives may be far out of scale
-_MAX_LOOPS = 50  # loops listed; locate.json has all
-_MAX_CONTROL_POINTS = 200  # control points, and lenses, listed; locate.json has all
+_MAX_ROWS = 200  # control points, lenses and loops listed, of each; locate.json has all
 _AXES = "xyz"
-_TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
-_NO_PAIR = 255  # byte of the matrix without a pair; no share comes near
 # In the order in which they make one script.
 _SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js")
 
@@ -107,7 +105,7 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
     rank = np.empty(len(cameras), dtype=np.int64)
     rank[cameras] = np.arange(len(cameras))
     display = _Display(drawing)
-    histogram = residual_histogram(drawing.pairs)
+    residuals_deg = residuals_of_states(drawing.pairs)
     return {
         "title": scene_name(facts),
         "subtitle": _subtitle(facts),
@@ -126,8 +124,8 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
         "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
-            "positions": _pack(display(drawing.points.positions), "f4"),
-            "colors": _pack(drawing.points.colors, "u1"),
+            "positions": pack_array(display(drawing.points.xyz), "f4"),
+            "colors": pack_array(drawing.points.colors, "u1"),
         },
         "reasons": [shorten(text) for text in reasons],
         "sceneNote": _scene_note(drawing),
@@ -135,18 +133,15 @@ def page_data(drawing: Drawing, facts: Facts, thumbnails: dict[int, str] | None 
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
         "highTrust": _HIGH_TRUST,
         "minTrust": float(facts.options.get("min_trust", 0.0)),
-        "histogram": {
-            "edges": histogram.edges_deg.tolist(),
-            "counts": {state: values.tolist() for state, values in histogram.counts.items()},
-        },
-        "tracks": _bars(track_length_bars(drawing.points.track_lengths)),
-        "reprojection": _bars(reprojection_error_bars(drawing.points.errors_px)),
-        "matrix": _matrix(drawing, rank),
+        "histogram": residual_histogram(residuals_deg),
+        "tracks": track_length_bars(drawing.points.lengths),
+        "reprojection": reprojection_error_bars(drawing.points.errors_px),
+        "matrix": view_graph_matrix(drawing.pairs, rank),
         "convergence": _convergence(drawing),
-        "notes": _notes(drawing, histogram.medians_deg),
-        "intrinsics": _intrinsics(facts),
-        "control": _control_points(facts),
-        "loops": _loops(facts),
+        "notes": _notes(drawing, residuals_deg),
+        "intrinsics": _cells(facts, "intrinsics", lambda lens: -abs(lens.change)),
+        "control": _cells(facts, "control_points", lambda point: -(point.error or 0.0)),
+        "loops": _cells(facts, "loops", lambda loop: (-loop.num_refused, -loop.num_matches)),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts.pieces)],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts.timings_s.items()],
         "options": _options(facts.options),
@@ -184,22 +179,22 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
     aligned = drawing.input_is_aligned
     return {
         "names": [shorten(cameras.names[k]) for k in order.tolist()],
-        "placed": _pack(cameras.placed[order], "u1"),
-        "trust": _pack(cameras.trust[order], "f4"),
-        "sigma": _pack(cameras.sigmas[order], "f4"),
-        "ellipsoids": _pack(display.turn(cameras.ellipsoids[order]), "f4"),
-        "degree": _pack(cameras.degrees[order], "i4"),
-        "agreeing": _pack(agreeing[order], "i4"),
-        "error": _pack(errors[order], "f4"),
-        "piece": _pack(cameras.pieces[order], "i4"),
+        "placed": pack_array(cameras.placed[order], "u1"),
+        "trust": pack_array(cameras.trust[order], "f4"),
+        "sigma": pack_array(cameras.sigmas[order], "f4"),
+        "ellipsoids": pack_array(display.turn(cameras.ellipsoids[order]), "f4"),
+        "degree": pack_array(cameras.degrees[order], "i4"),
+        "agreeing": pack_array(agreeing[order], "i4"),
+        "error": pack_array(errors[order], "f4"),
+        "piece": pack_array(cameras.pieces[order], "i4"),
         "reason": _encode([cameras.reasons[k] for k in order.tolist()], reasons),
-        "center": _pack(display(cameras.centers[order]), "f4"),
-        "frusta": _pack(_frusta(drawing, order, display), "f4"),
-        "ghost": _pack(display(_ghosts(drawing)[order]), "f4"),
-        "inputCenter": _pack(display(cameras.poses.centers[order]), "f4") if aligned else None,
-        "shift": _pack(drawing.shifts()[order], "f4") if aligned else None,
+        "center": pack_array(display(cameras.centers[order]), "f4"),
+        "frusta": pack_array(_frusta(drawing, order, display), "f4"),
+        "ghost": pack_array(display(_ghosts(drawing)[order]), "f4"),
+        "inputCenter": pack_array(display(cameras.poses.centers[order]), "f4") if aligned else None,
+        "shift": pack_array(drawing.shifts()[order], "f4") if aligned else None,
         "further": [
-            {"title": column.title, "hint": column.hint, "values": _pack(column.values[order], "f4")}
+            {"title": column.title, "hint": column.hint, "values": pack_array(column.values[order], "f4")}
             for column in drawing.further
         ],
     }
@@ -219,9 +214,9 @@ def _doubts(drawing: Drawing, facts: Facts, order: IntArray, display: _Display) 
         others[row] = drawing.cameras.centers[row] + place.offset
         counts[row] = place.num_here, place.num_there
     return {
-        "group": _pack(groups[order], "i4"),
-        "other": _pack(display(others[order]), "f4"),
-        "otherCounts": _pack(counts[order], "i4"),
+        "group": pack_array(groups[order], "i4"),
+        "other": pack_array(display(others[order]), "f4"),
+        "otherCounts": pack_array(counts[order], "i4"),
     }
 
 
@@ -253,40 +248,17 @@ def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str,
         "dual": pairs.dual_norms,
     }
     return {
-        "first": _pack(ends[:, 0], "i4"),
-        "second": _pack(ends[:, 1], "i4"),
-        "verdict": _pack(pairs.classes[order], "u1"),
-        "support": _pack(pairs.support[order], "i4"),
+        "first": pack_array(ends[:, 0], "i4"),
+        "second": pack_array(ends[:, 1], "i4"),
+        "verdict": pack_array(pairs.classes[order], "u1"),
+        "support": pack_array(pairs.support[order], "i4"),
         "reason": _encode([pairs.reasons[k] for k in order.tolist()], reasons),
-    } | {name: _pack(values[order], "f4") for name, values in columns.items()}
+    } | {name: pack_array(values[order], "f4") for name, values in columns.items()}
 
 
 def _encode(texts: Sequence[str], known: dict[str, int]) -> dict[str, str]:
     """Return the numbers of texts, and add those that are new to the known ones."""
-    return _pack(np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64), "i4")
-
-
-def _pack(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
-    """Return an array as base64 of little-endian numbers, which the page decodes."""
-    raw = np.ascontiguousarray(values, dtype=np.dtype(_TYPES[kind]).newbyteorder("<")).tobytes()
-    return {"type": kind, "bytes": base64.b64encode(raw).decode("ascii")}
-
-
-def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
-    matrix = view_graph_matrix(drawing.pairs, len(rank))
-    known = {"side": len(matrix.cells), "perCell": matrix.cameras_per_cell, "rowOf": _pack(rank, "i4")}
-    if matrix.cameras_per_cell == 1:
-        return known | {"cells": _pack(np.nan_to_num(matrix.cells, nan=_NO_PAIR), "u1")}
-    against = np.rint(np.nan_to_num(matrix.cells) * matrix.counts)
-    largest = np.iinfo(np.uint16).max
-    counts = {"against": against, "counts": matrix.counts}
-    return known | {name: _pack(np.minimum(values, largest), "u2") for name, values in counts.items()}
-
-
-def _bars(bars: Bars | None) -> dict[str, Any] | None:
-    if bars is None:
-        return None
-    return {"counts": bars.counts.tolist(), "texts": list(bars.texts), "ticks": [list(t) for t in bars.ticks]}
+    return pack_array(np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64), "i4")
 
 
 def _convergence(drawing: Drawing) -> dict[str, Any]:
@@ -303,25 +275,10 @@ def _convergence(drawing: Drawing) -> dict[str, Any]:
     }
 
 
-def _loops(facts: Facts) -> list[list[str]]:
-    """Return the cells of the loops of videos, those that were refused first."""
-    loops = facts.loops if isinstance(facts, ModelFacts) else ()
-    ordered = sorted(loops, key=lambda loop: (-loop.num_refused, -loop.num_matches))
-    return [[shorten(cell) for cell in loop.cells] for loop in ordered[:_MAX_LOOPS]]
-
-
-def _intrinsics(facts: Facts) -> list[list[str]]:
-    """Return the cells of the cameras whose intrinsics were in doubt, the largest change first."""
-    lenses = facts.intrinsics if isinstance(facts, ModelFacts) else ()
-    ordered = sorted(lenses, key=lambda lens: -abs(lens.change))
-    return [[shorten(cell) for cell in lens.cells] for lens in ordered[:_MAX_CONTROL_POINTS]]
-
-
-def _control_points(facts: Facts) -> list[list[str]]:
-    """Return the cells of the ground control points, the farthest off first."""
-    points = facts.control_points if isinstance(facts, ModelFacts) else ()
-    ordered = sorted(points, key=lambda point: -(point.error or 0.0))
-    return [[shorten(cell) for cell in point.cells] for point in ordered[:_MAX_CONTROL_POINTS]]
+def _cells(facts: Facts, table: str, order: Callable[[Any], Any]) -> list[list[str]]:
+    """Return the cells of a table of the facts, sorted by `order`; empty where they have no such table."""
+    rows = sorted(getattr(facts, table, ()), key=order)
+    return [[shorten(cell) for cell in row.cells] for row in rows[:_MAX_ROWS]]
 
 
 # --- words -----------------------------------------------------------------------------------------
@@ -349,9 +306,9 @@ def _scene_note(drawing: Drawing) -> str:
         notes = [f"Nodes span {drawing.extent:.4g} units."]
     if drawing.dimension > len(_AXES):
         notes.append(f"The first three of {drawing.dimension} dimensions are drawn.")
-    if drawing.points.num_all > len(drawing.points.positions):
+    if drawing.points.num_all > len(drawing.points.xyz):
         notes.append(
-            f"{len(drawing.points.positions):,} of {drawing.points.num_all:,} points are drawn "
+            f"{len(drawing.points.xyz):,} of {drawing.points.num_all:,} points are drawn "
             f"(at most {MAX_POINTS:,}, without those far outside)."
         )
     return " ".join([*notes, _pairs_note(drawing)]).strip()
@@ -367,10 +324,10 @@ def _pairs_note(drawing: Drawing) -> str:
     )
 
 
-def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
+def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[str, str]:
     """Return what stands under each chart."""
     return {
-        "histogram": _histogram_note(medians_deg),
+        "histogram": _histogram_note(residuals_deg),
         "tracks": _tracks_note(drawing.points),
         "reprojection": _reprojection_note(drawing.points),
         "trust": _trust_note(drawing),
@@ -394,26 +351,28 @@ def _trust_note(drawing: Drawing) -> str:
     return f"{said}; the least trusted others are shown." if high < known else f"{said}."
 
 
-def _histogram_note(medians_deg: dict[str, float]) -> str:
-    if not medians_deg:
+def _histogram_note(residuals_deg: Mapping[str, FloatArray]) -> str:
+    if not residuals_deg:
         return "No pair has a residual."
     where = {"input": " at the input's positions", "optimum": " at the solver's optimum"}
-    last = " as delivered" if len(medians_deg) > 1 else ""
-    medians = ", ".join(f"{value:.3g}°{where.get(state, last)}" for state, value in medians_deg.items())
+    last = " as delivered" if len(residuals_deg) > 1 else ""
+    medians = ", ".join(
+        f"{np.median(values):.3g}°{where.get(state, last)}" for state, values in residuals_deg.items()
+    )
     return f"Angle between what the matches of a pair say and where its cameras stand; median: {medians}."
 
 
-def _tracks_note(points: DrawnPoints) -> str:
-    if not len(points.track_lengths):
+def _tracks_note(points: PickedPoints) -> str:
+    if not len(points.lengths):
         return ""
-    share = float(np.mean(points.track_lengths <= 2))
-    median = float(np.median(points.track_lengths))
+    share = float(np.mean(points.lengths <= 2))
+    median = float(np.median(points.lengths))
     said = f"Number of images that see a 3D point; a bar reaches to the next. The median is {median:.3g}."
     weak = f" {share:.0%} are seen by two only: nothing checks these." if share >= _NOTED_SHARE else ""
     return f"{said}{weak}{_sample(points)}"
 
 
-def _reprojection_note(points: DrawnPoints) -> str:
+def _reprojection_note(points: PickedPoints) -> str:
     known = points.errors_px[np.isfinite(points.errors_px)]
     if not len(known):
         return ""
@@ -424,10 +383,10 @@ def _reprojection_note(points: DrawnPoints) -> str:
     )
 
 
-def _sample(points: DrawnPoints) -> str:
-    if len(points.track_lengths) >= points.num_all:
+def _sample(points: PickedPoints) -> str:
+    if len(points.lengths) >= points.num_all:
         return ""
-    return f" Counted over {len(points.track_lengths):,} points, evenly picked."
+    return f" Counted over {len(points.lengths):,} points, evenly picked."
 
 
 def _matrix_note(cameras_per_cell: int) -> str:

@@ -49,9 +49,7 @@ def draw_checked(
 ) -> Drawing:
     """Return the drawing of a model that was judged, with how well points hold each of its images."""
     drawing = _draw_as_it_stands(model, cameras, pairs)
-    points = replace(
-        drawing.points, errors_px=quality.point_errors_px, track_lengths=quality.point_track_lengths
-    )
+    points = drawing.points._replace(errors_px=quality.point_errors_px, lengths=quality.point_track_lengths)
     return replace(drawing, further=tuple(_columns(quality, len(cameras))), points=points)
 
 

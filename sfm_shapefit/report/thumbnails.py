@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.paths import file_of, refuse_no_folder
-from sfm_shapefit.report.drawing import Drawing
 
 MAX_BYTES = 4_000_000  # bytes of all pictures of a page as base64; with more it opens slowly
 _WIDEST_PX = 320  # pixels, longer side of a picture; the page shows none larger
@@ -18,31 +17,20 @@ _BYTES_PER_PIXEL = 0.25  # bytes of a JPEG of this quality per pixel; an estimat
 _BASE64 = 4.0 / 3.0  # characters per byte of base64; it holds six bits each
 
 
-def thumbnails_of(drawing: Drawing, folder: Path | str) -> dict[int, str] | None:
-    """Return small pictures of a drawing's cameras, the least trusted first; None if no folder is given.
-
-    Raises:
-        InputError: if the folder is none.
-    """
-    if not str(folder):
-        return None
-    trust = drawing.cameras.trust
-    return read_thumbnails(Path(folder), drawing.cameras.names, np.lexsort((trust, np.isnan(trust))))
-
-
-def read_thumbnails(folder: Path, names: Sequence[str], order: IntArray) -> dict[int, str]:
+def read_thumbnails(folder: Path, names: Sequence[str], trust: FloatArray) -> dict[int, str]:
     """Return data URLs of small JPEG pictures by row of the names, but for rows without a readable image.
 
     Args:
         folder: where the images are, under their names.
         names: as the model has them, from strangers: one that leads out of the folder is left out.
-        order: rows, the most important first, in case that not all fit into `MAX_BYTES`.
+        trust: of the images; the least trusted come first, in case that not all fit into `MAX_BYTES`.
 
     Raises:
         InputError: if the folder is none.
     """
     refuse_no_folder(folder)
-    files = {row: path for row in order.tolist() if (path := file_of(folder, names[row])) is not None}
+    rows = np.lexsort((trust, np.isnan(trust))).tolist()
+    files = {row: path for row in rows if (path := file_of(folder, names[row])) is not None}
     budget = MAX_BYTES / _BASE64 / max(len(files), 1)
     width = float(np.clip(np.sqrt(budget / _BYTES_PER_PIXEL / 0.75), _NARROWEST_PX, _WIDEST_PX))
     found, total = {}, 0

@@ -11,6 +11,7 @@ from sfm_shapefit.judgement.evidence import ModelEvidence
 from sfm_shapefit.judgement.grade import NOTHING_AGAINST, Grade, judge_graph, weigh_evidence
 from sfm_shapefit.judgement.places import OtherPlace
 from sfm_shapefit.judgement.seams import Seam
+from sfm_shapefit.judgement.support import ObservationShares
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
@@ -68,7 +69,7 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
 def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_decides_nothing(
     found, share, contradicting, grade
 ):
-    verdict = altered(found, agreeing_observations=share, contradicting_observations=contradicting).verdict
+    verdict = altered(found, observations=ObservationShares(share, contradicting)).verdict
     assert verdict.grade is grade
     assert bool(verdict.reasons) is (grade is not Grade.GOOD)
 

@@ -13,7 +13,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.pipeline.rigs import rigid_parts
+from sfm_shapefit.pipeline.rigs import find_rigid_parts
 from sfm_shapefit.pipeline.stand import Stand
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement, place_pieces
@@ -41,7 +41,7 @@ def placement_at(locations, pairs=None) -> Placement:
 def stand_at(source, locations, *, all_pairs=True, pull_rad=None, **told) -> Stand:
     """Return all images of a source at some locations, and the gauge by what is told, see `GaugeRule`."""
     images, pairs = source.images, None if all_pairs else source.view.pairs
-    rigid = rigid_parts(images, np.zeros(images.num_images, np.bool_))
+    rigid = find_rigid_parts(images)
     template = template_of(read_model(FOLDER))
     known = Known(priors=told.pop("priors", None))
     told = {"scale": "auto", "known": known, **told}

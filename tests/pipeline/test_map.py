@@ -71,10 +71,10 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
 def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
     found = sfm_shapefit.map_database(COURTYARD / "database.db", points="never")
     located = found.models[0].located
-    shares, row = located.matched_shares.copy(), next(r for r in located.pairs if r.verdict == "inlier")
+    scores, row = located.scores.copy(), next(r for r in located.pairs if r.verdict == "inlier")
     names = [(pair.name1, pair.name2) for pair in located.pairs]
-    shares[names.index((row.name1, row.name2))] = 1e-4
-    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, matched_shares=shares))
+    scores[names.index((row.name1, row.name2)), 1] = 1e-4
+    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, scores=scores))
     sfm_shapefit.write_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
     listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
     assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}

@@ -30,7 +30,7 @@ from sfm_shapefit.pipeline.gauge_choice import GaugeRule
 from sfm_shapefit.pipeline.join import judge_joins, merge_groups
 from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, measure
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
-from sfm_shapefit.pipeline.rigs import place_cameras, rigid_parts
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.pipeline.seed import seed_points, select_trusted
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.given import PositionPriors
@@ -221,7 +221,7 @@ TURNED_PRIORS = {"priors": known(2.0 * (TRUTH.centers + OFF) @ TURN.T + 100.0)}
     ],
 )
 def test_gauge_the_first_by_precedence_sets_the_scale_and_the_others_check_it(fixed, told, scale, checks):
-    locations, rigid = 0.1 * TRUTH.centers, rigid_parts(TRUTH, np.arange(8) < fixed)
+    locations, rigid = 0.1 * TRUTH.centers, find_rigid_parts(TRUTH, np.arange(8) < fixed)
     rule = GaugeRule(TRUTH, rigid, **{"scale": "auto", **told})
     chosen = rule.choose(np.arange(8), locations, 0.1 if fixed > 1 else None)
     assert chosen.scale == scale

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit import InputError, PlacementOptions, locate
+from sfm_shapefit import InputError, locate
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, compose, invert, median_spread, normalized
 from sfm_shapefit.facts.warnings import prior_warnings
@@ -146,7 +146,7 @@ def test_a_known_distance_of_a_camera_that_is_not_placed_says_nothing():
     t, names = model.centers[:6], model.names
 
     def placed(*known):
-        rule = GaugeRule(model, find_rigid_parts(model, PlacementOptions()), "auto", distances=known)
+        rule = GaugeRule(model, find_rigid_parts(model), "auto", distances=known)
         return rule.choose(np.arange(6), t, None).similarity.apply(t)
 
     found = placed((names[1], names[4], 3.0), (names[2], names[7], 9.0))

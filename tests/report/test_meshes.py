@@ -34,7 +34,7 @@ def test_the_glb_holds_cameras_and_points_upright_around_the_origin(tmp_path):
     assert modes == {"cameras": triangles, "points": points}
     loaded = trimesh.load(tmp_path / "scene.glb").geometry
     assert len(loaded["cameras"].faces) == 6 * 24
-    assert len(loaded["points"].vertices) == len(drawing.points.positions)
+    assert len(loaded["points"].vertices) == len(drawing.points.xyz)
     apexes = np.asarray(loaded["cameras"].vertices)[: 5 * 24 : 5]
     placed = drawing.cameras.centers[drawing.cameras.placed]
     height = (placed - np.median(placed, axis=0)) @ drawing.axes[2]

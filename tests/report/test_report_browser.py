@@ -399,9 +399,9 @@ def test_the_first_view_holds_the_ring_and_not_the_few_cameras_far_away(driver, 
 
 def test_points_far_behind_the_scene_do_not_make_a_dot_of_the_cameras(driver, tmp_path):
     drawing, facts = make_drawing()
-    positions = drawing.points.positions.copy()
+    positions = drawing.points.xyz.copy()
     positions[::3] *= 20.0  # a third of the points
-    drawing = replace(drawing, points=replace(drawing.points, positions=3.0 * positions))
+    drawing = replace(drawing, points=drawing.points._replace(xyz=3.0 * positions))
     write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     rows = np.flatnonzero(drawing.cameras.placed).tolist()

@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.pipeline.locate import locate
 from sfm_shapefit.pipeline.map import map_database
-from sfm_shapefit.report.charts import residual_histogram
+from sfm_shapefit.report.charts import residuals_of_states
 from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.results import draw_result
 from tests.drawings import make_drawing
@@ -26,7 +26,7 @@ def test_what_is_drawn_of_a_result_is_what_its_facts_count():
     assert int(drawing.cameras.placed.sum()) == facts.num_placed
     assert int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS)) == facts.pairs["outlier"]
     assert np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).all()
-    assert len(drawing.points.positions) > 0
+    assert len(drawing.points.xyz) > 0
 
 
 def test_map_is_not_compared_with_positions_that_no_database_has():
@@ -36,7 +36,7 @@ def test_map_is_not_compared_with_positions_that_no_database_has():
     apart = replace(found.images, frames=replace(found.images.frames, centers=given))
     drawing = draw_result(replace(found, images=apart))
     assert input_centers(drawing) is None
-    assert "input" not in residual_histogram(drawing.pairs).counts
+    assert "input" not in residuals_of_states(drawing.pairs)
 
 
 def test_a_bare_graph_has_its_report_too(tmp_path):
