@@ -254,10 +254,7 @@ def _say_stage(stage: str, done: int, total: int) -> None:
 def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
     """Print a two-column table on stdout; warnings have a color where the terminal has.
 
-    Args:
-        title: line above the table.
-        rows: labels and lines; those without lines are left out.
-        elsewhere: file or flag that has the lines beyond the first few; if empty, all are shown.
+    If a file or flag has the lines `elsewhere`, only the first few are shown.
     """
     from rich.console import Console
     from rich.table import Table
@@ -278,12 +275,7 @@ def print_table(title: str, rows: Iterable[Row], elsewhere: str = "") -> None:
 
 
 def print_answer(told: Telling, time_taken: str = "") -> None:
-    """Print on stdout what is told of a result, a line each, without rows of a table.
-
-    Args:
-        told: the lines, and what is out of the ordinary.
-        time_taken: put at the end of the first line.
-    """
+    """Print on stdout what is told of a result, a line each, with the time at the end of the first line."""
     first, *others = told.lines
     gap = " " * min(8, max(2, 80 - len(first) - len(time_taken)))  # in a terminal of 80 columns on one line
     print_lines([f"{first}{gap}{time_taken}" if time_taken else first, *others])

@@ -88,7 +88,6 @@ def evaluate_command(
 
 
 def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[Row]:
-    """Return the errors against a model or known positions."""
     from sfm_shapefit.scene.evaluation import Evaluation
 
     common = f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"
@@ -100,7 +99,6 @@ def _told(errors: "Evaluation | PositionEvaluation", *, verbose: bool) -> list[R
 
 
 def _position_rows(facts: "PositionFacts") -> list[Row]:
-    """Return the errors against known positions."""
     scale, aligned = facts.ref_from_model.scale, _describe(facts.aligned_position_error)
     return [
         row("compared", facts.statement),
@@ -131,7 +129,6 @@ def _evaluation_rows(errors: "Evaluation") -> list[Row]:
 
 
 def _recall_rows(errors: "Evaluation") -> list[Row]:
-    """Return AUC of relative poses, and how many cameras are within thresholds."""
     aucs = [f"{100.0 * auc.auc:.1f} at {auc.threshold_deg:g} deg" for auc in errors.relative_pose_aucs]
     return [
         row("relative pose AUC", ", ".join(aucs)),
@@ -156,7 +153,6 @@ def _describe_recall(recall: "Recall") -> str:
 
 
 def _trajectory_rows(errors: "Evaluation", smallest: float) -> list[Row]:
-    """Return ATE and RPE, if they were asked for."""
     found = errors.trajectory
     if found is None:
         return []

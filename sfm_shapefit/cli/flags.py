@@ -43,7 +43,6 @@ PriorsFile = Annotated[
 
 
 def _check_executor(name: str) -> str:
-    """Refuse an executor that does not exist."""
     if not re.fullmatch("serial|processes|dask(:.+)?", name):
         raise typer.BadParameter(f"{name!r} is not one of serial, processes, dask, dask:ADDRESS")
     return name
@@ -302,7 +301,6 @@ def _values_of(name: str, text: str) -> tuple[Any, ...]:
 
 
 def _word_or_number(text: str) -> str | float:
-    """Return the number that a text is, or the text."""
     try:
         return float(text)
     except ValueError:
@@ -361,7 +359,6 @@ def _describe_unknown(name: str, known: Sequence[str]) -> str:
 
 
 def _commands_with(name: str) -> str:
-    """Name the commands that have an option."""
     from sfm_shapefit.facts.options import InspectOptions, JoinOptions, LocateOptions, MapOptions
 
     kinds = {"locate": LocateOptions, "map": MapOptions, "join": JoinOptions, "inspect": InspectOptions}

@@ -51,19 +51,17 @@ class Run(Generic[S]):
     compiling: "CompileTime | None" = None
     """Seconds spent compiling so far."""
 
-    @property
-    def writing(self) -> dict[str, Any]:
-        """How the result is written; keywords of `write_result`."""
-        flags = self.flags
-        how = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
-        return how | {"protect": self.protect}
-
-    def show(self, found: "Result", source: Path, out: Path) -> None:
-        """Print the facts as JSON, or what is told of them, or nothing, once the output is complete.
+    def finish(self, found: "Result", source: Path, out: Path) -> None:
+        """Write the result, and print its facts as JSON, or what is told of it, or nothing, in the end.
 
         The command ends with exit code 4, if that was asked for and the model is not to be used.
         """
-        self.is_unusable = self.flags.strict and found.verdict.is_bad
+        from sfm_shapefit.pipeline.write import write_result
+
+        flags = self.flags
+        how: dict[str, Any] = {"overwrite": flags.overwrite, "report": flags.report, "images": flags.images}
+        write_result(found, out, protect=self.protect, **how)
+        self.is_unusable = flags.strict and found.verdict.is_bad
         if self.flags.json:
             self.shown = lambda: print_json(found.summary())
         elif not self.flags.quiet:
@@ -90,14 +88,12 @@ class Run(Generic[S]):
         print_ending(found.verdict.grade.value, found.verdict.statement, f"written to {out}/{opened}", step)
 
     def _missing_pictures(self, names: Sequence[str]) -> int:
-        """Return how many images the folder lacks, if one is given."""
         from sfm_shapefit.base.paths import file_of
 
         folder = Path(self.flags.images)
         return sum(not file_of(folder, name) for name in names) if self.flags.images else 0
 
     def _describe_time(self) -> str:
-        """Say how long the command took, and how much of it went into compiling."""
         total = f"{time.perf_counter() - self.started:.1f} s"
         compiling = 0.0 if self.compiling is None else self.compiling.seconds
         if compiling >= _NOTICED_S:

@@ -36,8 +36,6 @@ def join_command(
     *models, target = paths
     with command_run(JoinOptions, given, target, [*models, database], "MODEL MODEL... OUT") as run:
         from sfm_shapefit.pipeline.join import join
-        from sfm_shapefit.pipeline.write import write_result
 
         found = join(models, database, options=run.options, progress=run.progress)
-        write_result(found, target, **run.writing)
-        run.show(found, models[0], target)
+        run.finish(found, models[0], target)

@@ -54,11 +54,9 @@ def locate_command(
     with command_run(LocateOptions, given, target, [source, database, priors]) as run:
         from sfm_shapefit.pipeline.execution import open_executor
         from sfm_shapefit.pipeline.locate import locate
-        from sfm_shapefit.pipeline.write import write_result
 
         with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
             found = locate(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
-        write_result(found, target, **run.writing)
-        run.show(found, source, target)
+        run.finish(found, source, target)

@@ -52,9 +52,7 @@ def map_command(
     with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
         from sfm_shapefit.pipeline.execution import open_executor
         from sfm_shapefit.pipeline.map import map_database
-        from sfm_shapefit.pipeline.write import write_result
 
         with open_executor(executor, run.options.placement.solver.num_threads()) as workers:
             found = map_database(source, run.options, progress=run.progress, priors=priors, executor=workers)
-        write_result(found, target, **run.writing)
-        run.show(found, source, target)
+        run.finish(found, source, target)

@@ -64,7 +64,6 @@ def place_command(
         raise typer.BadParameter(f"{source} is a COLMAP model, which sfm-shapefit locate takes")
     with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
         from sfm_shapefit.pipeline.place import place_graph_file
-        from sfm_shapefit.pipeline.write import write_result
 
         found = place_graph_file(
             source,
@@ -74,5 +73,4 @@ def place_command(
             reverse=reverse,
             progress=run.progress,
         )
-        write_result(found, target, **run.writing)
-        run.show(found, source, target)
+        run.finish(found, source, target)
