@@ -42,7 +42,6 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
         rotations=rotations,
         centers=centers + rng.normal(0, 0.3, centers.shape),
         half_sizes=halves,
-        focal_lengths_px=np.full(num_cameras, 1000.0),
     )
     points = PickedPoints(
         xyz=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],

@@ -186,21 +186,19 @@ class ToldEvidence(Record):
 def tell_evidence(
     evidence: ModelEvidence, images: Images, scale: float = 1.0, axes: FloatArray | None = None
 ) -> ToldEvidence:
-    """Return what evidence says, by name.
+    """Return what evidence says, by name of the images and of the lenses that they were asked for.
 
     Args:
-        evidence: by rows of images and their lenses.
-        images: with the lenses that were asked.
+        evidence, images: in one order.
         scale: from the units of the evidence to those of the output.
         axes: (3, 3) rotation from the axes of the evidence to those of the output; the same if None.
     """
     return ToldEvidence(
         lenses=tuple(_tell_lens(wrong, images.lenses[wrong.lens]) for wrong in evidence.lenses),
         places=tuple(
-            AmbiguousPlace(
+            AmbiguousPlace.taken_from(
+                found,
                 image=images.names[found.camera],
-                num_here=found.num_here,
-                num_there=found.num_there,
                 offset=tuple((scale * (found.offset if axes is None else axes @ found.offset)).tolist()),
             )
             for found in evidence.places

@@ -42,7 +42,6 @@ class Joined:
     """A model beside another, and what came of joining it to that."""
 
     model: int
-    """Its number."""
     to: int
     """The number of the model that it was joined to, or to be joined to."""
     found: PieceJoin | None

@@ -178,11 +178,8 @@ class MapResult(Written):
             title = f"model {number}: {model.located.verdict.statement}" if several else ""
             told = model.located.facts.told((), model.located.placement.refined.statement())
             lines += [title, *told.lines] if several else told.lines
-            rows += (
-                [one._replace(label=f"{one.label} of model {number}") for one in told.rows]
-                if several
-                else told.rows
-            )
+            whose = f" of model {number}" if several else ""
+            rows += [one._replace(label=f"{one.label}{whose}") for one in told.rows]
             details += [row("model", title), row("rotations", model.averaging.statement), *told.details]
         rows += [row("join", one.statement) for one in self.joins]
         rows += [row(one.folder, one.facts.verdict.statement) for one in self.joined]
@@ -215,8 +212,6 @@ def tell_joins(result: MapResult) -> MapResult:
     """Return the result whose models know what came of joining them."""
     models = list(result.models)
     for join in result.joins:
-        facts = join.facts(result.folder_of_join(join))
-        models[join.model] = replace(
-            models[join.model], located=replace(models[join.model].located, join=facts)
-        )
+        facts, model = join.facts(result.folder_of_join(join)), models[join.model]
+        models[join.model] = replace(model, located=replace(model.located, join=facts))
     return replace(result, models=tuple(models))

@@ -183,13 +183,7 @@ class GroupFacts(Record):
 
     @classmethod
     def of_placement(cls, placement: Placement, kept: BoolArray, fixed: BoolArray | None) -> Self | None:
-        """Return what moved together; None where each camera moves by itself.
-
-        Args:
-            placement: of the cameras.
-            kept: which of its cameras are in the output.
-            fixed: (n,) images that stay where they are; None if none was to.
-        """
+        """Return what moved together, and how many images (n,) are fixed; None where each moves by itself."""
         if placement.groups is None:
             return None
         cameras = placement.groups.group_of[: placement.num_cameras]
@@ -222,12 +216,7 @@ class FactsOfModel(Facts):
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
-        """Return the answer in lines.
-
-        Args:
-            against: how many pairs contradict it, and of how many.
-            more: what else is told of the matches.
-        """
+        """Return the answer in lines; of the pairs how many are `against` it, that of all, and `more`."""
         error_px = self.mean_reprojection_error_px
         points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
         source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
@@ -319,12 +308,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return super().expert_sentences() + ([f"{said[:1].upper()}{said[1:]}."] if said else [])
 
     def told(self, left_out: Sequence[str], centers: str) -> Telling:
-        """Return what the terminal says.
-
-        Args:
-            left_out: images that are not in the output, with the reason.
-            centers: where the centers come from, in words.
-        """
+        """Return what the terminal says; `left_out` are images with the reason, `centers` their origin."""
         rows = [
             Row("not placed", left_out),
             *self.piece_rows(),
@@ -404,12 +388,7 @@ class CheckedFacts(FactsOfModel):
         return NextStep(text, f"sfm-shapefit locate {path} located{self.inputs.database_flag}")
 
     def told(self, cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Telling:
-        """Return what the terminal says.
-
-        Args:
-            cameras: rows of all images, with what is weak about them.
-            pairs: rows of the pairs that were looked at.
-        """
+        """Return what the terminal says, of cameras what is weak about them."""
         # One that the second opinion confirms is not told, whatever its weakness.
         doubted = (row for row in cameras if not row.placed or row.name in self.verdict.cameras)
         weak = [f"{row.name}: {row.reason}" for row in doubted if row.reason]

@@ -159,9 +159,7 @@ def folder_of(piece: int) -> str:
 def pieces_of(placement: Placement, solved: Iterable[tuple[int, str, int]]) -> list[Piece]:
     """Return the parallel-rigid pieces of three cameras or more, and the largest.
 
-    Args:
-        placement: the graph and its largest piece.
-        solved: number, scale and number of placed cameras of each piece that is solved.
+    Pieces that are `solved` have a number, a scale and a number of placed cameras.
     """
     facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
     n, graph = placement.num_cameras, placement.graph
@@ -197,12 +195,9 @@ class Delivered(Record):
 
     @classmethod
     def compare(cls, placement: Placement, centers: FloatArray, *, adjusted: bool) -> Self:
-        """Compare the delivered centers with the certified optimum.
+        """Compare the delivered centers (k, d), NaN for those that are left out, with the certified optimum.
 
-        Args:
-            placement: the solve and what was kept of it.
-            centers: (k, d) delivered centers of `placement.cameras`, NaN for those that are left out.
-            adjusted: whether a bundle adjustment came last.
+        The last step was a bundle adjustment, if `adjusted`.
         """
         solved, refined = placement.certified, placement.refined
         delivered = f"{refined.start}, refined in angles" if refined.is_refined else refined.start
@@ -377,11 +372,7 @@ def facts_of_placement(
 ) -> dict[str, Any]:
     """Return what can be said of any placement, by the fields of `PlacedFacts`; nodes count as images.
 
-    Args:
-        placement: the evidence.
-        cameras: a row of each.
-        solved: as of `pieces_of`.
-        measures: the focal length in pixels and the unit of positions.
+    Pieces are `solved` as of `pieces_of`; `measures` are focal length in pixels and unit of positions.
     """
     residuals, graph = residuals_deg(placement), placement.graph
     others = ("pycolmap", "numpy", "scipy", "clarabel")

@@ -175,9 +175,7 @@ class LocateResult(_Placed):
     """What became of the placement and of the given rotations, before any bundle adjustment; None if the
     placement stayed as it was found."""
     timings_s: dict[str, float]
-    """Wall-clock seconds per stage."""
     warnings: tuple[str, ...]
-    """What the user should know, a sentence each."""
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
     where it was kept; None if there was none."""
@@ -197,8 +195,7 @@ class LocateResult(_Placed):
     prior_fit: PriorFit | None = None
     """How well position priors fit the images and the `directions`; None where they do not set the scale."""
     num_seen: IntArray
-    """(n,) number of points that an image saw, where it was left out because they are too few, or hardly any
-    of those that its matches could make; -1 for all others."""
+    """(n,) number of points that an image saw, where it was left out because of it; -1 for all others."""
     unsupported: BoolArray
     """(n,) images hardly any of whose matches makes a point with a third image; left out too, unless the
     least trust is 0."""
@@ -393,7 +390,6 @@ class LocateResult(_Placed):
         }
 
     def _wrong_priors(self) -> dict[str, float]:
-        """Return the images whose position priors are wrong, and how far they are off."""
         fit = self.prior_fit
         return {} if fit is None else {self.images.names[k]: float(fit.off[k]) for k in fit.wrong.tolist()}
 
@@ -457,7 +453,6 @@ class LocateResult(_Placed):
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
-    """Return a pair's row with its direction in the output's axes."""
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
@@ -475,7 +470,6 @@ class GraphResult(_Placed):
     further: tuple[Judged, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
-    """Wall-clock seconds per stage."""
 
     @cached_property
     def facts(self) -> GraphFacts:
@@ -483,12 +477,11 @@ class GraphResult(_Placed):
         placement = self.placement
         solved = [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *self.further)]
         right = self.right_pairs
-        return GraphFacts(
+        return GraphFacts.taken_from(
+            self,
             **facts_of_placement(placement, self.cameras, solved, (math.nan, SOLVER_UNITS)),
-            verdict=self.verdict,
             options=flat_values(self.options),
             delivered=Delivered.compare(placement, placement.locations, adjusted=False),
-            timings_s=self.timings_s,
             warnings=list(graph_warnings(placement)),
             inputs=GraphInputs(graph=str(self.path), directions=self.statement),
             dimension=placement.graph.dimension,

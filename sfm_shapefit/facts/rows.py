@@ -140,13 +140,9 @@ def pair_rows(
     further: Sequence[Judged] = (),
     scores: Sequence[Mapping[str, float]] = (),
 ) -> list[PairRow]:
-    """Return one row per pair of cameras.
+    """Return one row per pair of cameras (m,), with its number of inlier matches, and `scores` as columns.
 
-    Args:
-        placement: the graph and its largest piece.
-        support: (m,) the pairs' number of inlier matches.
-        further: the other pieces that are solved; their pairs are judged by them.
-        scores: further columns of each pair (m,), if there are any.
+    Pairs of the `further` pieces that are solved are judged by these.
     """
     graph, groups = placement.graph, placement.groups
     judged: dict[int, tuple[Any, ...]] = {}

@@ -150,11 +150,7 @@ def axis_names(dimension: int) -> list[str]:
 
 
 def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
-    """Write records as CSV, at least one; numbers round-trip, NaN and None are empty fields.
-
-    Raises:
-        InputError: if the file cannot be written.
-    """
+    """Write records as CSV, at least one; numbers round-trip, NaN and None are empty fields."""
     _write_csv({name: [record[name] for record in records] for name in records[0]}, path)
 
 
@@ -214,11 +210,6 @@ def columns_of(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type[CameraRow] | type[PairRow], dimension: int
 ) -> dict[str, Column]:
     """Return an array for each column of cameras.csv or pairs.csv, by its name there.
-
-    Args:
-        rows: n rows of one type.
-        row_type: their type, also if there are none.
-        dimension: of the locations; a vector has so many columns, correlations one per two axes.
 
     Returns:
         n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is

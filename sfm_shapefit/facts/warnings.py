@@ -29,12 +29,8 @@ _MEDIAN_TURN = 1.538  # standard deviations; median angle of turns that are norm
 def wrong_rotations(turned_deg: FloatArray, sigma_deg: float) -> IntArray:
     """Return the images (k,) that turned by more than what was said and the scatter of most explain.
 
-    Args:
-        turned_deg: (n,) angles; NaN where unknown.
-        sigma_deg: how far off rotations were said to be about each axis.
-
-    Returns:
-        Their rows, the worst first.
+    The worst come first. Angles (n,) are NaN where unknown; rotations were said to be off by `sigma_deg`
+    about each axis.
     """
     typical = np.nanmedian(turned_deg) if np.isfinite(turned_deg).any() else 0.0
     rows = np.flatnonzero(turned_deg > _GROSS * max(typical / _MEDIAN_TURN, sigma_deg))

@@ -52,11 +52,7 @@ def act(
 ) -> LocateResult:
     """Place the images of a source, and once more where evidence against the result can be acted on.
 
-    Args:
-        place: from what is known of the images, and their matches, to a result.
-        given: what is known.
-        source: the images and their matches.
-        options: of the run.
+    `place` leads from what is known of the images, and their matches, to a result.
     """
     found = place(given, source)
     remedy = find_remedy(found, given, source, options)

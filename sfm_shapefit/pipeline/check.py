@@ -66,4 +66,4 @@ def _map_anew(
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
     doubted[[place.camera for place in best.evidence.places]] = True
-    return OtherModel(best.placed, fit_pairs(best.placed.centers, best.directions), doubted)
+    return best.placed, fit_pairs(best.placed.centers, best.directions), doubted

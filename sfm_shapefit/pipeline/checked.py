@@ -7,28 +7,17 @@ of the picture, or if more than a third of its pairs contradict it, and more tha
 A model is not to be used if its pairs say nothing of where its cameras stand, or for the evidence of
 `judgement.grade`; else its weak cameras are to be looked at.
 
-These limits are set by the bundled scenes (courtyard, photographed, ring8, facade9) and twelve models of
-COLMAP: fountain-P11, Herz-Jesus-P8 and P25, castle-P19 and P30, lego, liberty, a street of KITTI, a beach
-from a drone, a park by a rig of fisheyes (twice), a hall with robots. In all of them, sound as they are:
-
-    reprojection error     at most 1.74 times the usual; at most 0.67 px where twice the usual is below
-                           0.75 px (exact matches: 1e-11 px, 72 times the usual)
-    points, coverage       40 or more and 17 % or more, but in the park: from 11 and from 5 %
-    pairs that contradict  at most a third of a camera's; at courtyard, where a quarter of all pairs is
-                           wrong, 23 % in the median and 54 % at most; in the park 25 % in the median,
-                           70 % at most; lego has four cameras above a third, of five that are wrong
-
-Where a tenth of the cameras was moved by 0.2 % of the scene's extent, or turned by 0.2 degrees, their errors
-were 2.4 times the usual or more, but for one at facade9 and one at liberty (2.0 and 1.9) and for the park,
-whose wide lenses show it little. If a camera is moved by 1 %, 35 % or more of its pairs contradict it.
+The limits are set by the bundled scenes and twelve sound models of COLMAP, see "What `check` calls weak" in
+scripts/results/notes.md.
 """
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,7 +50,6 @@ if TYPE_CHECKING:
 
     from sfm_shapefit.report.drawing import Drawing
 
-# The header says what set these limits.
 _FEWEST_POINTS = 30  # points; an image that sees fewer is weak
 _LARGE_PX, _LARGE_OF_USUAL = 0.75, 2.0  # pixels and usual errors; an image whose error is above both is weak
 _LEAST_COVERAGE = 0.15  # share of the picture with points; an image with less is weak
@@ -73,7 +61,6 @@ class CheckResult(Reported, Tabled):
     """The verdict on a model, with the evidence for it."""
 
     model: ColmapModel
-    """The model as read."""
     cameras: list[CameraRow]
     """One row per image, those with a pose first; the reason says what is weak about a camera."""
     pairs: list[PairRow]
@@ -103,15 +90,9 @@ class CheckResult(Reported, Tabled):
         return f"{self.facts.num_placed} of {self.facts.num_images} images, {self.verdict.statement}"
 
 
-class OtherModel(NamedTuple):
-    """Another model of the same matches, to compare with."""
-
-    images: Images
-    """Where it has them."""
-    fits: PairFits
-    """How pairs fit it."""
-    doubted: BoolArray
-    """(n,) images that may stand elsewhere by their own matches."""
+OtherModel = tuple[Images, PairFits, BoolArray]
+"""Another model of the same matches, to compare with: where it has the images, how pairs fit it, and which
+images (n,) may stand elsewhere by their own matches."""
 
 
 def check_source(
@@ -121,19 +102,14 @@ def check_source(
     clock: Clock,
     other: OtherModel | None = None,
 ) -> CheckResult:
-    """Judge a model whose matches are open: measure, judge and grade it.
-
-    Args:
-        model: not changed.
-        matches: of its images.
-        options: how directions are measured.
-        clock: what it takes is added to its seconds.
-        other: for a second opinion.
-    """
+    """Judge a model whose matches are open: measure, judge and grade it; another is a second opinion."""
     with clock("points"):
-        structure = _structure(model)
+        pictures = ModelPictures(model.images, points2d_of(model.reconstruction, model.images))
+        structure = Structure(points_of(model.reconstruction, model.images), model.images, pictures)
         quality = image_quality(*structure[:3])
-    fits = _measure(model, matches, options, clock)
+    fits = None
+    with clock("directions"), suppress(UnsolvableError):  # no pair may share matches
+        fits = fit_pairs(model.images.centers, measure(matches, options, clock).directions)
     pairs, level_deg = ([], np.nan) if fits is None else (_tell_pairs(model.images, fits), fits.level_deg)
     with clock("evidence"):
         evidence = gather_evidence(matches, fits, structure, clock.threads)
@@ -150,17 +126,6 @@ def check_source(
     )
 
 
-def _measure(
-    model: ColmapModel, matches: MatchSource, options: DirectionOptions, clock: Clock
-) -> PairFits | None:
-    """Return how pairs fit where cameras stand; None where no pair shares matches."""
-    with clock("directions"):
-        try:
-            return fit_pairs(model.images.centers, measure(matches, options, clock).directions)
-        except UnsolvableError:
-            return None
-
-
 def _compare(
     matches: MatchSource, fits: PairFits, structure: Structure, other: OtherModel
 ) -> SecondOpinion | None:
@@ -172,12 +137,6 @@ def _compare(
         return second
     sure = ask_pixels(matches, structure, np.isin(np.arange(images.num_images), elsewhere))
     return second._replace(wrong=second.wrong[:0], undecided=second.undecided[:0]) if sure.any() else second
-
-
-def _structure(model: ColmapModel) -> Structure:
-    """Return the points of a model, and its images with their keypoints."""
-    pictures = ModelPictures(model.images, points2d_of(model.reconstruction, model.images))
-    return Structure(points_of(model.reconstruction, model.images), model.images, pictures)
 
 
 def _tell_pairs(images: Images, fits: PairFits) -> list[PairRow]:

@@ -157,12 +157,4 @@ def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) ->
     for visit in visits:
         first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
         if first[0] in among:
-            yield Loop(
-                first=first,
-                second=second,
-                num_pairs=visit.num_pairs,
-                num_matches=visit.num_matches,
-                num_refused=visit.num_refused,
-                angle_deg=visit.angle_deg,
-                tolerance_deg=visit.tolerance_deg,
-            )
+            yield Loop.taken_from(visit, first=first, second=second)

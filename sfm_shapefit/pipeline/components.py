@@ -90,10 +90,7 @@ class ComponentAveraging(NamedTuple):
     ) -> AveragedRotations:
         """Average rotations, by the arrangement of the frames that the matches speak for, and by gravity.
 
-        Args:
-            members: the frames.
-            inside: the pairs among them.
-            local: the same by their place among these.
+        The pairs among them are `inside`, and `local` by their place among the members.
         """
 
         def average(some: RelativeRotations) -> AveragedRotations:

@@ -95,7 +95,6 @@ def convert(
 
 
 def _format_of(path: Path) -> str:
-    """Return the format of a file by its suffix."""
     for name, one in FORMATS.items():
         if path.suffix.lower() in one.suffixes:
             return name

@@ -31,10 +31,8 @@ _LIKELY = 0.6
 """Robust weight of a pair as placed, from which a pair of very many is first tried as it is given: no other
 pose fits as many matches.
 
-On a made ring of 900 images, 1 % of the answers for right cameras are then off by more than 3.5 standard
-deviations, of trials 10 %: these end beside the best pose. Pairs turned by 0.5 to 3 degrees keep up to 6 % of
-the turn. On photographs (liberty-calibrated) some false pairs would be believed as they are given, so that
-where pairs are fewer all are asked without prejudice. 0.7 is as good on two made rings and a facade.
+Where pairs are fewer all are asked without prejudice, see "Pairs tried as they are given" in
+scripts/results/notes.md.
 """
 _AS_WELL = 0.95
 """Share of the robust weight with which `map` found a pair's pose; near that pose, with other intrinsics and
@@ -42,8 +40,7 @@ fewer matches, it is the answer again if it keeps as much. Other trials would en
 _MOST_PAIRS = 40
 """Pairs of a camera that are asked at most, those with most matches; a thousand take more than a second.
 
-Measured on a made facade and a made ring of 900 images, 60 of them turned: 33 pairs of each camera leave out
-the same cameras as all pairs; 15 and 6 do so on the facade, and on the ring one more, which is wrong.
+See "Pairs tried as they are given" in scripts/results/notes.md.
 """
 _MOST_ASKED = 30_000  # pairs of all cameras together; beyond 750 images each camera has fewer for it
 _FEWEST_PAIRS = 6  # pairs of a camera, however many cameras there are; see `_MOST_PAIRS`
@@ -114,11 +111,7 @@ def doubt_cameras(
 ) -> Judged:
     """Return the placement with a trust that follows what the pairs say of the rotations.
 
-    Args:
-        placement: of some of the images.
-        directions: of all pairs.
-        relative: what `ask_pairs` returned; if None, the given rotations are believed.
-        images: at the given rotations.
+    What `ask_pairs` returned is `relative`; if None, the given rotations are believed.
     """
     if relative is None:
         return replace(placement, assessment=believe_rotations(placement.assessment))
@@ -154,7 +147,7 @@ def confirm_rotations(source: MatchSource, directions: PairDirections, threads: 
     return np.array([kind is Doubt.RIGHT for kind in kinds])
 
 
-def _rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
+def rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
     """Return the rank of each entry among those of its label, by the keys, the first one first."""
     order = np.lexsort((*keys[::-1], labels))
     ranks = np.empty(len(labels), dtype=np.int64)
@@ -180,7 +173,7 @@ def _most_pairs(num_images: int) -> int:
 
 def _strongest(directions: PairDirections, num_images: int) -> BoolArray:
     """Return which pairs are among those of most matches of one of their cameras, (k,)."""
-    rank = _rank_within(directions.pairs.T.ravel(), np.tile(-directions.num_matches, 2))
+    rank = rank_within(directions.pairs.T.ravel(), np.tile(-directions.num_matches, 2))
     return np.asarray((rank < _most_pairs(num_images)).reshape(2, -1).any(axis=0))
 
 

@@ -100,9 +100,9 @@ def average_database(
     options = merge_options(options, MapOptions, overrides)
     clock = Clock.of(progress, options.placement.solver, executor)
     with closing(DatabaseFile(database_in(Path(database)))) as file:
-        measured = measure_run(start_run(file, options, clock, None))
-        run, reasons = measured.run, dict[int, str]()
-        components = list(run.average_images(measured.relative, reasons))
+        run, relative, *_ = measure_run(start_run(file, options, clock, None))
+        reasons: dict[int, str] = {}
+        components = list(run.average_images(relative, reasons))
         if not components:
             raise UnsolvableError(next(iter(reasons.values()), "no two images have a relative rotation"))
         _, members, averaging = max(components, key=lambda found: len(found[1]))

@@ -25,11 +25,9 @@ class Structure(NamedTuple):
     """The points of a model, and what they are seen with."""
 
     points: Points
-    """Points that the images see."""
     images: Images
     """Images where the model has them; NaN where it does not."""
     pictures: Pictures
-    """Keypoints and lenses of the images."""
     among: BoolArray | None = None
     """(i,) images that make the points; all if None."""
     asked: BoolArray | None = None
@@ -44,11 +42,7 @@ def gather_evidence(
 ) -> ModelEvidence:
     """Return the evidence against a model that its fit did not use.
 
-    Args:
-        source: the images, at the rotations of the model, and their matches.
-        fits: of all pairs, their directions measured at these rotations; None if there are none.
-        structure: the points of the model.
-        threads: number of threads to use.
+    Images and `fits`, those of all pairs, are at the rotations of the model; None if no pair has a direction.
     """
     points, images, pictures, among, asked = structure
     _, lenses = question_lenses(points, images, pictures, threads, among, _ask_some(images, asked))

@@ -16,12 +16,12 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Generic
+from typing import Any
 
 from sfm_shapefit.base.errors import MissingExtraError
-from sfm_shapefit.base.executors import Advance, Answer, WorkerError, answers
+from sfm_shapefit.base.executors import Answer, WorkerError, answers
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.scene.matches import MatchBatch, MatchPart, View
 
 MATCHES_PER_TASK = 1_000_000
@@ -29,41 +29,37 @@ MATCHES_PER_TASK = 1_000_000
 _RETRIES = 3  # times that dask gives a task to another worker; one that kills three is at fault itself
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairWork(Generic[Answer]):
-    """What to measure of the pairs of a database."""
-
-    estimate: Callable[[MatchBatch], Answer]
-    """A function of a module, or a `partial` of one, so that other processes find it."""
-    min_matches: int = 1
-    """Pairs with fewer are left out."""
-    matches_per_task: int = MATCHES_PER_TASK
-
-
 def measure_with_workers(
-    view: View, work: PairWork[Answer], executor: Executor, advance: Advance
+    view: View,
+    estimate: Callable[[MatchBatch], Answer],
+    clock: Clock,
+    min_matches: int = 1,
+    matches_per_task: int = MATCHES_PER_TASK,
 ) -> list[Answer]:
-    """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
+    """Return what the workers of the clock's executor measure of all pairs of a database, in their order.
 
-    The executor is not shut down; `advance` is told of the pairs that are done and of their number.
+    What estimates them is a function of a module, or a `partial` of one, so that other processes find it.
+    Pairs with fewer than `min_matches` are left out. The executor is not shut down.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
         InputError: as a worker found the database.
     """
+    assert clock.executor is not None
     found: list[Answer] = []
     done = 0
-    for part, measured in answers(executor, partial(measure_part, work), view.parts(work.matches_per_task)):
+    work = partial(measure_part, estimate, min_matches)
+    for part, measured in answers(clock.executor, work, view.parts(matches_per_task)):
         found += measured
         done += part.num_pairs
-        advance(done, view.num_pairs)
+        clock.advance(done, view.num_pairs)
     return found
 
 
-def measure_part(work: PairWork[Answer], part: MatchPart) -> list[Answer]:
-    """Return what is measured of the pairs of a part, a value per batch; what a worker runs."""
+def measure_part(estimate: Callable[[MatchBatch], Answer], min_matches: int, part: MatchPart) -> list[Answer]:
+    """Return what is measured of the pairs of a part with so many matches, a value per batch; in a worker."""
     with part.open() as view:
-        return [work.estimate(batch) for batch in view.batches(work.min_matches)]
+        return [estimate(batch) for batch in view.batches(min_matches)]
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm_shapefit.adjustment.bundle_adjustment import adjust_thinly
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.pipeline.clock import Clock
@@ -47,15 +47,10 @@ def adjust_first_placement(
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
-    Args:
-        given: what is known of the images; nothing of it sets a scale here but rigs.
-        source: at the averaged rotations.
-        options: of the run.
-        clock: of the run.
-        lenses_wanted, rotations_known: as in `adjust_thinly`.
+    Nothing that is known of them sets a scale here but rigs; `lenses_wanted` and `rotations_known` as in
+    `adjust_thinly`.
 
     Raises:
-        WorkerError: if a worker died and the executor does not replace it.
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
     images, is_free = source.images, given.rigid.groups is None  # rigid groups need few points
@@ -82,9 +77,11 @@ def adjust_first_placement(
     )
     rotations, centers = images.rotations.copy(), np.full((images.num_images, 3), np.nan)
     rotations[posed.rows], centers[posed.rows] = adjusted.images.rotations, adjusted.images.centers
-    is_posed = np.isin(np.arange(images.num_images), posed.rows)
-    near = Near(centers, placement.refined)
-    return FirstPlacement(adjusted, _turn_the_others(images.rotations, rotations, is_posed), near)
+    # Images without a place keep their averaged rotations, in the axes that the others have now.
+    there = np.isfinite(centers).all(axis=1)
+    common = mean_rotation_l1(images.rotations[there].transpose(0, 2, 1) @ rotations[there])
+    rotations[~there] = images.rotations[~there] @ common
+    return FirstPlacement(adjusted, rotations, Near(centers, placement.refined))
 
 
 def start_from_first(
@@ -112,9 +109,3 @@ def start_from_first(
     source = source.at(images.turned_to(first.rotations))
     rigid = find_rigid_parts(source.images)
     return given._replace(rigid=rigid, intrinsics=intrinsics), source, first
-
-
-def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:
-    """Return the adjusted rotations of the `posed`, and those of the others in the same axes."""
-    common = mean_rotation_l1(averaged[posed].transpose(0, 2, 1) @ adjusted[posed])
-    return np.where(posed[:, None, None], adjusted, averaged @ common)

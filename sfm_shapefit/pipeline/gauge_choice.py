@@ -8,7 +8,6 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError, UnsolvableError
-from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.pipeline.rigs import Rigid
 from sfm_shapefit.placement.gauge import (
     Gauge,
@@ -38,11 +37,7 @@ SETS_SCALE: dict[ScaleKind, str] = {
 
 
 def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str], missing: str) -> None:
-    """Refuse known distances of images that there are not; `missing` says so, but for the name.
-
-    Raises:
-        InputError: with the first such name.
-    """
+    """Refuse known distances of images that there are not; `missing` says so, but for the name."""
     for name in (name for one in known for name in one[:2]):
         if name not in names:
             raise InputError(f"known distances: {missing} {name}")
@@ -69,10 +64,6 @@ class GaugeRule(NamedTuple):
             cameras: (k,) those in the output, ascending.
             locations: (k, 3) where they are, in axes of the input.
             unit: length of the unit of rigid groups in the locations' units; None without such groups.
-
-        Raises:
-            InputError: if what is known does not determine the scale.
-            UnsolvableError: if the only fixed image is not among the cameras.
         """
         images, rigid = self.images, self.rigid
         centers, fixed = images.centers[cameras], rigid.fixed[cameras]
@@ -128,18 +119,8 @@ def off_by(scale: float) -> str:
     return f"they differ by {100.0 * abs(scale - 1.0):.3g} %"
 
 
-def restore_axes(given: Images, adjusted: Images, cameras: IntArray) -> FloatArray:
-    """Return the turn of the world (3, 3) that brings some adjusted rotations closest to those given."""
-    return mean_rotation_l1(given.rotations[cameras].transpose(0, 2, 1) @ adjusted.rotations[cameras])
-
-
 def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Sequence[KnownDistance]) -> Gauge:
-    """Return the gauge of known distances of cameras, by their names; those that are not there say nothing.
-
-    Raises:
-        InputError: if the cameras of a distance coincide.
-        UnsolvableError: if of each distance an image is not among the cameras.
-    """
+    """Return the gauge of known distances of cameras, by name; those that are not there say nothing."""
     place_of = {name: place for place, name in enumerate(names)}
     there = [one for one in known if {*one[:2]} <= place_of.keys()]
     if not there:

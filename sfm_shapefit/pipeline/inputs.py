@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.facts.options import PlacingOptions, Source
+from sfm_shapefit.facts.options import InspectOptions, PlacingOptions, Source
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import DatabaseMatches, find_database, open_database
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
@@ -29,7 +29,6 @@ class MatchSource:
     view: View
     """How the images see them, but for the pairs that are left out."""
     inputs: Inputs
-    """Where they come from."""
     economy: Economy = ECONOMIES[0]
     fixed: BoolArray | None = None
     """(i,) images that stay where they are; None if none does."""
@@ -63,7 +62,7 @@ class MatchSource:
         view = self.matches.at(images, self.inputs.left_out, economy.reading)
         return replace(self, view=view, economy=economy)
 
-    def workload(self) -> Workload:
+    def workload(self, options: PlacingOptions | InspectOptions) -> Workload:
         """Return what is known of the work before any direction is measured."""
         view, num_images = self.view, self.images.num_images
         return Workload(
@@ -73,15 +72,13 @@ class MatchSource:
             num_matches=view.num_matches,
             num_edges=view.num_pairs,
             num_nodes=num_images,
+            adjusts=options.placement.refines and options.freedom.adjusts_cameras(num_images),
+            adjusts_bundle=options.freedom.adjust == "full",
         )
 
 
 def open_matches(model: ColmapModel, inputs: Inputs) -> DatabaseMatches | TrackMatches:
-    """Open the matches that were chosen.
-
-    Raises:
-        InputError: if they cannot be read.
-    """
+    """Open the matches that were chosen."""
     if inputs.database is None:
         return TrackMatches(model)
     return open_database(inputs.database, model.images.names)
@@ -90,19 +87,11 @@ def open_matches(model: ColmapModel, inputs: Inputs) -> DatabaseMatches | TrackM
 def see_matches(
     matches: Matches, images: Images, inputs: Inputs, options: PlacingOptions | None = None
 ) -> MatchSource:
-    """Return the matches as images see them; without options memory has no limit.
-
-    Raises:
-        InputError: if there is no way to stay below the limit.
-    """
+    """Return the matches as images see them; without options memory has no limit."""
     source = MatchSource(matches=matches, view=matches.at(images, inputs.left_out), inputs=inputs)
     if options is None or not options.memory.max_memory_mb or not source.has_database:
         return source
-    bare = replace(
-        source.workload(),
-        adjusts=options.placement.refines and options.freedom.adjusts_cameras(images.num_images),
-        adjusts_bundle=options.freedom.adjust == "full",
-    )
+    bare = source.workload(options)
     work = replace(bare, has_points=options.nodes.uses_points(images.num_images))
     return source.at(images, choose_economy(work, bare, options.memory.max_memory_mb))
 

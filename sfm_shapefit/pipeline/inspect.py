@@ -71,8 +71,7 @@ def inspect(
         with clock("diagnosis"):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
             grouped = find_rigid_parts(images).apply(with_points)
-            work = count_work(matches, directions)
-            work = describe_work(grouped, work, options.placement, options.freedom)
+            work = describe_work(grouped, count_work(matches, directions, options), options.placement)
             confirmed = confirm_rotations(matches, directions, clock.threads)
             return Inspection(
                 directions=inputs.statement,

@@ -27,15 +27,8 @@ def settle_intrinsics(
 ) -> tuple[Images, RefinedIntrinsics]:
     """Return the images to start from, lenses in doubt marked, and what adjustments may change of these.
 
-    Args:
-        images: as given.
-        file: the database, if there is one, which says which intrinsics are guesses.
-        wanted: intrinsics that may change.
-        left_out: pairs that say nothing of focal lengths.
-        listed: ids of lenses whose focal lengths are guesses of a list of poses.
-
-    Raises:
-        InputError: if the database cannot be read.
+    The database, if there is one, says which intrinsics are guesses, and so are those of lenses whose ids are
+    `listed`; pairs that are left out say nothing of focal lengths.
     """
     guessed = {} if file is None else find_uncalibrated(file, images, listed)
     lenses, factors = list(images.lenses), np.ones(len(images.lenses))

@@ -6,7 +6,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,13 +21,12 @@ from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
-from sfm_shapefit.facts.result import Inputs
-from sfm_shapefit.files.colmap.database import find_database, open_database
+from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.merge import merge_models
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.pipeline.adjust import bundle_adjust
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.inputs import open_source, read_left_out
+from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.joined import JoinedGroup, Told, tell_group
 from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces, tie_pieces
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
@@ -73,7 +72,9 @@ def join(
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
         pieces = _read(models)
-        inputs = _inputs(models, database)
+        inputs = choose_inputs(models[0], database)
+        if inputs.database is None:
+            inputs = replace(inputs, statement="images that the models share")
         names = sorted({name for piece in pieces for name in piece.model.images.names})
         inputs = read_left_out(inputs, names, options.directions.without)
     with ExitStack() as stack:
@@ -122,24 +123,11 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
             f"{pieces[rigs.index(True)].label} has rigs of several cameras, and a scale by that, but "
             f"{pieces[rigs.index(False)].label} has none; give both the same rigs"
         )
-    return [
-        ModelPiece(label=one.label, model=one.model, scale_sigma=0.0 if any(rigs) else None) for one in pieces
-    ]
-
-
-def _inputs(models: "Sequence[pycolmap.Reconstruction | Path | str]", database: Path | str | None) -> Inputs:
-    """Return where matches come from."""
-    folder = Path(models[0]) if isinstance(models[0], Path | str) else None
-    found = find_database(folder) if folder is not None and database is None else None
-    path = found if database is None else Path(database)
-    statement = "images that the models share" if path is None else f"inlier matches of {path}"
-    return Inputs(folder=folder, database=path, statement=statement)
+    return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
 
 
 def _opened(pieces: Sequence[ModelPiece], database: Path, names: Sequence[str]) -> Any:
     """Open a database, and refuse one that knows no image of a model."""
-    from contextlib import closing
-
     matches = open_database(database, names)
     missing = {*matches.missing_names}
     for piece in pieces:
@@ -155,13 +143,7 @@ def _opened(pieces: Sequence[ModelPiece], database: Path, names: Sequence[str]) 
 def judge_joins(
     pieces: Sequence[ModelPiece], tied: TiedPieces, priors: Sequence[PositionPriors | None] = ()
 ) -> Iterator[Joined]:
-    """Yield what comes of joining each piece but the first: by pairs, or else by position priors.
-
-    Args:
-        pieces: the pieces.
-        tied: their cameras and ties.
-        priors: of the cameras of each piece, if there are any.
-    """
+    """Yield what comes of joining each piece but the first: by pairs, or else by `priors` of its cameras."""
     found = join_pieces(tied.cameras, tied.ties)
     usable = [] if tied.cameras.is_metric.any() else priors
     placed = [_on_priors(tied.cameras.centers_of(k), one) for k, one in enumerate(usable)]
@@ -247,48 +229,46 @@ class _Growing:
         """Take in a piece that was joined to one of the group."""
         assert done.join is not None
         world_from = compose(self.group.world_from[done.to], done.join.to_from_piece)
-        merged, renamed, new = merge_models(
-            self.group.reconstruction, piece.model.reconstruction, world_from, self._same_points(done, tied)
-        )
+        worlds = {**self.group.world_from, done.model: world_from}
+        same = self._same_points(done.join, worlds, tied)
+        ours, theirs = self.group.reconstruction, piece.model.reconstruction
+        merged, renamed, new = merge_models(ours, theirs, world_from, same)
         for number, ids in self.ids.items():
             self.ids[number] = {point: renamed.get(now, now) for point, now in ids.items()}
         self.ids[done.model] = new
-        worlds = {**self.group.world_from, done.model: world_from}
         ends = [np.flatnonzero(tied.cameras.piece_of == k)[:2] for k in (done.model, done.to)]
         names = dict.fromkeys(tied.names[v] for v in np.concatenate(ends).tolist())
         known = (*self.group.tied, *itertools.combinations(names, 2))
         self.group = JoinedGroup(merged, worlds, (*self.group.joins, done), known)
 
-    def _fits(self, tied: TiedPieces, pair: int, done: Joined) -> BoolArray:
-        """Return which matches of a pair see, from each side, the point that the other side has."""
-        assert done.join is not None
-        rows, ties = slice(*tied.ties.matches.offsets[pair : pair + 2].tolist()), tied.ties.matches
-        off = np.zeros(rows.stop - rows.start)
-        ends = ties.pairs[pair].tolist()
-        newest = compose(self.group.world_from[done.to], done.join.to_from_piece)
-        worlds = {**self.group.world_from, done.model: newest}
-        own = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
-        for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):
-            seen = own[1 - way].apply(tied.ties.points[rows, 1 - way])
-            eye = own[way].apply(tied.cameras.centers[ends[way]][None])
-            looks = rays @ tied.cameras.rotations[ends[way]] @ own[way].rotation.T
-            off = np.maximum(off, angle_between(seen - eye, looks))
-        return np.asarray(off <= AGREEING_PX * ties.pixel_angles[pair])
-
-    def _same_points(self, done: Joined, tied: TiedPieces) -> list[tuple[int, int]]:
+    def _same_points(
+        self, join: PieceJoin, worlds: Mapping[int, Similarity], tied: TiedPieces
+    ) -> list[tuple[int, int]]:
         """Return points of the group and of a new piece that are one by the pairs that agree; each once."""
-        assert done.join is not None
         pieces = tied.cameras.piece_of[tied.ties.matches.pairs]
         same: dict[int, int] = {}
-        for pair in done.join.agreeing.tolist():
-            rows = slice(*tied.ties.matches.offsets[pair : pair + 2].tolist())
-            way = int(pieces[pair, 1] == done.model)
+        for pair in join.agreeing.tolist():
+            way = int(pieces[pair, 1] == join.piece)
             other = int(pieces[pair, 1 - way])
             if other not in self.ids:
                 continue
-            fits = self._fits(tied, pair, done)
+            rows, fits = _fitting(tied, pair, worlds)
             for ids in tied.keypoints[rows][fits].tolist():
                 one = self.ids[other].get(ids[1 - way])
                 if one is not None and ids[way] >= 0 and one not in same.values():
                     same.setdefault(ids[way], one)
         return [(one, other) for other, one in same.items()]
+
+
+def _fitting(tied: TiedPieces, pair: int, worlds: Mapping[int, Similarity]) -> tuple[slice, BoolArray]:
+    """Return the matches of a pair, and which of them see, from each side, the point of the other side."""
+    ties = tied.ties.matches
+    rows = slice(*ties.offsets[pair : pair + 2].tolist())
+    off, ends = np.zeros(rows.stop - rows.start), ties.pairs[pair].tolist()
+    own = [worlds[int(tied.cameras.piece_of[v])] for v in ends]
+    for way, rays in enumerate((ties.rays_i[rows], ties.rays_j[rows])):
+        seen = own[1 - way].apply(tied.ties.points[rows, 1 - way])
+        eye = own[way].apply(tied.cameras.centers[ends[way]][None])
+        looks = rays @ tied.cameras.rotations[ends[way]] @ own[way].rotation.T
+        off = np.maximum(off, angle_between(seen - eye, looks))
+    return rows, np.asarray(off <= AGREEING_PX * ties.pixel_angles[pair])

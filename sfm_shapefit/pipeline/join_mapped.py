@@ -1,7 +1,6 @@
 """The models of `map` joined, as `join` joins any, and by position priors of their images too."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,21 +18,17 @@ from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from sfm_shapefit.scene.given import PositionPriors
 
 
-class JoinedModels(NamedTuple):
-    """What came of joining models."""
+def join_mapped(
+    models: Sequence[MappedModel], run: MapRun
+) -> tuple[tuple[Joined, ...], tuple[JoinedModel, ...], tuple[str, ...]]:
+    """Join the models of a run, largest first, where that is safe and wanted.
 
-    joins: tuple[Joined, ...] = ()
-    """One for each model but the largest."""
-    joined: tuple[JoinedModel, ...] = ()
-    """Models in one world, larger ones first; none where nothing was joined."""
-    warnings: tuple[str, ...] = ()
-    """What was told and could not be used for it, a sentence each."""
-
-
-def join_mapped(models: Sequence[MappedModel], run: MapRun) -> JoinedModels:
-    """Join the models of a run, largest first, where that is safe."""
-    if len(models) < 2:
-        return JoinedModels()
+    Returns:
+        What came of joining each model but the largest, the models in one world, larger ones first, and what
+        was told and could not be used for it, a sentence each.
+    """
+    if len(models) < 2 or run.options.join == "never":
+        return (), (), ()
     located = {number: model.located for number, model in enumerate(models)}
     pieces = [
         ModelPiece(
@@ -53,7 +48,7 @@ def join_mapped(models: Sequence[MappedModel], run: MapRun) -> JoinedModels:
     for group in merge_groups(pieces, tied, joins):
         source = see_matches(run.matches, read_model(group.reconstruction).images, inputs)
         joined.append(tell_group(group, told, source, options.directions, run.clock.anew()))
-    return JoinedModels(tuple(joins), tuple(joined), tuple(warnings))
+    return tuple(joins), tuple(joined), tuple(warnings)
 
 
 def _priors_of(

@@ -77,15 +77,7 @@ class JoinedGroup(NamedTuple):
 def tell_group(
     group: JoinedGroup, told: Told, source: MatchSource, options: DirectionOptions, clock: Clock
 ) -> JoinedModel:
-    """Return joined models with what can be said of them.
-
-    Args:
-        group: the models.
-        told: what is known beside.
-        source: of the matches of the models' images.
-        options: how directions are measured.
-        clock: what it takes is added to its seconds.
-    """
+    """Return joined models with what can be said of them; `source` has the matches of their images."""
     first, located = next(iter(group.world_from)), told.located
     labels = {
         k: label for one in group.joins for k, label in zip((one.model, one.to), one.labels, strict=True)
@@ -93,8 +85,7 @@ def tell_group(
     folder = f"joined_{first}" if located else "."
     gauge = Gauge(scale="input", similarity=_SAME, statement="input: those of the first model")
     if first in located:
-        gauge, rescale = _choose_scale(group, located[first].gauge, told.distances)
-        group = _rescaled(group, rescale)
+        gauge, group = _choose_scale(group, located[first].gauge, told.distances)
     model = read_model(group.reconstruction)
     rows = {name: k for k, name in enumerate(model.images.names)}
     tied = np.array([(rows[a], rows[b]) for a, b in group.tied], dtype=np.int64).reshape(-1, 2)
@@ -132,8 +123,8 @@ def tell_group(
 
 def _choose_scale(
     group: JoinedGroup, first: Gauge, known: Sequence[KnownDistance]
-) -> tuple[Gauge, Similarity | None]:
-    """Return the gauge of joined models, and the similarity that leads to it, if it is not the first one's.
+) -> tuple[Gauge, JoinedGroup]:
+    """Return the gauge of joined models, and the models in it.
 
     A scale that the first model knows stays. An arbitrary one gives way to known distances, be they within
     one of the models or between two.
@@ -149,18 +140,13 @@ def _choose_scale(
         except InputError as error:  # two cameras stand in one place
             warning = str(error)
         else:
-            return gauge, gauge.similarity
-    return replace(first, statement=f"that of model {number}: {first.statement}", warning=warning), None
-
-
-def _rescaled(group: JoinedGroup, similarity: Similarity | None) -> JoinedGroup:
-    """Return the models under a similarity of their world."""
-    if similarity is None:
-        return group
-    return group._replace(
-        reconstruction=transform_model(group.reconstruction, similarity),
-        world_from={number: compose(similarity, one) for number, one in group.world_from.items()},
-    )
+            world = group.world_from.items()
+            return gauge, group._replace(
+                reconstruction=transform_model(group.reconstruction, gauge.similarity),
+                world_from={number: compose(gauge.similarity, one) for number, one in world},
+            )
+    statement = f"that of model {number}: {first.statement}"
+    return replace(first, statement=statement, warning=warning), group
 
 
 def _camera_rows(

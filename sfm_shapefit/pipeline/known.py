@@ -6,7 +6,6 @@ line in each of the two functions here.
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -40,11 +39,7 @@ def read_known(
     control_points: str = "",
     gravity: str = "",
 ) -> Known:
-    """Return what the user tells of images: position priors, control points, gravity, as far as asked for.
-
-    Raises:
-        InputError: if something is asked for and cannot be read, or there is none of these images.
-    """
+    """Return what the user tells of images: position priors, control points, gravity, as far as asked for."""
     return Known(
         priors=None if priors is None else _read_priors(images, file, priors),
         control=_read_control(images, control_points) if control_points else None,
@@ -52,20 +47,16 @@ def read_known(
     )
 
 
-class BroughtToKnown(NamedTuple):
-    """A model after what the user told has set its axes, and what is said of it."""
-
-    seeded: Seeded
-    control_points: tuple[ControlPoint, ...]
-    """A row for each control point."""
-    warnings: tuple[str, ...]
-
-
-def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool) -> BroughtToKnown:
+def bring_to_known(
+    seeded: Seeded, known: Known, options: StructureOptions, *, moves: bool
+) -> tuple[Seeded, tuple[ControlPoint, ...], list[str]]:
     """Return a model in scale and axes of control points, or with z up by gravity, where these are known.
 
     Points that cannot tell scale and axes leave the model as it is, and so do all where the model is not to
     move: they check its scale then.
+
+    Returns:
+        The model, a row for each control point, and what to warn of.
     """
     rows, warnings = list[ControlPoint](), list[str]()
     if known.control is not None:
@@ -73,7 +64,7 @@ def bring_to_known(seeded: Seeded, known: Known, options: StructureOptions, *, m
     if known.gravity is not None:
         seeded, more = _turn_upright(seeded, known.gravity)
         warnings += more
-    return BroughtToKnown(seeded, tuple(rows), tuple(warnings))
+    return seeded, tuple(rows), warnings
 
 
 def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -> PositionPriors:

@@ -9,7 +9,7 @@ Images that the averaging drops form components of their own.
 from concurrent.futures import Executor
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.settings import merge_options
@@ -21,7 +21,7 @@ from sfm_shapefit.pairs.options import LEAST_MATCHES
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.component import locate_components, refine_intrinsics
-from sfm_shapefit.pipeline.join_mapped import JoinedModels, join_mapped
+from sfm_shapefit.pipeline.join_mapped import join_mapped
 from sfm_shapefit.pipeline.map_run import MapRun, start_run
 from sfm_shapefit.rotations.sequences import Videos, Visit
 
@@ -78,10 +78,8 @@ def map_opened(
     models = locate_components(run, relative, visits, reasons)
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
-    found = JoinedModels((), ())
-    if options.join == "safe":
-        with clock("join"):
-            found = join_mapped(models, run)
+    with clock("join"):
+        joins, joined, told = join_mapped(models, run)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)
@@ -91,8 +89,8 @@ def map_opened(
         database=path,
         options=options,
         models=tuple(models),
-        joins=found.joins,
-        joined=found.joined,
+        joins=joins,
+        joined=joined,
         num_images=run.images.num_images,
         num_pairs=len(relative.pairs),
         num_video_frames=videos.num_frames,
@@ -100,34 +98,28 @@ def map_opened(
         timings_s=clock.seconds,
         warnings=(
             *map_warnings(run.read.rigs.incomplete, models, left_out),
-            *found.warnings,
-            *lost_distances(options.gauge.known_distance, models, found.joined),
+            *told,
+            *lost_distances(options.gauge.known_distance, models, joined),
         ),
     )
     return tell_joins(result)
 
 
-class MeasuredPairs(NamedTuple):
-    """What the averaging works from."""
+def measure_run(run: MapRun) -> tuple[MapRun, RelativeRotations, Videos, tuple[Visit, ...]]:
+    """Return the relative rotations of all pairs that are believed, videos, and visits.
 
-    run: MapRun
-    """With scores of the pairs, and without refused ones."""
-    relative: RelativeRotations
-    videos: Videos
-    visits: tuple[Visit, ...]
-
-
-def measure_run(run: MapRun) -> MeasuredPairs:
-    """Return the relative rotations of all pairs that are believed."""
+    The run knows scores of the pairs then, and which ones are refused.
+    """
     relative = run.measure()
-    if run.options.freedom.adjust != "none" and run.share_of_doubted_lenses() >= _MANY_DOUBTED:
+    doubted = run.intrinsics.focal[run.images.lens_of]
+    if run.options.freedom.adjust != "none" and doubted.mean() >= _MANY_DOUBTED:
         known = refine_intrinsics(run, relative)
         if known.differ_in_rays(run.images):
             run = run._replace(images=known)
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)
-    return MeasuredPairs(run.score_pairs(relative), relative, videos, visits)
+    return run.score_pairs(relative), relative, videos, visits
 
 
 def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:

@@ -25,7 +25,7 @@ from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.known import read_known
-from sfm_shapefit.pipeline.relative_rotations import Sharing, measure_rotations
+from sfm_shapefit.pipeline.relative_rotations import measure_rotations
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
@@ -37,11 +37,7 @@ _MOST_SCORED_PAIRS = 20_000  # pairs; scores of more are not worth 0.2 ms a pair
 
 
 def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Path | str | None) -> "MapRun":
-    """Read what a run works from.
-
-    Raises:
-        InputError: if the database, or a file that the options name, cannot be used.
-    """
+    """Read what a run works from: the database, and the files that the options name."""
     path = file.path
     with clock("read"):
         read = read_images(file)
@@ -85,8 +81,7 @@ class MapRun(NamedTuple):
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
-            sharing = Sharing(self.clock.threads, self.clock.executor, self.clock.advance)
-            return measure_rotations(self.view(), LEAST_MATCHES, sharing)
+            return measure_rotations(self.view(), LEAST_MATCHES, self.clock)
 
     def view(self) -> View:
         """Return the matches of all images in axes of their cameras, but for the pairs that are left out."""
@@ -128,10 +123,6 @@ class MapRun(NamedTuple):
                     rows = rows_of_pairs(batch.pairs, relative.pairs)
                     scores[rows[rows >= 0], 1] = matched_shares(pixels, sizes, partners, batch)[rows >= 0]
         return self._replace(scores=PairScores(relative.pairs, scores))
-
-    def share_of_doubted_lenses(self) -> float:
-        """Return the share of images whose intrinsics are in doubt."""
-        return float(np.mean(self.intrinsics.focal[self.images.lens_of]))
 
     def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]

@@ -10,6 +10,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import SIGMA_PER_MEDIAN
+from sfm_shapefit.facts.options import InspectOptions, PlacingOptions
 from sfm_shapefit.graph.measured import Evidence, MeasuredGraph
 from sfm_shapefit.graph.rigidity import is_parallel_rigid
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -18,7 +19,7 @@ from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.memory import Workload
 from sfm_shapefit.placement.conditioning import direction_spread
@@ -93,8 +94,7 @@ def measure(
     """
     beside, without = _Beside(source, options.inlier_threshold_px, wanted), source.pairs_of_fixed
     if clock.executor is not None and source.has_database:
-        work = PairWork(estimate=partial(estimate_directions, options=options))
-        parts = measure_with_workers(source.view, work, clock.executor, clock.advance)
+        parts = measure_with_workers(source.view, partial(estimate_directions, options=options), clock)
         if without is not None and parts:
             every = concatenate(parts)
             parts = [every.subset(np.flatnonzero(~is_among(every.pairs, without)))]
@@ -226,12 +226,14 @@ def _is_held_by_pairs(graph: ViewGraph) -> bool:
     return bool(is_spread) and is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension)
 
 
-def count_work(source: MatchSource, directions: PairDirections) -> Workload:
+def count_work(
+    source: MatchSource, directions: PairDirections, options: PlacingOptions | InspectOptions
+) -> Workload:
     """Return the work to do, as far as it is known once the directions are measured."""
     usable = directions.usable()
     is_few = len(usable) <= _MAX_SAMPLED_PAIRS and len(directions.pairs) <= _MOST_PAIRS
     return replace(
-        source.workload(),
+        source.workload(options),
         num_pairs=len(directions.pairs),
         num_matches=int(directions.num_matches.sum()),
         num_sampled=len(usable) if source.economy.samples and is_few else 0,

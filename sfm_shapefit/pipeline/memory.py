@@ -20,7 +20,6 @@ from sfm_shapefit.files.colmap.database import MOST_KEYPOINTS, PIXEL_BYTES
 from sfm_shapefit.files.colmap.sorted_matches import MATCH_BYTES, MOST_MATCHES
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.scene.matches import KEPT_MATCHES, MOST_BESIDE_TRACKS, PLENTY, Reading
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method, plan_factor
@@ -141,14 +140,7 @@ def keep_within_memory(
 ) -> tuple[Economy, MeasuredGraph]:
     """Return what is given up, `least` or more, to stay below a limit that is not 0, and the graph then.
 
-    Args:
-        measured: graph to be placed.
-        describe: returns the work that a graph makes.
-        limit_mb: peak memory in MB to stay below.
-        least: what is given up already.
-
-    Raises:
-        InputError: with the number needed, if there is no way.
+    `describe` returns the work that a graph makes.
     """
     if not limit_mb:
         return least, measured
@@ -157,9 +149,7 @@ def keep_within_memory(
     return economy, measured if economy.points else bare
 
 
-def describe_work(
-    measured: MeasuredGraph, work: Workload, placement: PlacementOptions, freedom: FreedomOptions
-) -> Workload:
+def describe_work(measured: MeasuredGraph, work: Workload, options: PlacementOptions) -> Workload:
     """Return the work that is left once the graph is known: its factor is planned, nothing is solved.
 
     `work` is all of it but for the graph.
@@ -168,8 +158,8 @@ def describe_work(
     needs_factor = measured.groups is not None
     if graph.num_edges:
         plan = plan_factor(measured)
-        needs_factor = needs_factor or choose_method(graph, placement.solver).method == "newton"
-        max_bytes = np.inf if needs_factor else placement.solver.factor_bytes
+        needs_factor = needs_factor or choose_method(graph, options.solver).method == "newton"
+        max_bytes = np.inf if needs_factor else options.solver.factor_bytes
         if plan is not None and plan.num_bytes(graph.dimension, np.float64) <= max_bytes:
             entries = plan.num_bytes(1, np.uint8)
     return replace(
@@ -178,8 +168,6 @@ def describe_work(
         num_nodes=graph.num_nodes,
         num_sampled=graph.num_edges if work.num_sampled else 0,
         has_points=measured.num_points > 0,
-        adjusts=placement.refines and freedom.adjusts_cameras(work.num_images),
-        adjusts_bundle=freedom.adjust == "full",
         factor_entries=entries,
         needs_factor=needs_factor,
     )

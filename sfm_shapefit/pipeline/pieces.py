@@ -58,12 +58,9 @@ class _Tie(NamedTuple):
 
 
 def tie_pieces(pieces: Sequence[ModelPiece], matches: Matches | None, left_out: PairNames) -> TiedPieces:
-    """Return what ties pieces to one another.
+    """Return what ties pieces to one another: matches of their images, but for pairs that are left out.
 
-    Args:
-        pieces: the first is the world.
-        matches: of images of theirs; None if there are none beside the images that they share.
-        left_out: pairs of images whose matches count for nothing.
+    Without matches, images that they share tie them.
     """
     seen = _Seen(pieces)
     found = list(seen.shared())

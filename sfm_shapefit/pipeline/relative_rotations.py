@@ -4,15 +4,14 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
@@ -28,7 +27,8 @@ from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import LEAST_MATCHES, DirectionOptions
 from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.execution import PairWork, measure_with_workers
+from sfm_shapefit.pipeline.doubts import rank_within
+from sfm_shapefit.pipeline.execution import measure_with_workers
 from sfm_shapefit.rotations.average import average_relative_rotations
 from sfm_shapefit.scene.matches import RayMatches, View
 from sfm_shapefit.solver.options import SolverOptions
@@ -47,16 +47,6 @@ class DatabaseRotations(RelativeRotations):
 
     names: tuple[str, ...]
     """(n,) all images of the database, by name in ascending order; `pairs` are positions in this list."""
-
-
-class Sharing(NamedTuple):
-    """Among whom work is shared out, and who hears of it."""
-
-    threads: int = 1
-    executor: Executor | None = None
-    """Its workers do the work instead of threads."""
-    advance: Advance = nobody
-    """Called with the pairs that are done and their number."""
 
 
 def relative_rotations(
@@ -99,11 +89,10 @@ def relative_rotations(
     with clock("relative rotations"), closing(DatabaseFile(database)) as file:
         images = read_images(file).images
         view = DatabaseMatches(file, images.names).at(images.apart())
-        sharing = Sharing(clock.threads, executor, clock.advance)
         if source == "stored":
             found = stored_relative_rotations(view, min_matches)
         else:
-            found = measure_rotations(view, min_matches, sharing)
+            found = measure_rotations(view, min_matches, clock)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=images.names)
 
@@ -111,31 +100,28 @@ def relative_rotations(
 def measure_rotations(
     view: View,
     min_matches: int = LEAST_MATCHES,
-    sharing: Sharing | None = None,
+    clock: Clock | None = None,
 ) -> RelativeRotations:
     """Return relative rotations estimated from matches; pairs are indices into the view's images.
 
-    Args:
-        view: of images in axes of their cameras, see `Images.apart`.
-        min_matches: pairs with fewer inlier matches are left out.
-        sharing: one thread if None.
+    The images are in axes of their cameras, see `Images.apart`.
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    sharing = sharing or Sharing()
+    clock = clock or Clock()
     are_many = have_many_pairs(view.images.num_images, view.num_pairs)
     estimate = partial(estimate_relative_rotations, are_many=are_many)
     if are_many:
-        some = estimate_here(view, estimate, sharing, min_matches, without=_all_but_some(view))
-        averaged = average_relative_rotations(view.images.num_images, some, sharing.threads)
+        some = estimate_here(view, estimate, clock, min_matches, without=_all_but_some(view))
+        averaged = average_relative_rotations(view.images.num_images, some, clock.threads)
         known = np.where(averaged.registered[:, None, None], averaged.rotations, np.nan)
         estimate = partial(estimate_near, are_many=are_many, rotations=known)
-    if sharing.executor is None:
-        return estimate_here(view, estimate, sharing, min_matches)
-    work = PairWork(estimate=estimate, min_matches=min_matches, matches_per_task=_MATCHES_PER_TASK)
-    return concatenate_rotations(measure_with_workers(view, work, sharing.executor, sharing.advance))
+    if clock.executor is None:
+        return estimate_here(view, estimate, clock, min_matches)
+    parts = measure_with_workers(view, estimate, clock, min_matches, _MATCHES_PER_TASK)
+    return concatenate_rotations(parts)
 
 
 def estimate_near(
@@ -155,13 +141,7 @@ def estimate_near(
     rays_i, own = np.empty_like(batch.rays_i), itertools.pairwise(batch.offsets.tolist())
     for (first, last), turn in zip(own, turns.transpose(0, 2, 1), strict=True):
         np.matmul(batch.rays_i[first:last], turn, out=rays_i[first:last])
-    in_axes_of_j = RayMatches(
-        pairs=batch.pairs,
-        offsets=batch.offsets,
-        rays_i=rays_i,
-        rays_j=batch.rays_j,
-        pixel_angles=batch.pixel_angles,
-    )
+    in_axes_of_j = replace(batch, rays_i=rays_i)
     baselines = estimate_directions(in_axes_of_j, _NEAR, threads).directions
     likely = LikelyPoses(turns, baselines, np.full(len(batch.pairs), _LIKELY))
     return estimate_relative_rotations(batch, threads, advance, are_many=are_many, likely=likely)
@@ -171,17 +151,14 @@ def _all_but_some(view: View) -> IntArray:
     """Return the pairs (m, 2) that are not among the first of one of their images, by matches, then drawn."""
     counts = np.repeat(view.matches.num_matches[view.rows], 2)
     drawn = np.repeat(np.random.default_rng(0).permutation(view.num_pairs), 2)
-    ends = view.pairs.ravel()
-    order = np.lexsort((drawn, -counts.astype(np.int64), ends))
-    degrees = np.bincount(ends)
-    rank = np.arange(len(ends)) - np.repeat(np.cumsum(degrees) - degrees, degrees)
-    return np.delete(view.pairs, order[rank < _FIRST_PAIRS] // 2, axis=0)
+    ranks = rank_within(view.pairs.ravel(), -counts.astype(np.int64), drawn)
+    return np.delete(view.pairs, np.flatnonzero(ranks < _FIRST_PAIRS) // 2, axis=0)
 
 
 def estimate_here(
     view: View,
     estimate: Callable[..., RelativeRotations],
-    sharing: Sharing,
+    clock: Clock,
     min_matches: int = LEAST_MATCHES,
     *,
     without: IntArray | None = None,
@@ -194,10 +171,10 @@ def estimate_here(
     for batch in view.batches(min_matches, without):
 
         def advance(done: int, before: int = before) -> None:
-            sharing.advance(before + done, total)
+            clock.advance(before + done, total)
 
-        parts.append(estimate(batch, sharing.threads, advance))
+        parts.append(estimate(batch, clock.threads, advance))
         before += len(batch.pairs)
     if without is None:
-        sharing.advance(total, total)
+        clock.advance(total, total)
     return concatenate_rotations(parts)

@@ -137,10 +137,8 @@ def place_by_checked(
 
     It is tried only where the usual placement leaves pairs over: few pairs need the points of all tracks.
 
-    Args:
-        usual: the placement with the points of all tracks.
-        checked: makes the same graph with the points of checked tracks.
-        place: places a graph; its first piece counts.
+    `checked` makes the same graph with the points of checked tracks, and `place` places one; its first piece
+    counts.
     """
     if _count_agreeing(usual) >= _FITTING * usual.num_pairs:
         return None
@@ -153,7 +151,6 @@ def place_by_checked(
 
 
 def _count_agreeing(placement: Placement) -> int:
-    """Return how many pairs agree with a placement."""
     return int(placement.agreement.agrees[placement.pairs].sum())
 
 

@@ -30,7 +30,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.first_placement import start_from_first
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
-from sfm_shapefit.pipeline.relative_rotations import Sharing, estimate_here
+from sfm_shapefit.pipeline.relative_rotations import estimate_here
 from sfm_shapefit.pipeline.settle import settle
 from sfm_shapefit.placement.gauge import coincide
 from sfm_shapefit.rotations.average import average_relative_rotations
@@ -114,7 +114,7 @@ def _measure(
     view = source.matches.at(source.images.apart(), source.inputs.left_out)
     are_many = have_many_pairs(view.images.num_images, view.num_pairs)
     estimate = estimate or partial(estimate_relative_rotations, are_many=are_many)
-    return estimate_here(view, estimate, Sharing(clock.threads, advance=clock.advance), without=without)
+    return estimate_here(view, estimate, clock, without=without)
 
 
 def average_near(rough: Images, relative: RelativeRotations, threads: int) -> Images:

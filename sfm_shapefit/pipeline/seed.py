@@ -13,7 +13,7 @@ from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, hand_back_memory
 from sfm_shapefit.base.executors import nobody
-from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.base.geometry import Similarity, mean_rotation_l1
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.judgement.judged import Judged
 from sfm_shapefit.judgement.support import (
@@ -23,7 +23,6 @@ from sfm_shapefit.judgement.support import (
     images_without_support,
 )
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.pipeline.gauge_choice import restore_axes
 from sfm_shapefit.pipeline.stand import Stand, posed_part
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.prior_refinement import PULLED
@@ -80,12 +79,8 @@ def seed_points(
     Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
     executor shares out the tracks that are triangulated where nothing is adjusted.
 
-    Args:
-        stand: where the cameras stand, in the gauge of the output.
-        kept: (k,) which of the placement's cameras are in the output.
-        options: settings.
-        clock: of the run.
-        sure: (i,) images that the pixels confirm, so that half of the points suffice; none if None.
+    The placement's cameras (k,) that are `kept` are in the output. Half of the points suffice for images (i,)
+    that are `sure`, as the pixels confirm them.
     """
     source, fixed = stand.source, stand.given.fixed_frames
     images, points, adjusted, partners = _make_points(stand, kept, options, clock)
@@ -165,7 +160,8 @@ def _set_gauge(seeded: Seeded, stand: Stand, cameras: IntArray) -> Seeded:
     unit, fixed = None if stand.placement.unit is None else 1.0, seeded.fixed
     if fixed.any() and unit is not None:
         return seeded
-    turn = np.eye(3) if fixed.any() else restore_axes(stand.source.images, seeded.images, cameras)
+    given, own = stand.source.images.rotations[cameras], seeded.images.rotations[cameras]
+    turn = np.eye(3) if fixed.any() else mean_rotation_l1(given.transpose(0, 2, 1) @ own)
     found = stand.given.rule.choose(cameras, seeded.images.centers[cameras] @ turn.T, unit)
     axes = np.eye(3) if found.axes is None else found.axes
     scale, shift = found.similarity.scale, found.similarity.translation

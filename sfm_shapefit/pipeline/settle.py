@@ -84,12 +84,7 @@ def settle(
 ) -> LocateResult:
     """Place the cameras of an open source, and make the seeded models of its rigid pieces, the largest first.
 
-    Args:
-        given: what is known of the images.
-        opened: the images, at their rotations, and their matches.
-        options: settings.
-        clock: of the run.
-        first: where an adjustment has the images already; None if there was none.
+    An adjustment may have the images already; `first` says where then.
     """
     with clock("directions"):
         checked = first is None and given.rigid.groups is None  # rigid groups need few points
@@ -98,8 +93,8 @@ def settle(
     directions = measured.directions
     with clock("solve"):
         graph = given.rigid.apply(build_graph(opened.images, measured, options.nodes))
-        work = count_work(opened, directions)
-        describe = partial(describe_work, work=work, placement=options.placement, freedom=options.freedom)
+        work = count_work(opened, directions, options)
+        describe = partial(describe_work, work=work, options=options.placement)
         economy, graph = keep_within_memory(graph, describe, options.memory.max_memory_mb, opened.economy)
         source = opened.at(opened.images, economy)
         measured = measured if economy.samples else replace(measured, errors=None)
@@ -141,11 +136,7 @@ def finish_piece(
 ) -> LocateResult:
     """Take one rigid piece from its placement to its model.
 
-    Args:
-        placed: its cameras, before anything is adjusted.
-        options: settings.
-        clock: of the run.
-        first: where an adjustment has the images already.
+    Its cameras are placed, and nothing is adjusted yet but, where there was one, a `first` placement.
     """
     given, source, before = placed.given, placed.source, placed.source.images
     started = pull_cameras(_start(placed, first), source.economy.limit(options.placement))
@@ -163,8 +154,7 @@ def finish_piece(
     if (sure & ~seeded.images.is_posed).any():
         seeded = seed_points(stand, kept, options, clock, sure)
     moves = judged.unit is None and not given.rigid.fixed.any()
-    brought = bring_to_known(seeded, given.known, options.structure, moves=moves)
-    seeded = brought.seeded
+    seeded, control, told = bring_to_known(seeded, given.known, options.structure, moves=moves)
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
@@ -208,10 +198,10 @@ def finish_piece(
         evidence=evidence,
         intrinsics=intrinsics,
         rigs=rigs,
-        control_points=brought.control_points,
+        control_points=control,
         suspicions=stand.failures,
     )
-    return replace(found, warnings=(*_warnings(found, stand), *brought.warnings))
+    return replace(found, warnings=(*_warnings(found, stand), *told))
 
 
 def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
@@ -225,7 +215,6 @@ def _start(stand: Stand, first: FirstPlacement | None) -> Stand:
 
 
 def _adjust(stand: Stand, options: PlacingOptions, clock: Clock) -> Stand:
-    """Adjust the placed cameras, if that is wanted."""
     num_cameras = len(stand.placement.cameras)
     is_small = stand.placement.piece > 0 and num_cameras < _SMALLEST_ADJUSTED
     adjusts = options.placement.refines and options.freedom.adjusts_cameras(num_cameras)

@@ -46,7 +46,6 @@ class Stand(NamedTuple):
     gauge: Gauge
     """The map from the placement's locations to the frame that is worked in."""
     freedom: Freedom
-    """What may move."""
     intrinsics: RefinedIntrinsics
     held: KnownPositions | None = None
     """Priors that pull at the frames and hold the gauge by that, with the weights that they ended with."""
@@ -86,8 +85,7 @@ class Stand(NamedTuple):
     def place(self, kept: BoolArray | None = None) -> Images:
         """Return all images where they are placed, fixed ones as they were; NaN where neither.
 
-        Args:
-            kept: (k,) which of the placement's cameras count; all if None.
+        Only the placement's cameras (k,) that are `kept` count.
         """
         chosen = np.ones(len(self.placement.cameras), dtype=np.bool_) if kept is None else kept
         centers = self.gauge.similarity.apply(self.placement.locations[chosen])

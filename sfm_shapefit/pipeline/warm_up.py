@@ -92,9 +92,7 @@ class WarmUp:
 def warm_up(examples: Sequence[str], report: Tell | None = None) -> WarmUp:
     """Compile the kernels that examples need and keep them on disk, in as many processes as there are cores.
 
-    Args:
-        examples: names of functions of `pipeline.examples`.
-        report: called whenever a kernel is ready.
+    Examples are names of functions of `pipeline.examples`; `report` is called whenever a kernel is ready.
     """
     if not examples:
         return WarmUp(0, ())
@@ -118,9 +116,7 @@ def compile_together(report: Tell, say: Callable[[str], None]) -> Iterator[None]
 
     There is no warm-up on a single core, nor where there was one already, as it would find nothing to do.
 
-    Args:
-        report: called whenever a kernel is ready.
-        say: told why the kernels of a wheel do not serve, if they do not.
+    `report` is called whenever a kernel is ready, and `say` told why the kernels of a wheel do not serve.
     """
 
     def act() -> None:
@@ -205,16 +201,11 @@ def _work(connection: Any, objects_between_searches: tuple[int, int, int]) -> No
         connection.send(None)
         while name := connection.recv():
             try:
-                _run_example(name)
+                from sfm_shapefit.pipeline import examples
+
+                with tempfile.TemporaryDirectory() as folder:
+                    getattr(examples, name)(Path(folder))
+                note(name, PACKAGE / "pipeline")
             except Exception as error:  # whatever it is, the others are worth running
                 connection.send(WarmUpError(f"{name}: {type(error).__name__}: {error}"))
             connection.send(None)
-
-
-def _run_example(name: str) -> None:
-    """Run an example, and note that it is done."""
-    from sfm_shapefit.pipeline import examples
-
-    with tempfile.TemporaryDirectory() as folder:
-        getattr(examples, name)(Path(folder))
-    note(name, PACKAGE / "pipeline")

@@ -119,11 +119,7 @@ def write_page(
 
 
 def refuse_file(page: Path, *, overwrite: bool) -> None:
-    """Refuse a file to be made that exists, or whose folder does not.
-
-    Raises:
-        InputError: if so.
-    """
+    """Refuse a file to be made that exists, or whose folder does not."""
     if not page.absolute().parent.is_dir():
         raise InputError(f"the folder of {page} does not exist; make it, or name another")
     if page.is_dir():
@@ -140,7 +136,6 @@ def _draw_page(found: Any) -> str:
 
 
 def _drawing_of(found: Any) -> "Drawing":
-    """Return what the page of a result shows."""
     from sfm_shapefit.report.results import draw_joined, draw_result
 
     if isinstance(found, JoinedModel):

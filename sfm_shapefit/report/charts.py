@@ -31,12 +31,9 @@ def pack_array(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
 
 
 def track_length_bars(lengths: IntArray) -> dict[str, Any] | None:
-    """Return counts, texts and ticks of the histogram of track lengths; None if there are no points.
+    """Return the histogram of track lengths, the numbers of images that see points (s,); None without points.
 
     Ticks are places, in bars from the left, and their text.
-
-    Args:
-        lengths: (s,) number of images that see each point.
     """
     if not len(lengths):
         return None
@@ -54,11 +51,7 @@ def track_length_bars(lengths: IntArray) -> dict[str, Any] | None:
 
 
 def reprojection_error_bars(errors_px: FloatArray) -> dict[str, Any] | None:
-    """Return the same of the points' errors in pixels; None if none is known.
-
-    Args:
-        errors_px: (s,) mean reprojection error of each point; NaN where it is not known.
-    """
+    """Return the same of the points' mean errors in pixels (s,), NaN where not known; None if all are."""
     known = errors_px[np.isfinite(errors_px)]
     if not len(known):
         return None
@@ -108,11 +101,8 @@ def view_graph_matrix(pairs: Pairs, rank: IntArray) -> dict[str, Any]:
     """Return the symmetric matrix of pairs, of at most 200 x 200 cells, in the order of cameras.csv.
 
     With one camera a cell, what became of its pair: 1 agrees, 2 undetermined, 3 no direction, 4 contradicts.
-    With several, how many pairs contradict the solution, and how many there are.
-
-    Args:
-        pairs: all of them.
-        rank: (n,) rows of the cameras on the page.
+    With several, how many pairs contradict the solution, and how many there are. The rows of the cameras on
+    the page are their `rank` (n,).
     """
     per_cell = max(-(-len(rank) // MOST_CELLS), 1)
     side = -(-len(rank) // per_cell)

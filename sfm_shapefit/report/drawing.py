@@ -53,8 +53,6 @@ class Poses:
     """(n, 3)"""
     half_sizes: FloatArray
     """(n, 2) half the width and height of the picture at distance 1, limited to what can be drawn."""
-    focal_lengths_px: FloatArray
-    """(n,)"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -220,20 +218,16 @@ def poses_of(images: Images | None, names: Sequence[str]) -> Poses:
     row_of = {name: row for row, name in enumerate(names)}
     rows = [k for k, name in enumerate(images.names) if name in row_of]
     own = [row_of[images.names[k]] for k in rows]
-    focal_lengths_px = images.focal_lengths_px[rows]
+    halves = images.sizes_px[rows] / (2.0 * images.focal_lengths_px[rows, None])
     found.rotations[own], found.centers[own] = images.rotations[rows], images.centers[rows]
-    found.half_sizes[own] = np.clip(images.sizes_px[rows] / (2.0 * focal_lengths_px[:, None]), *_HALF_SIZES)
-    found.focal_lengths_px[own] = focal_lengths_px
+    found.half_sizes[own] = np.clip(halves, *_HALF_SIZES)
     return found
 
 
 def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> FloatArray:
     """Return the picture corners of cameras in the world's axes, shape (k, 4, 3), around each picture.
 
-    Args:
-        drawing: rotations, pictures and depth.
-        rows: (k,) cameras with a rotation.
-        centers: (k, 3) where they stand.
+    The cameras are those of some rows (k,) with a rotation, and stand at the centers (k, 3).
     """
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     halves = drawing.cameras.poses.half_sizes[rows]
@@ -261,10 +255,7 @@ def view_axes(rotations: FloatArray) -> FloatArray:
     """Return right, forward and up, as rows, as most cameras see them; the world's axes if there are none.
 
     People hold cameras level: up is the direction most orthogonal to the pictures' x axes and, as far as that
-    leaves it open, opposite to their y axes.
-
-    Args:
-        rotations: (n, 3, 3) cam_from_world.
+    leaves it open, opposite to their y axes. Rotations (n, 3, 3) are cam_from_world.
     """
     rotations = rotations[np.isfinite(rotations).all(axis=(1, 2))]
     if len(rotations) == 0:
@@ -287,7 +278,6 @@ def _unknown_poses(n: int) -> Poses:
         rotations=np.full((n, 3, 3), np.nan),
         centers=np.full((n, 3), np.nan),
         half_sizes=np.full((n, 2), np.nan),
-        focal_lengths_px=np.full(n, np.nan),
     )
 
 

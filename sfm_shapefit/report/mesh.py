@@ -34,7 +34,6 @@ def mesh_bytes(drawing: Drawing, file_type: str) -> bytes:
 
 
 def _scene(drawing: Drawing) -> "trimesh.Scene":
-    """Return the cameras and the points, upright."""
     import trimesh
 
     cameras, points = drawing.cameras, drawing.points

@@ -75,11 +75,8 @@ def report_html(
 ) -> str:
     """Return the page.
 
-    Args:
-        drawing: what is drawn.
-        facts: what is told of it.
-        thumbnails: data URLs of pictures by row of the cameras, as of `read_thumbnails`; none if None.
-        images: the folder of the images, for the next command.
+    Thumbnails are data URLs by row of the cameras, as of `read_thumbnails`; `images` is the folder of the
+    images, for the next command.
     """
     data, script = page_data(drawing, facts, thumbnails), _script()
     data["images"] = images
@@ -325,7 +322,6 @@ def _pairs_note(drawing: Drawing) -> str:
 
 
 def _notes(drawing: Drawing, residuals_deg: Mapping[str, FloatArray]) -> dict[str, str]:
-    """Return what stands under each chart."""
     return {
         "histogram": _histogram_note(residuals_deg),
         "tracks": _tracks_note(drawing.points),

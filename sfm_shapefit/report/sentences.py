@@ -28,13 +28,11 @@ _MOST_WEAK = 6  # weak cameras among these; the table of cameras has all
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hint:
-    """Something to look at, and which row shows it."""
+    """Something to look at, and which row of the cameras or of the pairs shows it."""
 
     text: str
     camera: int | None = None
-    """A row of the cameras."""
     pair: int | None = None
-    """A row of the pairs."""
 
 
 def shorten(text: str, limit: int = MAX_TEXT) -> str:

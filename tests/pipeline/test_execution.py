@@ -17,8 +17,8 @@ from sfm_shapefit.pairs.estimate import estimate_directions
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pairs.pair_directions import concatenate
 from sfm_shapefit.pipeline import execution
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.execution import (
-    PairWork,
     WorkerError,
     measure_part,
     measure_with_workers,
@@ -33,20 +33,21 @@ def model(tiny_ring):
     return read_model(tiny_ring / "sparse" / "0")
 
 
-WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()), matches_per_task=700)
+ESTIMATE = partial(estimate_directions, options=DirectionOptions())
 
 
 def serial(tiny_ring, model):
     with view_of(tiny_ring / "database.db", model.images) as view:
         (part,) = view.parts(10**9)
-    (found,) = measure_part(WORK, part)
+    (found,) = measure_part(ESTIMATE, 1, part)
     return found
 
 
 def shared(tiny_ring, model, executor):
     seen = []
     with view_of(tiny_ring / "database.db", model.images) as view:
-        parts = measure_with_workers(view, WORK, executor, lambda *done: seen.append(done))
+        clock = Clock(lambda _stage, *done: seen.append(done), executor=executor)
+        parts = measure_with_workers(view, ESTIMATE, clock, matches_per_task=700)
     return concatenate(parts), seen
 
 
@@ -73,7 +74,7 @@ def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(tiny_ring, m
     assert_same_bits(found, serial(tiny_ring, model))
 
 
-def _die(_work, _part):
+def _die(*_given):
     os._exit(1)
 
 
@@ -88,7 +89,7 @@ def test_a_worker_that_dies_in_a_pool_is_reported(tiny_ring, model, monkeypatch)
 
 
 def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model, monkeypatch):
-    def refuse(_work, _part):
+    def refuse(*_given):
         raise InputError("the database is damaged")
 
     monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_part", refuse)
@@ -96,13 +97,13 @@ def test_an_error_of_the_input_passes_as_it_is(tiny_ring, model, monkeypatch):
         shared(tiny_ring, model, pool)
 
 
-def die_once(flag, work, part):
+def die_once(flag, *given):
     """Kill the first worker that comes here, in the middle of the work."""
     try:
         os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
     except FileExistsError:
         time.sleep(0.05)
-        return measure_part(work, part)
+        return measure_part(*given)
     os._exit(1)
 
 

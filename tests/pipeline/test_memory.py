@@ -22,7 +22,6 @@ from sfm_shapefit.pipeline.memory import (
     keep_within_memory,
 )
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.scene.freedom import FreedomOptions
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.synthetic import random_graph_problem
 from tests.scenes import RING
@@ -80,13 +79,19 @@ def loop_graph(num_nodes=400):
 
 PLACEMENT = PlacementOptions()
 LOOP_WORK = Workload(
-    num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
+    num_images=400,
+    num_keypoints=0,
+    num_pairs=8000,
+    num_matches=0,
+    num_edges=8000,
+    num_nodes=400,
+    adjusts=True,
 )
 
 
 def describe(measured, work, options=PLACEMENT):
-    """What there is to do with a graph, its cameras adjusted."""
-    return describe_work(measured, work, options, FreedomOptions())
+    """What there is to do with a graph."""
+    return describe_work(measured, work, options)
 
 
 def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_nothing_is_refined():
@@ -118,7 +123,13 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
     problem = random_graph_problem(200, 0.5, sigma=0.01, seed=1)
     measured = MeasuredGraph(ViewGraph(200, problem.edges, problem.directions), num_points=60)
     work = Workload(
-        num_images=140, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=140
+        num_images=140,
+        num_keypoints=0,
+        num_pairs=1,
+        num_matches=10_000_000,
+        num_edges=1,
+        num_nodes=140,
+        adjusts=True,
     )
     limit = forecast(describe(measured.without_points(), work), ECONOMIES[3]).peak_mb
     economy, kept = keep_within_memory(
