@@ -119,8 +119,9 @@ def check_source(
             evidence = evidence.beside(second, fits.sides[1])
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
     told = tell_evidence(evidence, model.images)
-    facts = _tell(model, matches, verdict, cameras, pairs, level_deg) | _tell_points(quality)
-    facts |= {"timings_s": clock.seconds, "evidence": told, "warnings": told.statements}
+    facts = _tell(model, matches, cameras, pairs, quality)
+    facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
+    facts |= {"evidence": told, "warnings": told.statements}
     return CheckResult(
         model=model, cameras=cameras, pairs=pairs, quality=quality, facts=CheckedFacts(**facts)
     )
@@ -244,36 +245,27 @@ def _strange_pairs(fits: PairFits | None) -> Iterator[str]:
 def _tell(
     model: ColmapModel,
     matches: MatchSource,
-    verdict: ModelVerdict,
     cameras: list[CameraRow],
     pairs: list[PairRow],
-    level_deg: float,
+    quality: ImageQuality,
 ) -> dict[str, Any]:
-    """Return what is told of a model beside its points, by the fields of `CheckedFacts`."""
+    """Return what is told of a model beside its verdict, by the fields of `CheckedFacts`."""
     error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
     measures = (float(np.median(model.images.focal_lengths_px)), "of the model's units")
+    errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
     return {
         "inputs": matches.inputs.facts,
         "options": {},
-        "verdict": verdict,
         "num_images": len(cameras),
         "num_placed": model.images.num_images,
         "num_pairs": len(pairs),
         "num_points": model.reconstruction.num_points3D(),
         "figures": KeyFigures.of_cameras(cameras, error_deg, *measures),
         "sigma_of": "",
-        "residual_level_deg": level_deg,
         "scale": "input: those of the model",
         "pieces": [],
         "loose_groups": [],
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
-    }
-
-
-def _tell_points(quality: ImageQuality) -> dict[str, float]:
-    """Return what is told of the model's points."""
-    errors_px = quality.point_errors_px[np.isfinite(quality.point_errors_px)]
-    return {
         "mean_reprojection_error_px": float(errors_px.mean()) if len(errors_px) else np.nan,
         "median_track_length": _median(quality.point_track_lengths.tolist()),
     }

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits
 from sfm_shapefit.judgement.limits import FITTING_PX, OUTNUMBERED
-from sfm_shapefit.judgement.seams import Cut, Seam, find_cuts, find_seams
+from sfm_shapefit.judgement.seams import Seam, find_cuts, find_seams
 from sfm_shapefit.judgement.ties import Rays, Untied, find_groups, links_of_pairs, rigid_groups
 from sfm_shapefit.judgement.witnesses import are_confirmed
 from sfm_shapefit.judgement.wrong_lenses import question_lenses
@@ -49,7 +49,10 @@ def gather_evidence(
     if fits is None:
         return ModelEvidence(lenses=lenses)
     tied, untied = _tie(source, fits, structure)
-    seams = _question_cuts(source, find_cuts(*fits.sides, tied), threads)
+    cuts, seams = find_cuts(*fits.sides, tied), tuple[Seam, ...]()
+    if cuts:  # which are seams by the rotations that pairs across have by themselves
+        across = np.concatenate([cut.contradicting for cut in cuts])
+        seams = find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)
     apart = [camera for seam in seams for camera in seam.cameras.tolist()]
     contradicted = fits.contradicted(images)
     doubted = np.isin(np.arange(images.num_images), [one.camera for one in contradicted])
@@ -168,11 +171,3 @@ def _are_lost(view: View, structure: Structure, fits: BoolArray, group: IntArray
         lost[ends[same & ~sound, 0]] = True
         carried[ends[same & sound, 0]] = True
     return lost & ~carried
-
-
-def _question_cuts(source: MatchSource, cuts: tuple[Cut, ...], threads: int) -> tuple[Seam, ...]:
-    """Return the cuts that are seams, by the rotations that pairs across have by themselves."""
-    if not cuts:
-        return ()
-    across = np.concatenate([cut.contradicting for cut in cuts])
-    return find_seams(cuts, ask_rotations(source, across, threads), source.images.rotations)

@@ -98,25 +98,22 @@ class GaugeRule(NamedTuple):
         """
         names = [self.images.names[camera] for camera in cameras.tolist()]
         if self.distances and chosen.scale != "distance":
-            found = partial(gauge_of_distances, names, centers, self.distances)
-            yield say_unused("known distances were", chosen, found)
+            known = partial(gauge_of_distances, names, centers, self.distances)
+            yield say_unused("known distances were", chosen, lambda: known().similarity.scale)
         if self.priors is not None and chosen.scale != "prior":
-            found = partial(prior_gauge, centers, self.priors.of(cameras))
-            yield say_unused("position priors were", chosen, found)
+            priors = self.priors.of(cameras)
+            yield say_unused(
+                "position priors were", chosen, lambda: prior_gauge(centers, priors).similarity.scale
+            )
 
 
-def say_unused(what: str, chosen: Gauge, find: Callable[[], Gauge]) -> str:
+def say_unused(what: str, chosen: Gauge, find: Callable[[], float]) -> str:
     """Say that something known did not set the scale, and by how much it differs from what did."""
     unused = f"{what} not used for the scale, which is that of {SETS_SCALE[chosen.scale]}"
     try:
-        return f"{unused}; {off_by(find().similarity.scale)}"
+        return f"{unused}; they differ by {100.0 * abs(find() - 1.0):.3g} %"
     except (InputError, UnsolvableError) as error:
         return f"{unused}, and do not check it: {error}"
-
-
-def off_by(scale: float) -> str:
-    """Say by how much scales differ whose ratio this is."""
-    return f"they differ by {100.0 * abs(scale - 1.0):.3g} %"
 
 
 def gauge_of_distances(names: Sequence[str], locations: FloatArray, known: Sequence[KnownDistance]) -> Gauge:

@@ -15,7 +15,7 @@ from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.pipeline.gauge_choice import SETS_SCALE, off_by
+from sfm_shapefit.pipeline.gauge_choice import say_unused
 from sfm_shapefit.pipeline.seed import Seeded, turn_about_origin
 from sfm_shapefit.placement.control_points import (
     control_gauge,
@@ -101,11 +101,9 @@ def _bring_to_control_points(
     if isinstance(fit, str):
         return seeded, rows, warnings
     if not moves:
-        unused = (
-            f"control points were not used for the scale, which is that of {SETS_SCALE[seeded.gauge.scale]}"
-        )
         checks: list[ControlPoint] = [replace(row, use="check") for row in rows]
-        return seeded, checks, [*warnings, f"{unused}; {off_by(fit.motion.scale)}"]
+        unused = say_unused("control points were", seeded.gauge, lambda: fit.motion.scale)
+        return seeded, checks, [*warnings, unused]
     return seeded.moved(fit.motion, control_gauge(seeded.gauge, known, fit)), rows, warnings
 
 

@@ -76,8 +76,7 @@ class Cameras:
     @property
     def sigmas(self) -> FloatArray:
         """(n,) largest standard deviation over the axes; NaN where it is not known."""
-        found: FloatArray = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).max(axis=1))
-        return found
+        return np.asarray(np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).max(axis=1)))
 
     @property
     def ellipsoids(self) -> FloatArray:
@@ -138,8 +137,7 @@ class Pairs:
     def worst_first(self) -> IntArray:
         """Return the rows, those that contradict the solution most first, those without a direction last."""
         rank = np.array([2, 0, 1, 3])[self.classes]
-        order: IntArray = np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank))
-        return order
+        return np.asarray(np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,8 +165,7 @@ class Drawing:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""
         if not self.input_is_aligned:
             return np.full(len(self.cameras.names), np.nan)
-        distances: FloatArray = np.linalg.norm(self.cameras.centers - self.cameras.poses.centers, axis=1)
-        return distances
+        return np.asarray(np.linalg.norm(self.cameras.centers - self.cameras.poses.centers, axis=1))
 
     @property
     def noun(self) -> str:
@@ -233,8 +230,7 @@ def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> Fl
     halves = drawing.cameras.poses.half_sizes[rows]
     in_camera = np.concatenate([signs * halves[:, None, :], np.ones((len(rows), 4, 1))], axis=2)
     rotations = drawing.cameras.poses.rotations[rows]
-    corners: FloatArray = centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations
-    return corners
+    return np.asarray(centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations)
 
 
 def input_centers(drawing: Drawing) -> FloatArray | None:

@@ -163,8 +163,7 @@ class _Display:
 
     def turn(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (..., 3) in the page's axes."""
-        shown: FloatArray = vectors @ self._axes.T
-        return shown
+        return np.asarray(vectors @ self._axes.T)
 
 
 # --- columns ---------------------------------------------------------------------------------------

@@ -61,7 +61,7 @@ def test_rough_rotations_lead_to_the_model_of_map(found, courtyard_mapped):
 def test_what_was_wrong_is_told_per_camera(found):
     names = [found.images.names[k] for k in wrong_rotations(found.turned_deg, 2.0).tolist()]
     assert set(names) == set(WRONG)
-    assert found.warnings[0].startswith("2 given rotations wrong and corrected: ")
+    assert found.warnings[0].startswith("2 given rotations are wrong and corrected: ")
     table = found.table("cameras")
     turned = dict(zip(table["name"], table["turned_deg"], strict=True))
     assert all(turned[name] == pytest.approx(120.0, abs=6.0) for name in WRONG)
