@@ -259,7 +259,7 @@ class Counting(ThreadPoolExecutor):
         self.tasks = {}
 
     def submit(self, work, /, task):
-        kind = work.args[0].estimate.func.__name__ if isinstance(work, partial) else work.__name__
+        kind = work.args[0].func.__name__ if isinstance(work, partial) else work.__name__
         self.tasks[kind] = self.tasks.get(kind, 0) + 1
         return super().submit(work, task)
 
