@@ -33,14 +33,14 @@ MOST_ARROWS = 75  # between rooms, beside those to base/; the list may only beco
 # Most lines of each room, docstrings and blank lines counted, to the next ten. Whoever raises one says in the
 # commit what the lines buy; whoever makes a room shorter lowers its budget, so that the room stays short.
 MOST_LINES = {
-    "adjustment": 4980,
+    "adjustment": 4700,
     "base": 2370,
     "cli": 1780,
     "facts": 3450,
     "files": 4990,
     "graph": 1340,
-    "judgement": 3450,
-    "laplacian": 2080,
+    "judgement": 3400,
+    "laplacian": 2100,
     "pairs": 1590,
     "pipeline": 6400,
     "placement": 2820,
