@@ -88,10 +88,10 @@ def with_points(model, points, options=None):
     return copy
 
 
-def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None, executor=None):
+def triangulated(seed, tracks, options=None, advance=lambda _done, _total: None):
     """A copy of a seed with the points of its matches, or of another model's tracks."""
     options, images = options or StructureOptions(), posed_images(seed)
-    points = triangulate(images, links_of(seed, tracks), options, advance, executor)
+    points = triangulate(images, links_of(seed, tracks), options, advance)
     structure = with_points(seed, points, options)
     return colored(structure, tracks) if isinstance(tracks, pycolmap.Reconstruction) else structure
 

@@ -11,29 +11,26 @@ from matches fit better here: on fountain-P11, Herz-Jesus-P25, castle-P30 and le
 and 4.3 % more observations, with mean errors of 0.44 instead of 0.53, 0.58 (0.71), 0.41 (0.51) and 0.47 px
 (0.65). The mean length of tracks is 4.60 (4.54), 5.64 (5.54), 4.91 (4.95) and 4.59 (4.66).
 
-No sample is random: the same input gives the same bits. Tracks know nothing of one another, so an executor's
-workers may share them, with the same bits again.
+No sample is random: the same input gives the same bits. An executor's workers have no part in it: to send
+them the tracks takes as long as they would save.
 
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
-from dataclasses import dataclass
 
 import numpy as np
 
 from sfm_shapefit.adjustment.sources import Links
 from sfm_shapefit.adjustment.views import views_of
 from sfm_shapefit.base.arrays import IntArray, hand_back_memory
-from sfm_shapefit.base.executors import Advance, answers, nobody
+from sfm_shapefit.base.executors import Advance, nobody
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
-from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
+from sfm_shapefit.tracks.links import ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
-    TriangulatedPoints,
     joining_limits_px,
     triangulate_tracks,
 )
@@ -47,7 +44,6 @@ def triangulate(
     links: Links,
     options: StructureOptions,
     advance: Advance = nobody,
-    executor: Executor | None = None,
 ) -> Points:
     """Return the points of links at the poses of images, a block of tracks at a time; none is filtered.
 
@@ -59,10 +55,6 @@ def triangulate(
         links: their matches, or tracks.
         options: what points must satisfy.
         advance: called with the tracks of the first joining that are done, and their number.
-        executor: shares out the tracks among its workers, with the same answer to the bit.
-
-    Raises:
-        WorkerError: if a worker died and the executor does not replace it.
     """
     views = views_of(images)
     limits = PointLimits(
@@ -72,12 +64,10 @@ def triangulate(
     )
     poses, parts = views.poses(images), list[Points]()
     if isinstance(links, ObservedTracks):
-        own = map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length)))
-        cut, done = ((np.arange(len(block.cameras)), block) for block in own), 0
-        tasks = (BlockTask(rows=rows, tracks=block, poses=poses, limits=limits) for rows, block in cut)
-        for task, found in answers(executor, triangulate_block, tasks):
-            parts.append(views.seen_points(task.tracks, found))
-            done += task.tracks.num_tracks
+        done = 0
+        for block in map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length))):
+            parts.append(views.seen_points(block, triangulate_tracks(block, poses, limits)))
+            done += block.num_tracks
             advance(done, links.num_tracks)
         return concatenate_points(parts)
     matched, joining_limits = links, tuple(joining_limits_px(limits.max_error_px, limits.max_error_px))
@@ -93,34 +83,19 @@ def triangulate(
         else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
-        cut, done = ((own.rows, matched.observed(own)) for own in map(joined.subset, _blocks(chosen))), 0
-        tasks = (BlockTask(rows=rows, tracks=block, poses=poses, limits=limits) for rows, block in cut)
-        for task, found in answers(executor, triangulate_block, tasks):
-            parts.append(views.seen_points(task.tracks, found))
-            is_left[task.rows[found.points_seen >= 0]] = False
-            done += task.tracks.num_tracks
+        done = 0
+        for own in map(joined.subset, _blocks(chosen)):
+            tracks = matched.observed(own)
+            found = triangulate_tracks(tracks, poses, limits)
+            parts.append(views.seen_points(tracks, found))
+            is_left[own.rows[found.points_seen >= 0]] = False
+            done += tracks.num_tracks
             if limit_px == joining_limits[0]:  # nearly all tracks
                 advance(done, len(chosen))
-        del joined, sizes, chosen, cut, tasks  # before the keypoints that are left are copied
+        del joined, sizes, chosen  # before the keypoints that are left are copied
     return number_points(parts)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlockTask:
-    """Some tracks of matches, and all that is needed to triangulate them elsewhere."""
-
-    rows: IntArray
-    """(m,) which of all matched keypoints each observation is."""
-    tracks: ObservedTracks
-    poses: CameraPoses
-    limits: PointLimits
 
 
 def _blocks(chosen: IntArray) -> Iterator[IntArray]:
     """Yield some of the chosen tracks at a time."""
     return (chosen[first : first + _TRACKS_A_BLOCK] for first in range(0, len(chosen), _TRACKS_A_BLOCK))
-
-
-def triangulate_block(task: BlockTask) -> TriangulatedPoints:
-    """Return the points of a task's tracks; what a worker runs."""
-    return triangulate_tracks(task.tracks, task.poses, task.limits)

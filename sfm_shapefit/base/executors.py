@@ -25,22 +25,18 @@ class WorkerError(ShapeFitError):
 
 
 def answers(
-    executor: Executor | None, work: Callable[[Task], Answer], tasks: Iterable[Task]
+    executor: Executor, work: Callable[[Task], Answer], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Answer]]:
     """Yield each task with what an executor's workers make of it, in the order of the tasks.
 
     Args:
-        executor: submits tasks, a few ahead of the answers; it is not shut down. None: all is done here.
+        executor: submits tasks, a few ahead of the answers; it is not shut down.
         work: a function of a module, so that other processes find it; what it raises is raised.
         tasks: its arguments, which are pickled on the way to other processes.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.
     """
-    if executor is None:
-        for task in tasks:
-            yield task, work(task)
-        return
     sent: deque[tuple[Task, Future[Answer]]] = deque()
     try:
         for task in tasks:

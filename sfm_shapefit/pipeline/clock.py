@@ -21,7 +21,7 @@ class Clock:
     seconds: dict[str, float] = field(default_factory=dict)
     stage: str = ""
     executor: Executor | None = None
-    """Shares out pairs and tracks among its workers; None: all is done in this process."""
+    """Shares out pairs among its workers; None: all is done in this process."""
     threads: int = field(default_factory=SolverOptions().num_threads)
     """Threads of this process."""
 

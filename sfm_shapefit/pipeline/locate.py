@@ -65,7 +65,7 @@ def locate(
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `files.colmap.priors`, the folder of the images, whose EXIF
             data have them, or "database" for its own pose priors.
-        executor: shares out pairs and tracks among its workers, which must see the file of the database, with
+        executor: shares out pairs among its workers, which must see the file of the database, with
             the same answer to the bit; it is not shut down. None: all is done here.
 
     Returns:

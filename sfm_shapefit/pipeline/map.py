@@ -51,7 +51,7 @@ def map_database(
         progress: called as stages advance.
         priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
             "unit", and so do those, with a warning, whose priors coincide or contradict the cameras.
-        executor: shares out pairs and tracks among its workers, as of `locate`. None: all is done here.
+        executor: shares out pairs among its workers, as of `locate`. None: all is done here.
 
     Returns:
         `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and

@@ -76,8 +76,7 @@ def seed_points(
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
-    Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
-    executor shares out the tracks that are triangulated where nothing is adjusted.
+    Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it.
 
     The placement's cameras (k,) that are `kept` are in the output. Half of the points suffice for images (i,)
     that are `sure`, as the pixels confirm them.
@@ -126,7 +125,7 @@ def _make_points(
             adjusted, points = adjust_seed(posed.images, links, options.structure, freedom, given)
             posed, images = posed._replace(images=adjusted.images), images.updated(adjusted.images)
         else:
-            points = triangulate(posed.images, links, options.structure, advance, clock.executor)
+            points = triangulate(posed.images, links, options.structure, advance)
         partners = _count(links, images, PartnerCounts(images, num_keypoints, limit_px, stand.source.fixed))
         del links
         points = filter_points(points, posed.images, stand.pictures(posed), options.structure)

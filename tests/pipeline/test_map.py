@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit.adjustment import structure as triangulation
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.intrinsics import describe_intrinsics
 from sfm_shapefit.facts.scene import describe_line, describe_loops
@@ -276,13 +275,12 @@ def assert_same_bits(shared, serial, folder):
         assert (folder / "shared" / "0" / name).read_bytes() == (folder / "serial" / "0" / name).read_bytes()
 
 
-def test_an_executor_shares_out_pairs_and_tracks_and_changes_no_bit(monkeypatch, tmp_path, courtyard_mapped):
+def test_an_executor_shares_out_pairs_and_changes_no_bit(monkeypatch, tmp_path, courtyard_mapped):
     monkeypatch.setattr(relative_rotations, "_MATCHES_PER_TASK", 1000)
-    monkeypatch.setattr(triangulation, "_TRACKS_A_BLOCK", 200)
     with Counting(2) as pool:
         shared = sfm_shapefit.map_database(COURTYARD / "database.db", executor=pool)
-    assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions", "triangulate_block"}
-    assert pool.tasks["estimate_relative_rotations"] > 3 < pool.tasks["triangulate_block"]
+    assert set(pool.tasks) == {"estimate_relative_rotations", "estimate_directions"}
+    assert pool.tasks["estimate_relative_rotations"] > 3
     assert pool.tasks["estimate_directions"] == 2  # of the averaged rotations and of the adjusted ones
     assert_same_bits(shared, courtyard_mapped, tmp_path)
 
