@@ -34,8 +34,8 @@ _DIRECTIONS_CANCEL, _DIRECTIONS_CANCEL_AT_GROUPS = 1e-9, 1e-12
 _LARGEST_RESIDUAL = 1e-9  # violation of the dual's equality; with more a bound is not called rigorous
 _ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 _LARGEST_NEWTON_FLOPS = 4e9  # operations of one block factorization; from here on splitting is faster
-# Of 2,501 graphs of 12 nodes in the plane, directions off by 1e-6 and a third drawn at random, Newton steps
-# left 18 above a gap of 1e-8, one of them at 3e-4. Splitting brings all of these below.
+# Newton steps left 18 of 2,501 graphs of 12 nodes in the plane, directions off by 1e-6 and a third drawn at
+# random, above a gap of 1e-8, one of them at 3e-4. Splitting brings all of these below.
 _STALLED = "Newton steps stalled above the tolerance: splitting"
 
 

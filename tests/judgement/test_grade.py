@@ -177,6 +177,7 @@ def test_a_loose_group_stands_apart_and_an_unchecked_one_is_looked_at(found):
         group = Untied(np.array([1, 2]), 1, 2, 0, is_loose)
         verdict = replace(found, evidence=ModelEvidence(untied=(group,))).verdict
         assert (verdict.grade, verdict.cameras, verdict.reasons) == (grade, (names[1], names[2]), (reason,))
+    assert verdict.statement == f"look at 2 cameras ({names[1]}, {names[2]}); {reason}"
 
 
 def test_a_model_a_third_of_which_is_named_is_not_to_be_used_and_a_small_seam_is_looked_at(found):
@@ -207,6 +208,8 @@ def test_a_camera_that_is_known_worse_than_the_scene_is_large_is_held_by_nothing
     extent = np.linalg.norm(np.ptp(placement.locations, axis=0))
     covariances[2] = (1.1 * extent) ** 2 * np.eye(3)
     covariances[3] = (0.9 * extent) ** 2 * np.eye(3)
-    known = replace(placement, adjusted_covariances=covariances).covariances
+    placement = replace(placement, adjusted_covariances=covariances)
+    assert set(altered(found, placement=placement).verdict.cameras) == {found.images.names[k] for k in (2, 3)}
+    known = placement.covariances
     assert np.isinf(known[2]).all()
     assert np.isfinite(np.delete(known, 2, axis=0)).all()

@@ -1,5 +1,6 @@
 """`check MODEL`: the verdict on any COLMAP model as it stands, which is left as it is."""
 
+import importlib
 import json
 from dataclasses import replace
 
@@ -65,6 +66,13 @@ def test_a_sound_model_is_good_and_a_displaced_camera_is_named(tmp_path, ring_ma
     assert banner(drawing, facts)["command"].startswith(
         "sfm-shapefit map "
     )  # its model has that camera right
+
+
+def test_a_page_that_would_replace_another_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    (tmp_path / "page.html").touch()
+    monkeypatch.setattr(importlib.import_module("sfm_shapefit.pipeline.check"), "check", None)
+    page = ("--report", tmp_path / "page.html")
+    assert "exists already" in run_refused("check", RING / "sparse" / "0", *page)
 
 
 def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
