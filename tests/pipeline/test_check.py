@@ -130,6 +130,13 @@ def test_what_map_doubts_check_does_not_call_good():
         assert "image_undistorter" not in replace(found.facts, evidence=unlike).next_step.command
 
 
+def test_a_weak_camera_that_stands_where_another_model_has_it_is_not_named(monkeypatch):
+    monkeypatch.setattr(checked, "_FEWEST_POINTS", 10**6)
+    for second_opinion, num_named in ((False, 8), (True, 0)):
+        found = check(RING / "sparse/0", RING / "database.db", second_opinion=second_opinion)
+        assert len(found.verdict.cameras) == num_named
+
+
 def test_a_camera_that_has_two_places_in_the_other_model_is_not_confirmed(courtyard_mapped):
     located = courtyard_mapped.models[0].located
     place = OtherPlace(4, 3, 5, np.ones(3), np.zeros((3, 2), dtype=int))
