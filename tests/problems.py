@@ -13,7 +13,7 @@ from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.engine import Goal
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
-from sfm_shapefit.solver.splitting.shapefit import AdmmResult, Splitting
+from sfm_shapefit.solver.splitting.split_then_newton import AdmmResult, Splitting
 
 Floats = npt.NDArray[np.float64]
 

@@ -95,13 +95,12 @@ def condition(
     loose[num_cameras:] = False
     labels = connected_components(n, used[loose[used].all(axis=1)])
     causes: list[Looseness | None] = [None] * num_cameras
-    for camera in np.flatnonzero(loose).tolist():
-        causes[camera] = _cause(int(num_pairs[camera]), float(narrowness[camera]), float(largest[camera]))
     groups = []
     for label in np.unique(labels[loose]).tolist():
         members = np.flatnonzero(loose & (labels == label))
         is_straight = _is_straight(locations[members])
         for camera in members.tolist():
+            causes[camera] = _cause(int(num_pairs[camera]), float(narrowness[camera]), float(largest[camera]))
             if is_undetermined[camera]:
                 causes[camera] = Looseness.DISTANCE
             elif is_straight:

@@ -148,16 +148,8 @@ def _rays_of(cameras: PieceCameras, ties: PieceTies) -> _Rays:
         pairs = pair_of[rows]
         eyes, others = ties.matches.pairs[pairs, way], ties.matches.pairs[pairs, 1 - way]
         looks = np.einsum("rk,rkl->rl", rays[rows], cameras.rotations[eyes])
-        found.append(
-            _Rays(
-                eyes,
-                looks,
-                cameras.piece_of[others],
-                ties.points[rows, 1 - way],
-                pairs,
-                ties.matches.pixel_angles[pairs],
-            )
-        )
+        targets, points = cameras.piece_of[others], ties.points[rows, 1 - way]
+        found.append((eyes, looks, targets, points, pairs, ties.matches.pixel_angles[pairs]))
     return _Rays(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

@@ -7,7 +7,7 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -174,7 +174,12 @@ def place_pieces(
         UnsolvableError: if a graph of many cameras has no three that are rigid, if the pairs do not tie its
             rigid groups to one another, or see `solve`.
     """
-    pieces = _split(measured, options)
+    if measured.groups is not None:
+        refuse_admm(options.solver)
+        pieces = [find_tied_piece(measured)]
+    else:
+        pieces = order_pieces(measured.graph, measured.num_cameras)
+        refuse_without_triangle(measured, pieces)
     how = _How(options, near, certified)
     yield _place_piece(measured, pieces, 0, how, on_iteration)
     for k in range(1, count_large(pieces, measured.num_cameras)):
@@ -200,7 +205,19 @@ def _place_piece(
 ) -> Placement:
     """Solve piece k, refine it robustly, and see which directions agree."""
     part, _ = measured.part(pieces[k].edges)
-    solved, history = _solve_part(part, how, on_iteration)
+    history: list[IterationInfo] = []
+
+    def watch(info: IterationInfo) -> bool | None:
+        history.append(info)
+        return None if on_iteration is None else on_iteration(info)
+
+    solved = solve(
+        part.graph,
+        how.options.solver.at_scale(part.graph.num_edges),
+        groups=part.groups,
+        on_iteration=watch if part.graph.num_edges <= _MOST_WATCHED else None,
+        certified=how.certified,
+    )
     nodes, near = pieces[k].nodes, how.near
     centers = None if near is None else near.locations[nodes[nodes < measured.num_cameras]]
     if near is None or centers is None or not np.isfinite(centers).all():
@@ -215,47 +232,16 @@ def _place_piece(
         certified=solved,
         refined=refined,
         agreement=find_agreement(part, refined.locations, refined.right),
-        history=history,
+        history=tuple(history),
         unit=unit,
     )
 
 
 @one_blas_thread()
 def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
-    """Return a placement with other locations of the same nodes, and which directions agree with these.
-
-    What was judged of a placement is not of these.
-    """
-    moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
-    moved["refined"] = refined
-    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations, refined.right)
-    return Placement(**moved)
-
-
-def _split(measured: MeasuredGraph, options: PlacementOptions) -> list[RigidPiece]:
-    """Return the pieces, most cameras first; or the one of tied rigid groups."""
-    if measured.groups is not None:
-        refuse_admm(options.solver)
-        return [find_tied_piece(measured)]
-    pieces = order_pieces(measured.graph, measured.num_cameras)
-    refuse_without_triangle(measured, pieces)
-    return pieces
-
-
-def _solve_part(
-    part: MeasuredGraph, how: _How, on_iteration: OnIteration | None
-) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
-    """Return the optimum of the convex program, and the iterations that led to it."""
-    history: list[IterationInfo] = []
-    options = how.options.solver.at_scale(part.graph.num_edges)
-
-    def watch(info: IterationInfo) -> bool | None:
-        history.append(info)
-        return None if on_iteration is None else on_iteration(info)
-
-    watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
-    solved = solve(part.graph, options, groups=part.groups, on_iteration=watched, certified=how.certified)
-    return solved, tuple(history)
+    """Return a placement with other locations of the same nodes, and which directions agree with these."""
+    agreement = find_agreement(placement.measured_part(), refined.locations, refined.right)
+    return replace(placement, refined=refined, agreement=agreement)
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

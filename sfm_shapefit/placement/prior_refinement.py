@@ -37,13 +37,8 @@ def pull_to_priors(
     """Return the placement refined on directions and priors together.
 
     A camera that the refinement had thrown out of the scene and put back stays undetermined, unless a prior
-    holds it where it is now. UnsolvableError if the factor would take more memory than the options allow.
-
-    Args:
-        placement: cameras placed by directions, and points with them.
-        gauge: gauge in which the priors are, from `prior_gauge`.
-        priors: priors of the images.
-        options: as they were given to `place`.
+    holds it where it is now. The gauge is that of the priors, from `prior_gauge`; the options are those of
+    the placement. UnsolvableError if the factor would take more memory than they allow.
     """
     part, refined = placement.measured_part(), placement.refined
     own = priors.of(placement.nodes).known

@@ -58,11 +58,8 @@ def find_second_configuration(
 ) -> SecondConfiguration | None:
     """Return the placement that the rejected pairs agree on, if they do.
 
-    Args:
-        graph: the solved view graph.
-        judged: its pairs of cameras, without directions to points.
-        inliers: (m,) which edges agree with the solution.
-        level_deg: standard deviation of the agreeing residuals, per axis.
+    Only pairs of cameras are `judged`, not directions to points; inliers (m,) agree with the solution, with
+    residuals of standard deviation `level_deg` per axis.
     """
     rejected = judged[~inliers[judged]]
     agreeing = len(judged) - len(rejected)

@@ -16,7 +16,7 @@ import warnings
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, hstack
+from scipy.sparse import bsr_array, coo_array, csr_array, hstack, kron
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import UnsolvableError
@@ -75,25 +75,20 @@ def solve_conic(
 def _operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
     """Return the sparse map from (t_0, ..., t_{n-1}) to all B_e^T (t_i - t_j), stacked edge by edge."""
     m, d, k = bases.shape
-    rows = np.broadcast_to((np.arange(m)[:, None] * k + np.arange(k))[:, None, :], (m, d, k))
-    parts: list[tuple[Any, Any, Any]] = []
-    for end, sign in ((0, 1.0), (1, -1.0)):
-        nodes = graph.edges[:, end]
-        columns = np.broadcast_to((nodes[:, None] * d + np.arange(d))[:, :, None], (m, d, k))
-        parts.append((sign * bases.ravel(), rows.ravel(), columns.ravel()))
-    values, row, column = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return coo_array((values, (row, column)), shape=(m * k, graph.num_nodes * d)).tocsr()
+    signs = np.tile([1.0, -1.0], m), (np.repeat(np.arange(m), 2), graph.edges.ravel())
+    incidence = coo_array(signs, shape=(m, graph.num_nodes))
+    across = bsr_array((bases.transpose(0, 2, 1), np.arange(m), np.arange(m + 1)), shape=(m * k, m * d))
+    return csr_array(across @ kron(incidence, np.eye(d)))
 
 
 def _reduction(groups: RigidGroups) -> csr_array:
     """Return A without the columns of group 0, which is grounded, and without those of s without offsets."""
     n, d = groups.offsets.shape
-    rows = np.arange(n * d)
-    columns = (groups.group_of[:, None] * d + np.arange(d)).ravel()
-    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, groups.num_groups * d)).tocsc()[:, d:]
+    belongs = coo_array((np.ones(n), (np.arange(n), groups.group_of)), shape=(n, groups.num_groups))
+    moving = csr_array(kron(belongs, np.eye(d)))[:, d:]
     if not groups.offsets.any():
-        return csr_array(moving)
-    scaled = (groups.offsets.ravel(), (rows, np.repeat(groups.units, d)))
+        return moving
+    scaled = (groups.offsets.ravel(), (np.arange(n * d), np.repeat(groups.units, d)))
     return csr_array(hstack([moving, coo_array(scaled, shape=(n * d, groups.num_units))]))
 
 

@@ -51,9 +51,7 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
     Formed explicitly: sqrt(||x||^2 - <x, v>^2) would lose half of the digits.
     """
-    transverse = np.empty(x.shape)
-    _across(x, v, transverse)
-    return transverse
+    return x - along(x, v)[:, None] * v
 
 
 def scale_functional(graph: ViewGraph) -> FloatArray:
@@ -97,16 +95,6 @@ def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
         for k in range(y.shape[1]):
             out[edges[e, 0], k] += y[e, k]
             out[edges[e, 1], k] -= y[e, k]
-
-
-@kernel
-def _across(x: Any, v: Any, out: Any) -> None:
-    for e in range(len(x)):
-        length = 0.0
-        for k in range(x.shape[1]):
-            length += x[e, k] * v[e, k]
-        for k in range(x.shape[1]):
-            out[e, k] = x[e, k] - length * v[e, k]
 
 
 def _sums_of(graph: ViewGraph, t: FloatArray) -> tuple[float, float]:

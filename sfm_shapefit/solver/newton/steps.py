@@ -221,20 +221,8 @@ def answer(
     """Return locations and dual of a graph; at an objective of 0, up to the tolerance, y = 0 proves it."""
     if progress.objective <= tol:
         iterate.feasible[:] = 0.0
-    dual = np.empty_like(problem.v)
-    _set_dual(problem.basis, iterate.feasible, dual)
+    dual = np.einsum("ekq,eq->ek", problem.basis, iterate.feasible)
     return np.ascontiguousarray(iterate.t[:, :dimension]), np.ascontiguousarray(dual[:, :dimension])
-
-
-@kernel
-def _set_dual(basis: Any, y: Any, dual: Any) -> None:
-    """Write B_e y_e."""
-    for e in range(len(dual)):
-        for k in range(basis.shape[1]):
-            x = 0.0
-            for q in range(basis.shape[2]):
-                x += basis[e, k, q] * y[e, q]
-            dual[e, k] = x
 
 
 @kernel

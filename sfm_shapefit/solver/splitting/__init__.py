@@ -4,7 +4,6 @@ edges              the proximal step, fused into one pass over the edges
 anderson           acceleration of the iteration
 linear             the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
 engine             the iteration that both programs share
-shapefit           a run of ShapeFit that can be continued
 split_then_newton  ShapeFit to a proven gap
 lud                LUD
 """

@@ -41,8 +41,6 @@ class LudResult:
 
     locations: FloatArray
     """(n, d) centered; the least edge length is about 1."""
-    lengths: FloatArray
-    """(m,) s_e >= 1, the best ones for the locations."""
     objective: float
     """sum_e w_e ||t_i - t_j - s_e v_e||."""
     dual_bound: float
@@ -92,7 +90,6 @@ def solve_lud(
         bound, residual = _dual_bound(graph, dual, factor)
     return LudResult(
         locations=t,
-        lengths=lengths,
         objective=float(graph.weights @ deviations),
         dual_bound=bound,
         equality_residual=residual,
