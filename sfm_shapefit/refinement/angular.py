@@ -55,6 +55,9 @@ KERNEL_WIDTH = 3.0
 DAMPING = DampingRange()
 """Damping of the steps, relative to the damping matrix of `AngularTerms`."""
 
+ALIKE = 1e-6
+"""Relative difference of costs; closer ones are those of the same place."""
+
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 # On exact data a smaller level would reject pairs for their rounding.
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH
@@ -66,7 +69,6 @@ _CONVERGED = 1e-9  # relative decrease of the cost; a smaller one counts as none
 _STILL = 1e-6  # share of the extent; a smaller move of all but a tenth of the nodes counts as none
 # Likewise by level, where a step is dear: noise of a level moves the nodes of boxes of 1e4 by .03 of it.
 _STILL_PER_LEVEL = 1e-3
-_ALIKE = 1e-6  # relative difference of costs; closer ones are those of the same place
 _HOPELESS = 20.0  # last decreases; a cost above the best one by more does not catch up
 _FARTHEST = 1e6  # median spreads; of nodes farther out the others are one point, whose shape is rounded away
 _MAX_STEPS = 60  # steps, a bound; 15 to 40 are needed
@@ -152,7 +154,7 @@ def refine_angles(
 
 def _is_decided(before: float, after: float, other_cost: float) -> bool:
     """Whether a cost has reached another, or stays above it even if it falls many times as much again."""
-    return abs(after - other_cost) <= _ALIKE * other_cost or after - other_cost > _HOPELESS * (before - after)
+    return abs(after - other_cost) <= ALIKE * other_cost or after - other_cost > _HOPELESS * (before - after)
 
 
 def robust_cost(measured: MeasuredGraph, locations: FloatArray, levels: FloatArray) -> float:

@@ -150,12 +150,8 @@ def put_by_consensus(
 ) -> FloatArray:
     """Return locations (n, d) with each node where most of its rays meet; worst nodes first.
 
-    Args:
-        graph: the directions.
-        locations: (n, d).
-        log_odds: (m,) log odds that a pair is right.
-        variances: (m,) s_e^2 of each direction.
-        sweeps: visits of all nodes, at most.
+    Pairs are right with `log_odds` (m,), their directions have the variances s_e^2 (m,). Nodes are visited in
+    so many sweeps at most.
     """
     variances = np.maximum(variances, _LEAST_LEVEL_RAD**2)
     fit = np.repeat(np.exp(-0.5 * residual_angles(graph, locations) ** 2 / variances), 2)
@@ -163,13 +159,8 @@ def put_by_consensus(
     peak = log_odds + log_ratio(np.zeros_like(variances), variances, graph.dimension)
     middle, radius = _middle_and_radius(locations)
     around, moved = adjacency(graph.num_nodes, graph.edges), locations.copy()
-    rays = (
-        (around.pointers, around.neighbors, around.edge_of),
-        graph.edges,
-        graph.directions,
-        peak,
-        variances,
-    )
+    structure = (around.pointers, around.neighbors, around.edge_of)
+    rays = (structure, graph.edges, graph.directions, peak, variances)
     has_moved = np.ones(graph.num_nodes, dtype=np.bool_)
     for _ in range(sweeps):
         _resect(rays, order, moved, has_moved, middle, _REACH * radius)

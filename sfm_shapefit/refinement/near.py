@@ -24,11 +24,8 @@ def stay_near(
 ) -> RefinedPlacement:
     """Return the locations of cameras that an adjustment has placed, and points where their rays meet.
 
-    Args:
-        measured: a piece.
-        solved: its certified solution.
-        centers: (k, 3) adjusted centers of its cameras, in any scale and from any origin, in the same axes.
-        first: the placement that was adjusted.
+    The centers (k, 3) are those of the cameras of a piece whose certified solution is given, in any scale and
+    from any origin, in the same axes; `first` is the placement that was adjusted.
     """
     graph, there = measured.graph, solved.locations[: len(centers)]
     cap = _CAP_OF_SIZE * median_spread(there)

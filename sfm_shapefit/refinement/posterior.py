@@ -236,10 +236,8 @@ def _sweep(sides: Any, ratio: Any, prior: float, sweeps: int, messages: Any, log
 
     `prior` is in log odds. Within a sweep all messages answer those of the sweep before.
     """
-    m = len(log_odds)
     for sweep in range(sweeps + 1):
-        for e in range(m):
-            log_odds[e] = 0.0
+        log_odds[:] = 0.0
         for t in range(len(sides)):
             for q in range(3):
                 log_odds[sides[t, q]] += messages[t, q]

@@ -21,6 +21,7 @@ from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.refinement.angular import (
+    ALIKE,
     AngularResult,
     fitting_pairs,
     plan_refinement,
@@ -395,7 +396,7 @@ def _choose(
     if _is_point(graph, by_name["ShapeFit"].best) and not _is_point(graph, by_name["LUD"].best):
         return by_name["LUD"], "most cameras of the other start stand in one point"
     difference = costs["LUD"] - costs["ShapeFit"]
-    name = "LUD" if difference < 0.0 else "ShapeFit"
+    name = "LUD" if difference < -ALIKE * costs["ShapeFit"] else "ShapeFit"  # not as rounding has it
     if apart <= COLLAPSED:
         reason = f"the starts' lengths differ by {apart:.0%}, not by a collapse; {name} fits no worse"
     elif abs(difference) <= _TIE * min(costs.values()):

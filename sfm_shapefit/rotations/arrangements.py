@@ -106,13 +106,9 @@ def choose_arrangement(
     averaged: AveragedRotations,
     average: Callable[[RelativeRotations], AveragedRotations],
 ) -> Chosen:
-    """Return the averaged rotations, or others that the matches clearly speak for.
+    """Return the rotations averaged by k pairs, or others that their evidence (k,) clearly speaks for.
 
-    Args:
-        relative: k pairs.
-        evidence: (k,) for each of them, see `evidence_of`.
-        averaged: the rotations by all of them.
-        average: how rotations are averaged, given some of them.
+    `average` returns the rotations by some of the pairs.
     """
     plain, best = _arrange(relative, evidence, averaged), None
     for least in _LEAST_SHARES:

@@ -90,8 +90,7 @@ def reweigh_pairs(
 ) -> None:
     """Fill robust weights (k,), weights / (1 + (|x| / scale)^2)^2, and the gradient D^T W x (n, 3)."""
     x = np.empty(3)
-    for i in range(len(gradient)):
-        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    gradient[:] = 0.0
     for e in range(len(pairs)):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
@@ -135,17 +134,14 @@ def weigh_blocks(
     Pairs whose residual angle is beyond `limit`, in radians, have the length NaN and the block 0.
     """
     x, r, hr, hx, half = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(4)
-    for i in range(len(gradient)):
-        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    gradient[:] = 0.0
     for e in range(len(pairs)):
         i, j = pairs[e, 0], pairs[e, 1]
         square = _world_residual(measured[e], turns[i], turns[j], x)
         block = blocks[e]
         if square > limit * limit:
             distances[e] = np.nan
-            for a in range(3):
-                for b in range(3):
-                    block[a, b] = 0.0
+            block[:] = 0.0
             continue
         for a in range(4):
             half[a] = turns[j, a]

@@ -26,13 +26,10 @@ Relative to the mean turn of some cameras only, P is I - 1 u^T with their shares
 shifted to u^T x = 0, and 1/n is u_i.
 """
 
-from typing import Any
-
 import numpy as np
 
-from sfm_shapefit.base.arrays import BoolArray, FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray, sum_by
 from sfm_shapefit.base.forests import connected_components
-from sfm_shapefit.base.jit import kernel
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
 from sfm_shapefit.rotations.averaging_system import RIDGE, AveragingSystem, plan_system
@@ -126,9 +123,12 @@ def _sampled(
     own = np.linalg.inv(system.sum_at_nodes(last.blocks))
     apply = system.block_operator(last.blocks)
     share = references / references.sum()
-    total, right = np.zeros(n), np.empty((n, 3))
+    total, roots, (i, j) = np.zeros(n), np.zeros((k, 3, 3)), system.pairs.T
+    counts = last.blocks[:, 0, 0] > 0.0
+    roots[counts] = np.linalg.cholesky(last.blocks[counts])
     for _ in range(_SAMPLES):
-        draw_right_side(system.pairs, last.blocks, rng.normal(size=(k, 3)), right)
+        pulls = np.einsum("kab,kb->ka", roots, rng.normal(size=(k, 3)))
+        right = sum_by(i, pulls, n) - sum_by(j, pulls, n)  # D^T B^(1/2) g
         x = system.solve_blocks(last.blocks, right, _REDUCTION)
         x = x - x[references].mean(axis=0)
         # A m = A x - L x.
@@ -136,27 +136,3 @@ def _sampled(
         total += np.sum(((1.0 - share)[:, None] * around + share[:, None] * x) ** 2, axis=1)
     exact = (1.0 - share) ** 2 * np.trace(own, axis1=1, axis2=2)
     return (exact + total / _SAMPLES) / 3.0, np.full(k, (n - 1) / np.sum(~np.isnan(last.distances)))
-
-
-@kernel
-def draw_right_side(pairs: Any, blocks: Any, normals: Any, right: Any) -> None:
-    """Fill D^T B^(1/2) g, (n, 3), with Cholesky factors as roots of the blocks (k, 3, 3)."""
-    for i in range(len(right)):
-        right[i, 0], right[i, 1], right[i, 2] = 0.0, 0.0, 0.0
-    for e in range(len(pairs)):
-        b, g = blocks[e], normals[e]
-        if b[0, 0] <= 0.0:
-            continue
-        l00 = np.sqrt(b[0, 0])
-        l10, l20 = b[1, 0] / l00, b[2, 0] / l00
-        l11 = np.sqrt(max(b[1, 1] - l10 * l10, 0.0))
-        l21 = (b[2, 1] - l20 * l10) / l11 if l11 > 0.0 else 0.0
-        l22 = np.sqrt(max(b[2, 2] - l20 * l20 - l21 * l21, 0.0))
-        i, j = pairs[e, 0], pairs[e, 1]
-        r0, r1, r2 = l00 * g[0], l10 * g[0] + l11 * g[1], l20 * g[0] + l21 * g[1] + l22 * g[2]
-        right[i, 0] += r0
-        right[i, 1] += r1
-        right[i, 2] += r2
-        right[j, 0] -= r0
-        right[j, 1] -= r1
-        right[j, 2] -= r2
