@@ -8,7 +8,7 @@ import pycolmap
 
 from sfm_shapefit.adjustment import bundle_adjustment
 from sfm_shapefit.adjustment.estimate import Estimate
-from sfm_shapefit.adjustment.freedom import Freedom
+from sfm_shapefit.adjustment.freedom import Freedom, GivenPoses
 from sfm_shapefit.adjustment.sources import Links, collect_matches, collect_tracks
 from sfm_shapefit.adjustment.structure import triangulate
 from sfm_shapefit.files.colmap.images import images_of, put_images
@@ -112,7 +112,8 @@ def placed(seed, estimate):
 def bundle_adjusted(seed, tracks, options=None, freedom=None):
     links, freedom = links_of(seed, tracks), freedom or Freedom()
     options = options or StructureOptions()
-    estimate, points = bundle_adjustment.adjust_seed(posed_images(seed), links, options, freedom)
+    images = posed_images(seed)
+    estimate, points = bundle_adjustment.adjust_seed(images, links, options, freedom, GivenPoses())
     found = placed(seed, estimate)
     structure = with_points(found.reconstruction, points, options)
     if isinstance(tracks, pycolmap.Reconstruction):
@@ -133,4 +134,4 @@ def adjusted_placement(seed, tracks, **freedom):
     """`freedom`: fields of `Freedom`; the matches decide about rotations."""
     free, links = Freedom(pull_rad=None, **freedom), links_of(seed, tracks)
     options, images = StructureOptions(), posed_images(seed)
-    return placed(seed, bundle_adjustment.adjust_placement(images, links, options, free))
+    return placed(seed, bundle_adjustment.adjust_placement(images, links, options, free, GivenPoses()))

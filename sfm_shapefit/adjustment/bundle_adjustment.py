@@ -18,7 +18,6 @@ from sfm_shapefit.scene.points import Points
 from sfm_shapefit.tracks.options import StructureOptions
 
 _MANY_FRAMES = 1_000  # frames whose poses, if they are fine, need no coarse solve; it is half of the time
-_NOTHING_GIVEN = GivenPoses()
 
 
 def adjust_seed(
@@ -26,16 +25,9 @@ def adjust_seed(
     links: Links,
     options: StructureOptions,
     freedom: Freedom,
-    given: GivenPoses = _NOTHING_GIVEN,
+    given: GivenPoses,
 ) -> tuple[Estimate, Points]:
-    """Adjust poses and points together, starting from the poses of `images`, all of them posed.
-
-    Args:
-        images: the start.
-        links: of these images; points are triangulated from them.
-        options: filters.
-        freedom: what moves.
-        given: what is known of the poses.
+    """Adjust poses, and points that are triangulated from links, from where all `images` are posed.
 
     Returns:
         The images where they stand now, and the points, not filtered yet. The gauge stays that of the start
@@ -85,7 +77,7 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = steps.begin(images, read_links(), options, freedom, _NOTHING_GIVEN)
+    run = steps.begin(images, read_links(), options, freedom, GivenPoses())
     only_lenses = lenses_wanted and not rotations_known
     if run.frees_more_than_poses:
         by_all = not only_lenses and len(images.frames.ids) <= MOST_FRAMES
@@ -116,19 +108,11 @@ def adjust_placement(
     links: Links,
     options: StructureOptions,
     freedom: Freedom,
-    given: GivenPoses = _NOTHING_GIVEN,
+    given: GivenPoses,
 ) -> Estimate:
-    """Adjust placed images whose rotations were given, on all tracks at once.
+    """Adjust images, all of them posed, whose rotations were given, on all tracks at once.
 
-    Args:
-        images: the start, all of them posed.
-        links: of these images.
-        options: filters.
-        freedom: what moves; rotations as the matches decide, if they are to.
-        given: what is known of the poses.
-
-    Raises:
-        UnsolvableError: if no point can be triangulated.
+    Rotations move as the matches decide, if they are to. UnsolvableError if no point can be triangulated.
     """
     run, errors = steps.begin(images, links, options, replace(freedom, pull_rad=np.inf), given), None
     if run.frees_more_than_poses:  # points are found, and rotations judged, with what comes out

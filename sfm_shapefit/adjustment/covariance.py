@@ -32,6 +32,7 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.scipy_parts import dgeqp3
 from sfm_shapefit.base.settings import merge_options
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.laplacian.selected import regauged
 from sfm_shapefit.scene.lens import FOCAL_LENGTHS
 
 # Shares added to the diagonal, tried in turn; what nothing holds becomes large, not singular.
@@ -84,10 +85,10 @@ def estimate_covariances(
     blocks = system.factor.inverse_blocks()
     nodes = system.seen_nodes() if deciding is None else system.layout.node_of_frame[deciding]
     if system.free.size:
-        regauged = partial(_transform, blocks, system.factor, system.motions)
+        moved_to = partial(regauged, blocks, system.factor.solve, system.motions)
         if deciding is None:
-            nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", regauged(dual)[:, :3, :3]))
-        blocks = regauged(_dual(system.motions, nodes))
+            nodes = system.steady_nodes(lambda dual: np.einsum("naa->n", moved_to(dual)[:, :3, :3]))
+        blocks = moved_to(_dual(system.motions, nodes))
     blocks *= options.noise_px**2
     layout = system.layout
     return FrameCovariances(
@@ -119,9 +120,9 @@ class GroundedSystem:
         moved = self.factor.solve(np.ascontiguousarray(right))
         if not (gauge and self.free.size):
             return moved
-        regauged = partial(self._regauge, moved)
-        nodes = self.steady_nodes(lambda dual: np.sum(regauged(dual)[:, :3] ** 2, axis=(1, 2)))
-        return regauged(_dual(self.motions, nodes))
+        moved_to = partial(self._regauge, moved)
+        nodes = self.steady_nodes(lambda dual: np.sum(moved_to(dual)[:, :3] ** 2, axis=(1, 2)))
+        return moved_to(_dual(self.motions, nodes))
 
     def _regauge(self, moved: FloatArray, dual: FloatArray) -> FloatArray:
         """Return moves (N, 6, r) less the motions that a dual reads off them."""
@@ -223,19 +224,6 @@ def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
         except UnsolvableError:
             if ridge == _RIDGES[-1]:
                 raise
-
-
-def _transform(
-    blocks: FloatArray, factor: ReducedFactor, motions: FloatArray, dual: FloatArray
-) -> FloatArray:
-    """Return the diagonal blocks of Z K^-1 Z^T."""
-    solved = factor.solve(dual)
-    middle = np.einsum("nai,naj->ij", dual, solved)
-    cross = motions @ solved.transpose(0, 2, 1)
-    transformed: FloatArray = (
-        blocks - cross - cross.transpose(0, 2, 1) + motions @ middle @ motions.transpose(0, 2, 1)
-    )
-    return transformed
 
 
 def _dual(motions: FloatArray, nodes: IntArray) -> FloatArray:

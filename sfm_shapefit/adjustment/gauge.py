@@ -70,12 +70,9 @@ def _null_space(matrix: FloatArray) -> FloatArray:
 
 @one_blas_thread()  # matrices this small keep other threads waiting for hundreds of times as long
 def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) -> Values:
-    """Return the values moved by the free similarity that brings their centers closest to the problem's.
+    """Return the values moved by that similarity of the `free_similarities` that brings centers nearest.
 
-    Args:
-        problem: the start.
-        values: an adjustment's answer.
-        free: from `free_similarities`.
+    It is to the centers of the problem, the start.
     """
     if free.shape[1] == _DIMENSION:
         motion = _best_similarity(problem, values)

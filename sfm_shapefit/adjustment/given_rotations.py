@@ -34,7 +34,7 @@ from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
-from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.geometry import mean_rotation_l1
 from sfm_shapefit.base.quaternions import rotation_vectors
 
@@ -159,7 +159,7 @@ def _draw_halves(problem: AdjustmentProblem, options: AdjustmentOptions, seed: i
     is_first = np.random.default_rng(seed).permutation(problem.num_points) % 2 == 0
     halves = [problem.of_points(half) for half in (is_first, ~is_first)]
     ends = [adjust(half, options).problem for half in halves]
-    seen = np.min([_count_observations(half) for half in halves], axis=0)
+    seen = np.min([np.bincount(half.frames_seeing(), minlength=half.num_frames) for half in halves], axis=0)
     known = (seen >= _FEWEST_POINTS) & ~problem.fixed
     errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
     agreement, chance = np.zeros(problem.num_frames), np.zeros(problem.num_frames)
@@ -176,8 +176,3 @@ def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
     if not problem.fixed.any():
         given = given @ mean_rotation_l1(given.transpose(0, 2, 1) @ rotations)
     return rotation_vectors(rotations @ given.transpose(0, 2, 1))
-
-
-def _count_observations(problem: AdjustmentProblem) -> IntArray:
-    """Return how many observations each frame has, (n,)."""
-    return np.bincount(problem.frames_seeing(), minlength=problem.num_frames).astype(np.int64)

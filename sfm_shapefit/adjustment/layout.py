@@ -213,11 +213,7 @@ def _pack(problem: AdjustmentProblem, sizes: IntArray) -> tuple[IntArray, IntArr
     """Return the pack of each lens (l,), -1 if it is held, and the first of its slots there.
 
     Each lens takes in those that share most points with it, as long as there is room and these are a tenth of
-    its own: what is apart would else meet in a block.
-
-    Args:
-        problem: the observations.
-        sizes: (l,) number of unknowns of each lens.
+    its own: what is apart would else meet in a block. `sizes` (l,) are the lenses' numbers of unknowns.
     """
     packs, first_slots = np.full(len(sizes), -1), np.zeros(len(sizes), np.int64)
     small = np.flatnonzero((sizes > 0) & (2 * sizes <= SLOTS))
@@ -261,9 +257,7 @@ def _entries(point: IntArray, nodes: IntArray, num_nodes: int) -> tuple[IntArray
 def _links(nodes: IntArray, camera: IntArray) -> tuple[IntArray, IntArray]:
     """Return the nodes that an observation ties, and the places of each camera's three ties (3, c), or -1.
 
-    Args:
-        nodes: (3, c) of each camera's frame, lens and sensor.
-        camera: of each observation.
+    The nodes (3, c) are those of each camera's frame, lens and sensor, `camera` that of each observation.
     """
     sees = np.zeros(nodes.shape[1], np.bool_)
     sees[camera] = True

@@ -12,7 +12,7 @@ import numpy as np
 from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import NormalEquations, Values
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.quaternions import rotation_vectors
 
 _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
@@ -33,35 +33,20 @@ def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> f
     return 0.5 * noise_px**2 * total
 
 
-def add_rotation_prior(
-    problem: AdjustmentProblem, values: Values, noise_px: float, blocks: FloatArray, gradients: FloatArray
-) -> None:
-    """Add the rotation prior to the blocks (n, 3, 3) and gradients (n, 3) of the rotations of all frames."""
-    if problem.rotation_prior is None:
-        return
-    d = _turns(problem, values)
-    jacobian = _inverse_left_jacobians(d)
-    pulled = noise_px**2 * jacobian.transpose(0, 2, 1) @ problem.rotation_prior.information
-    blocks += pulled @ jacobian
-    gradients += np.einsum("nab,nb->na", pulled, d)
-
-
-def add_center_prior(
-    problem: AdjustmentProblem, values: Values, noise_px: float, blocks: FloatArray, gradients: FloatArray
-) -> None:
-    """Add the center prior to the blocks (n, 3, 3) and gradients (n, 3) of the centers of all frames."""
-    prior = problem.center_prior
-    if prior is None:
-        return
-    information = noise_px**2 * prior.information
-    blocks[prior.indices] += information
-    gradients[prior.indices] += np.einsum("kab,kb->ka", information, prior.off(values.centers))
-
-
-def add_lens_prior(
+def add_priors(
     problem: AdjustmentProblem, layout: Layout, values: Values, noise_px: float, normal: NormalEquations
 ) -> None:
-    """Add the lens prior to the normal equations of the lenses that have a node."""
+    """Add all priors to the normal equations, but for those of rotations where these are held."""
+    if (centers := problem.center_prior) is not None:
+        pulled = noise_px**2 * centers.information
+        gradients = np.einsum("kab,kb->ka", pulled, centers.off(values.centers))
+        _add(layout.node_of_frame[centers.indices], slice(0, 3), pulled, gradients, normal)
+    if problem.rotation_prior is not None and layout.turns:
+        d = _turns(problem, values)
+        jacobian = _inverse_left_jacobians(d)
+        pulled = noise_px**2 * jacobian.transpose(0, 2, 1) @ problem.rotation_prior.information
+        gradients = np.einsum("nab,nb->na", pulled, d)
+        _add(layout.node_of_frame, slice(3, 6), pulled @ jacobian, gradients, normal)
     if problem.lens_prior is None:
         return
     information = noise_px**2 * _lens_information(problem)
@@ -70,6 +55,15 @@ def add_lens_prior(
     pulled = information[lens, value]
     normal.nodes[node, slot, slot] += pulled
     normal.node_gradients[node, slot] += pulled * (values.lenses - problem.lens_prior.values)[lens, value]
+
+
+def _add(
+    nodes: IntArray, slots: slice, blocks: FloatArray, gradients: FloatArray, normal: NormalEquations
+) -> None:
+    """Add blocks (k, 3, 3) and gradients (k, 3) to some slots of the nodes of k frames, -1 for fixed ones."""
+    moves = nodes >= 0
+    normal.nodes[nodes[moves], slots, slots] += blocks[moves]
+    normal.node_gradients[nodes[moves], slots] += gradients[moves]
 
 
 def _lens_information(problem: AdjustmentProblem) -> FloatArray:

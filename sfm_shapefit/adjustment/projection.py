@@ -50,8 +50,13 @@ def miss(views: Any, camera: int, u: float, v: float, observed: Any, k: int) -> 
 
 
 @inner_kernel
-def differentiate(views: Any, camera: int, u: float, v: float) -> tuple[float, float, float, float]:
-    """Return the derivatives of the pixel by u and v: x by both, then y by both."""
+def differentiate_by_point(
+    views: Any, camera: int, u: float, v: float, inverse: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return the derivatives of the pixel by the point in axes of the camera: x by it, then y.
+
+    `inverse` is that of the point's depth.
+    """
     f, g = views[camera, LENS], views[camera, LENS + 1]
     k1, k2 = views[camera, LENS + 4], views[camera, LENS + 5]
     p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
@@ -60,25 +65,8 @@ def differentiate(views: Any, camera: int, u: float, v: float) -> tuple[float, f
     # Twice the slope of the radial factor by s.
     slope = 2.0 * (k1 + 2.0 * s * k2)
     mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
-    return (
-        f * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u),
-        f * mixed,
-        g * mixed,
-        g * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v),
-    )
-
-
-@inner_kernel
-def differentiate_by_point(
-    views: Any, camera: int, u: float, v: float, inverse: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return the derivatives of the pixel by the point in axes of the camera: x by it, then y.
-
-    Args:
-        views, camera, u, v: as of `differentiate`.
-        inverse: of the point's depth.
-    """
-    x_by_u, x_by_v, y_by_u, y_by_v = differentiate(views, camera, u, v)
+    x_by_u, x_by_v = f * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u), f * mixed
+    y_by_u, y_by_v = g * mixed, g * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v)
     return (
         x_by_u * inverse,
         x_by_v * inverse,

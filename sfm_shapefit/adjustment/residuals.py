@@ -188,10 +188,7 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
     by_point, by_values = np.empty((2, 3)), np.zeros((2, NUM_VALUES))
     by_lens, by_sensor, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS)), np.zeros((2, SLOTS))
     for p in range(begin, end):
-        for e in range(first_entry[p], first_entry[p + 1]):
-            for a in range(3):
-                for c in range(SLOTS):
-                    entries[e, a, c] = 0.0
+        entries[first_entry[p] : first_entry[p + 1]] = 0.0
         v00, v01, v02, v11, v12, v22, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]

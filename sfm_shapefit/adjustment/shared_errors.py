@@ -40,7 +40,15 @@ from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.projection import SHIFT, differentiate, is_ahead, look, miss, turn_to_frame
+from sfm_shapefit.adjustment.projection import (
+    SHIFT,
+    differentiate_by_point,
+    is_ahead,
+    look,
+    miss,
+    turn_to_frame,
+    turn_to_world,
+)
 from sfm_shapefit.adjustment.residuals import kernel_inputs
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.base.arrays import FloatArray, IntArray
@@ -402,14 +410,13 @@ def _differentiate_by_frame(
         point: less the frame's center, in axes of the camera. u, v: of its ray. z: its depth.
         by_point, by_frame: are written.
     """
-    slopes = differentiate(views, camera, u, v)
+    slopes = differentiate_by_point(views, camera, u, v, 1.0 / z)
     b0, b1, b2 = turn_to_frame(views, camera, point[0], point[1], point[2])
     for axis in range(2):
-        by_u, by_v = slopes[2 * axis], slopes[2 * axis + 1]
-        j0, j1, j2 = by_u / z, by_v / z, -(by_u * u + by_v * v) / z
+        j0, j1, j2 = slopes[3 * axis], slopes[3 * axis + 1], slopes[3 * axis + 2]
+        by_point[axis, 0], by_point[axis, 1], by_point[axis, 2] = turn_to_world(views, camera, j0, j1, j2)
         for a in range(3):
-            slope = j0 * views[camera, a] + j1 * views[camera, 3 + a] + j2 * views[camera, 6 + a]
-            by_point[axis, a], by_frame[axis, a] = slope, -slope
+            by_frame[axis, a] = -by_point[axis, a]
         g0, g1, g2 = turn_to_frame(views, camera, j0, j1, j2)
         by_frame[axis, 3], by_frame[axis, 4] = b1 * g2 - b2 * g1, b2 * g0 - b0 * g2
         by_frame[axis, 5] = b0 * g1 - b1 * g0

@@ -12,12 +12,7 @@ from sfm_shapefit.adjustment.gauge import free_similarities, restore_baselines, 
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.lone_points import settle_points
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.priors import (
-    add_center_prior,
-    add_lens_prior,
-    add_rotation_prior,
-    sum_priors,
-)
+from sfm_shapefit.adjustment.priors import add_priors, sum_priors
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
@@ -160,12 +155,7 @@ def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_
     """Return which frames (n,) would have less cost at their pose of before, all else as it is after.
 
     A joint minimum is one for each frame by itself, but only a local one: a frame that few points hold may
-    have been led over a ridge by the others.
-
-    Args:
-        before: a problem at its start.
-        after: the same problem, adjusted, in the same gauge.
-        loss_scale_px: of the Cauchy loss.
+    have been led over a ridge by the others. Both are the same problem in the same gauge.
     """
     returned = replace(after, rotations=before.rotations, centers=before.centers)
     return _costs_of_frames(returned, loss_scale_px) < _costs_of_frames(after, loss_scale_px)
@@ -235,16 +225,7 @@ def linearize_all(
 ) -> NormalEquations:
     """Return the normal equations of observations and priors; see `linearize`."""
     normal = linearize(layout, values, options.loss_scale_px, workers, least_curvature)
-    moves = layout.node_of_frame >= 0
-    nodes = layout.node_of_frame[moves]
-    for add, slots in ((add_center_prior, slice(0, 3)), (add_rotation_prior, slice(3, 6))):
-        if slots.start == 3 and options.hold_rotations:
-            continue
-        blocks, gradients = np.zeros((len(moves), 3, 3)), np.zeros((len(moves), 3))
-        add(problem, values, options.noise_px, blocks, gradients)
-        normal.nodes[nodes, slots, slots] += blocks[moves]
-        normal.node_gradients[nodes, slots] += gradients[moves]
-    add_lens_prior(problem, layout, values, options.noise_px, normal)
+    add_priors(problem, layout, values, options.noise_px, normal)
     return normal
 
 

@@ -29,7 +29,7 @@ from sfm_shapefit.base.arrays import IntArray, hand_back_memory
 from sfm_shapefit.base.executors import Advance, answers, nobody
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points, concatenate_points, number_points
-from sfm_shapefit.tracks.links import CameraPoses, JoinedRows, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.tracks.links import CameraPoses, ObservedTracks
 from sfm_shapefit.tracks.options import StructureOptions
 from sfm_shapefit.tracks.triangulation import (
     PointLimits,
@@ -72,7 +72,9 @@ def triangulate(
     )
     poses, parts = views.poses(images), list[Points]()
     if isinstance(links, ObservedTracks):
-        tasks, done = _cut_own_tracks(links, poses, limits), 0
+        own = map(links.subset, _blocks(np.flatnonzero(links.lengths() >= limits.min_length)))
+        cut, done = ((np.arange(len(block.cameras)), block) for block in own), 0
+        tasks = (BlockTask(rows=rows, tracks=block, poses=poses, limits=limits) for rows, block in cut)
         for task, found in answers(executor, triangulate_block, tasks):
             parts.append(views.seen_points(task.tracks, found))
             done += task.tracks.num_tracks
@@ -91,14 +93,15 @@ def triangulate(
         else:  # two keypoints count 2 if they have no other partner, 3 or more if one has
             sizes = np.diff(np.append(0, np.cumsum(partners[joined.rows]))[joined.offsets])
         chosen, is_left = np.flatnonzero(sizes >= fewest), np.ones_like(partners, dtype=np.bool_)
-        tasks, done = _cut_tracks(matched, joined, chosen, poses, limits), 0
+        cut, done = ((own.rows, matched.observed(own)) for own in map(joined.subset, _blocks(chosen))), 0
+        tasks = (BlockTask(rows=rows, tracks=block, poses=poses, limits=limits) for rows, block in cut)
         for task, found in answers(executor, triangulate_block, tasks):
             parts.append(views.seen_points(task.tracks, found))
             is_left[task.rows[found.points_seen >= 0]] = False
             done += task.tracks.num_tracks
             if limit_px == joining_limits[0]:  # nearly all tracks
                 advance(done, len(chosen))
-        del joined, sizes, chosen, tasks  # before the keypoints that are left are copied
+        del joined, sizes, chosen, cut, tasks  # before the keypoints that are left are copied
     return number_points(parts)
 
 
@@ -113,21 +116,9 @@ class BlockTask:
     limits: PointLimits
 
 
-def _cut_tracks(
-    matched: MatchedKeypoints, joined: JoinedRows, chosen: IntArray, poses: CameraPoses, limits: PointLimits
-) -> Iterator[BlockTask]:
-    """Yield the chosen ones of the joined tracks, a block at a time."""
-    for first in range(0, len(chosen), _TRACKS_A_BLOCK):
-        block = joined.subset(chosen[first : first + _TRACKS_A_BLOCK])
-        yield BlockTask(rows=block.rows, tracks=matched.observed(block), poses=poses, limits=limits)
-
-
-def _cut_own_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: PointLimits) -> Iterator[BlockTask]:
-    """Yield tracks that are long enough to have a point, a block at a time."""
-    chosen = np.flatnonzero(tracks.lengths() >= limits.min_length)
-    for first in range(0, len(chosen), _TRACKS_A_BLOCK):
-        block = tracks.subset(chosen[first : first + _TRACKS_A_BLOCK])
-        yield BlockTask(rows=np.arange(len(block.cameras)), tracks=block, poses=poses, limits=limits)
+def _blocks(chosen: IntArray) -> Iterator[IntArray]:
+    """Yield some of the chosen tracks at a time."""
+    return (chosen[first : first + _TRACKS_A_BLOCK] for first in range(0, len(chosen), _TRACKS_A_BLOCK))
 
 
 def triangulate_block(task: BlockTask) -> TriangulatedPoints:

@@ -50,14 +50,9 @@ class Views:
         tracks: ObservedTracks,
         found: TriangulatedPoints,
     ) -> AdjustmentProblem:
-        """Return the problem of points, at the poses of the images.
+        """Return the problem of points found of tracks, at the poses of the images of the views.
 
-        Args:
-            images: those of the views.
-            sensors: (l,) lenses that move in their rigs.
-            given: what is known of their poses; rotations have no part yet.
-            tracks: observations of points.
-            found: the points.
+        Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
         used = np.flatnonzero(found.points_seen >= 0)
         rotations, translations = self._sensors(images)
@@ -133,11 +128,9 @@ def views_of(images: Images) -> Views:
 
 def _lens_of_views(lens: Lens) -> Lens:
     """Return the lens of the views of an image."""
-    return (
-        lens
-        if lens.is_adjustable
-        else Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)
-    )
+    if lens.is_adjustable:
+        return lens
+    return Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)
 
 
 def _cube() -> FloatArray:

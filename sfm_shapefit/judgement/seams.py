@@ -89,12 +89,9 @@ def find_cuts(agreeing: IntArray, contradicting: IntArray, group: IntArray) -> t
 
 
 def find_seams(cuts: tuple[Cut, ...], relative: RelativeRotations, rotations: FloatArray) -> tuple[Seam, ...]:
-    """Return the cuts that are seams.
+    """Return the cuts that are seams, by what pairs across them say relative to rotations (n, 3, 3).
 
-    Args:
-        cuts: of some cameras.
-        relative: relative rotations of pairs across the cuts, as far as they have one.
-        rotations: (n, 3, 3) cam_from_world of the cameras.
+    These are cam_from_world; a pair across may have no relative rotation.
     """
     sound = relative.subset(relative.are_sound())
     seams = []

@@ -32,12 +32,8 @@ def compare_models(
 ) -> SecondOpinion | None:
     """Return how images compare with others of the same names; None if too few are common.
 
-    Args:
-        images: of the model.
-        fits: how the pairs of matches fit it.
-        others: images of the other model, some of them posed.
-        other_fits: how the pairs fit that.
-        doubted: (k,) others that may stand elsewhere by their own matches.
+    Fits are those of the pairs of matches in either model. `doubted` (k,) are the others that may stand
+    elsewhere by their own matches.
     """
     row_of = {name: k for k, name in enumerate(others.names) if others.is_posed[k]}
     mine = np.array([k for k, name in enumerate(images.names) if name in row_of], dtype=np.int64)

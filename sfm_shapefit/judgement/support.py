@@ -20,14 +20,8 @@ _MATCHES_A_SLICE = 4_000_000  # matches between which Python can be interrupted:
 def images_of_few_points(points: Points, images: Images, least: IntArray, fixed: BoolArray) -> IntArray:
     """Return how many points images see that are to leave, -1 for those that stay, (i,).
 
-    A frame leaves if each of its images sees too few points. It takes its observations along,
-    which may leave others with too few; three frames stay.
-
-    Args:
-        points: of the images.
-        images: some of them posed; others have no part.
-        least: (f,) points.
-        fixed: (f,) frames that stay whatever they see.
+    A frame leaves if each of its posed images sees less than `least` (f,) points, and it is not `fixed` (f,).
+    It takes its observations along, which may leave others with too few; three frames stay.
     """
     gone, frame_of = np.full(images.num_images, -1), images.frame_of
     while True:
@@ -127,12 +121,8 @@ def images_without_support(counts: ObservationCounts, images: Images, fixed: Boo
     """Return the images (i,) of frames whose matches could make points with those of others, and hardly do.
 
     Directions can agree with a wrong pose, of an image on a repeated structure for one: points, which need
-    three images, do not. If fewer than three frames have points, none is returned.
-
-    Args:
-        counts: of the images.
-        images: some of them posed.
-        fixed: (f,) frames that are not asked.
+    three images, do not. If fewer than three frames have points, none is returned; `fixed` ones (f,) are not
+    asked.
     """
     could = counts.checked >= OUTNUMBERED * FEWEST_POINTS
     does = could & (counts.agreeing >= RARE * counts.checked)  # right images have .26 or more, a wrong one 0

@@ -117,12 +117,7 @@ def links_of_pairs(agreeing: IntArray, contradicting: IntArray) -> NodeLinks:
 def find_groups(group: IntArray, rays: Rays, pairs: NodeLinks) -> tuple[IntArray, tuple[Untied, ...]]:
     """Return the group of each node, (n,), and those that are not tied to the largest.
 
-    What is unchecked is one group with the largest all the same.
-
-    Args:
-        group: (n,) as `rigid_groups`.
-        rays: to points.
-        pairs: links by pairs.
+    What is unchecked is one group with the largest all the same. `group` (n,) is as of `rigid_groups`.
     """
     rays, count = _of_three(rays), len(group)
     lowest = np.full(int(rays.points.max(initial=-1)) + 1, count)
@@ -150,10 +145,7 @@ def _of_three(rays: Rays) -> Rays:
 def rigid_groups(count: int, rays: Rays, known: IntArray) -> IntArray:
     """Return the group of each node (n,) by the points that two of them share, a share of all points.
 
-    Args:
-        count: number of nodes, n.
-        rays: to points.
-        known: (k, 2) nodes that are known to stand rightly to one another.
+    Nodes (k, 2) are `known` to stand rightly to one another.
     """
     rays, group = _of_three(rays), np.arange(count)
     step = len(rays.points) // (_MOST_RAYS * count) + 1

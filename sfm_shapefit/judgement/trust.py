@@ -38,9 +38,9 @@ class CameraTrust:
     """The trust of k cameras, and the reasons for a low one."""
 
     trust: FloatArray
-    """(k,) in [0, 1]."""
+    """(k,) trust of each camera, in [0, 1]."""
     hold: FloatArray
-    """(k,) the second factor."""
+    """(k,) the second factor: how well the pairs hold each camera."""
     reasons: tuple[str, ...]
     """k sentences, empty where the trust is not low."""
     loose_reasons: tuple[str, ...]

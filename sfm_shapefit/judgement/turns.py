@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, rows_taken
+from sfm_shapefit.base.geometry import nearest_rotations, rotation_angles_deg
 from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.limits import ALIKE_DEG, HALF, KNOWN_DEG, MOST_COMPARED, RARE
 from sfm_shapefit.pairs.pair_directions import PairDirections, is_usable
@@ -264,9 +265,8 @@ class _Touching(NamedTuple):
 
 
 def _angles(rotations: FloatArray) -> FloatArray:
-    """Return the angles (k,) of rotations (k, 3, 3), radians in [0, pi]; exact for small ones too."""
-    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
-    return np.asarray(2.0 * np.arcsin(np.minimum(half, 1.0)))
+    """Return the angles (k,) of rotations (k, 3, 3), radians in [0, pi]."""
+    return np.asarray(np.radians(rotation_angles_deg(rotations)))
 
 
 def _level(pairs: PairTurns) -> float:
@@ -399,8 +399,7 @@ def _common_turn(
     for _ in range(_AVERAGING_STEPS):
         off = _angles(votes[voting] @ turn.T) / sigmas[voting]
         shares = weights[voting] / sigmas[voting] ** 2 / (1.0 + (off / _AGREEING_SIGMAS) ** 2) ** 2
-        left, _, right = np.linalg.svd(np.einsum("k,kab->ab", shares, votes[voting]))
-        turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+        turn = nearest_rotations(np.einsum("k,kab->ab", shares, votes[voting]))
     return np.asarray(turn)
 
 

@@ -43,15 +43,12 @@ from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.judgement.limits import FEW
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
-from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
+from sfm_shapefit.laplacian.selected import SelectedInverse, regauged, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
 
-_RIDGES = (
-    1e-12,
-    1e-10,
-    1e-8,
-)  # shares of each block's trace, added in turn; loose nodes become large, finite
+# Shares of each block's trace, added in turn; loose nodes become large, finite.
+_RIDGES = (1e-12, 1e-10, 1e-8)
 _FAR = 10.0  # spreads from the cameras' median; one that stands farther away may not decide the gauge
 _LOOSENING_ROUNDS = 20  # rounds in which cameras leave the gauge; a bound
 _SHORTEST = 1e-12  # share of the longest baseline; a shorter one counts as that long
@@ -192,7 +189,7 @@ def propagate_groups(
     inverse = selected_inverse(factor, ends)
     null = np.tile(np.eye(d), (len(share), 1, 1))
     fixed = share[:, None, None] * null
-    covariances = _in_gauge(factor, inverse, null, fixed)
+    covariances = regauged(inverse.nodes, factor.solve, null, fixed)
     if errors is not None:
         right = _right_side(ends, terms.pulls, errors, len(share))
         covariances = scatter(_moved(factor, right, null, fixed))
@@ -258,7 +255,7 @@ def _fix_gauge(
     gauge = is_camera & (distances_in_spreads(locations, locations[is_camera]) <= _FAR)
     least = max(3, int(np.sum(is_camera)) // 2)
     for _ in range(_LOOSENING_ROUNDS):
-        covariances = _in_gauge(factor, inverse, *_gauge_pair(locations, gauge))
+        covariances = regauged(inverse.nodes, factor.solve, *_gauge_pair(locations, gauge))
         sizes = np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
         largest = float(sizes[gauge].max())
         if largest <= FEW * median_spread(locations[gauge]):
@@ -268,17 +265,6 @@ def _fix_gauge(
             break
         gauge = kept
     return covariances, gauge
-
-
-def _in_gauge(
-    factor: CholeskyFactor, inverse: SelectedInverse, null: FloatArray, fixed: FloatArray
-) -> FloatArray:
-    """Return the diagonal blocks of S A^-1 S^T for N and F."""
-    product = factor.solve(fixed)  # A^-1 F
-    middle = np.einsum("nak,nal->kl", fixed, product)
-    cross = null @ product.transpose(0, 2, 1)
-    spread = null @ middle @ null.transpose(0, 2, 1)
-    return np.asarray(inverse.nodes - cross - cross.transpose(0, 2, 1) + spread)
 
 
 def _gauge_pair(locations: FloatArray, gauge: BoolArray) -> tuple[FloatArray, FloatArray]:

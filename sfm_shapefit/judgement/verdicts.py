@@ -6,7 +6,7 @@ pair decides for itself, is `uncertainty`; what all pairs of a camera say togeth
 
 import enum
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import INSIDE, SMALLEST_SHAPE
-from sfm_shapefit.judgement.trust import judge_cameras
+from sfm_shapefit.judgement.trust import CameraTrust, judge_cameras
 from sfm_shapefit.judgement.turns import Doubt, Doubts
 from sfm_shapefit.judgement.uncertainty import (
     GroupGauge,
@@ -48,7 +48,7 @@ class Verdict(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Assessment:
+class Assessment(CameraTrust):
     """Evidence for each pair and camera of a solved view graph."""
 
     residuals_deg: FloatArray
@@ -60,14 +60,6 @@ class Assessment:
     NaN for agreeing pairs outside the largest rigid piece of those."""
     level_deg: float
     """Standard deviation, per axis, of the residuals of all pairs together (from their median)."""
-    trust: FloatArray
-    """(k,) trust of each camera, in [0, 1], see `trust.judge_cameras`."""
-    reasons: tuple[str, ...]
-    """k sentences that say why a trust is low; empty where it is not."""
-    hold: FloatArray
-    """(k,) the factor of trust that says how well the pairs hold each camera."""
-    loose_reasons: tuple[str, ...]
-    """k sentences that say what the pairs leave open; empty where they hold the camera."""
     loose_groups: tuple[LooseCameras, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     covariances: FloatArray
@@ -119,14 +111,11 @@ def assess(
     covariances, leverages, held = find_hold(measured, locations, agreement, undetermined_nodes, max_bytes)
     judged = judge_cameras(measured, locations, agreement.agrees, standard_deviations(covariances), held)
     return Assessment(
+        **{item.name: getattr(judged, item.name) for item in fields(CameraTrust)},
         residuals_deg=np.degrees(agreement.angles_rad),
         inliers=agreement.agrees,
         leverages=leverages,
         level_deg=float(np.degrees(agreement.level_rad)),
-        trust=judged.trust,
-        reasons=judged.reasons,
-        hold=judged.hold,
-        loose_reasons=judged.loose_reasons,
         loose_groups=held.groups,
         covariances=covariances,
     )

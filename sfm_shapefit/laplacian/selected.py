@@ -12,6 +12,7 @@ twice the factorization. The block Z_RR of a supernode waits where its update ma
 factorization: it lives from the parent to the supernode, the same interval run backwards.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ from sfm_shapefit.base.scipy_parts import dtrtri
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
+_Solve = Callable[[FloatArray], FloatArray]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SelectedInverse:
@@ -31,6 +34,14 @@ class SelectedInverse:
     """(n, b, b) diagonal blocks."""
     edges: FloatArray
     """(m, b, b) block (i, j) of each edge; its transpose is block (j, i)."""
+
+
+def regauged(nodes: FloatArray, solve: _Solve, null: FloatArray, dual: FloatArray) -> FloatArray:
+    """Return the diagonal blocks (n, b, b) of S A^-1 S^T from those of A^-1; S = I - N F^T of (n, b, k)."""
+    solved = solve(dual)
+    middle = np.einsum("nai,naj->ij", dual, solved)
+    cross = null @ solved.transpose(0, 2, 1)
+    return np.asarray(nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1))
 
 
 def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_sigmas
+from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
@@ -29,7 +29,8 @@ def doubted(problem, given_px, sigma, *, distortion=False):
 def solve(free, problem):
     """The adjusted lens and the standard deviation of its focal length."""
     found = adjust(problem, OPTIONS, **free.overrides()).problem
-    return found.lenses[0], focal_sigmas(found, replace(OPTIONS, **free.overrides()))[0]
+    known = estimate_covariances(found, OPTIONS, **free.overrides())
+    return found.lenses[0], focal_shares(found, known)[0]
 
 
 def facing_a_wall(rng):
@@ -139,7 +140,8 @@ def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
     found = adjust(held.apply(replace(start, lenses=[start.lenses[0].as_given()]), None), options).problem
     focal_px, _, _, k1 = found.lenses[0].parameters
     assert focal_px == given_px
-    assert focal_sigmas(found, options)[0] == 0.0
-    sigma_k1 = estimate_covariances(found, options).lens_sigmas[0, 4]
+    known = estimate_covariances(found, options)
+    assert focal_shares(found, known)[0] == 0.0
+    sigma_k1 = known.lens_sigmas[0, 4]
     assert 0.0 < sigma_k1 < 0.1 * abs(true_k1)
     assert k1 == pytest.approx(true_k1 * (given_px / TRUE_PX) ** 2, abs=4.0 * sigma_k1)
