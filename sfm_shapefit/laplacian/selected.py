@@ -23,7 +23,7 @@ from sfm_shapefit.base.scipy_parts import dtrtri
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 
-Solve = Callable[[FloatArray], FloatArray]
+_Solve = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -36,7 +36,7 @@ class SelectedInverse:
     """(m, b, b) block (i, j) of each edge; its transpose is block (j, i)."""
 
 
-def regauged(nodes: FloatArray, solve: Solve, null: FloatArray, dual: FloatArray) -> FloatArray:
+def regauged(nodes: FloatArray, solve: _Solve, null: FloatArray, dual: FloatArray) -> FloatArray:
     """Return the diagonal blocks (n, b, b) of S A^-1 S^T from those of A^-1; S = I - N F^T of (n, b, k)."""
     solved = solve(dual)
     middle = np.einsum("nai,naj->ij", dual, solved)

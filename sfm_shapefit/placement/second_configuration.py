@@ -58,8 +58,8 @@ def find_second_configuration(
 ) -> SecondConfiguration | None:
     """Return the placement that the rejected pairs agree on, if they do.
 
-    Those `judged` are the pairs of cameras, without directions to points; inliers (m,) agree with the
-    solution, with residuals of standard deviation `level_deg` per axis.
+    Only pairs of cameras are `judged`, not directions to points; inliers (m,) agree with the solution, with
+    residuals of standard deviation `level_deg` per axis.
     """
     rejected = judged[~inliers[judged]]
     agreeing = len(judged) - len(rejected)

@@ -110,6 +110,7 @@ def start(name: str, locations=None) -> Start:
     [
         ((100.0, 99.0), 0.1, "LUD", "not by a collapse"),
         ((100.0, 100.0), 0.1, "ShapeFit", "not by a collapse"),
+        ((100.0, 100.0 - 1e-9), 0.1, "ShapeFit", "not by a collapse"),  # lower by rounding alone
         ((100.0, 100.05), 1.0, "LUD", "alike"),  # within a thousandth: the one that cannot collapse
         ((99.95, 100.0), 1.0, "LUD", "alike"),
         ((100.0, 101.0), 1.0, "ShapeFit", "better"),
