@@ -76,11 +76,9 @@ CHANGES = {
             "adjustment/freedom.py",
             "adjustment/gauge.py",
             "adjustment/layout.py",
-            "adjustment/problem.py",
             "adjustment/residuals.py",
             "adjustment/run.py",
             "adjustment/solve.py",
-            "adjustment/views.py",
             "facts/model.py",
             "facts/result.py",
             "facts/rigs.py",
@@ -91,7 +89,7 @@ CHANGES = {
         },
     ),
 }
-STILL_MORE = {"another pose that adjustments may free": 18}
+STILL_MORE = {"another pose that adjustments may free": 16}
 """Files of the changes that touch more than they may; the list may only become shorter."""
 
 

@@ -162,7 +162,7 @@ def command_run(
         if inputs[0] is not None:
             refuse_swapped(inputs[0], target, order)
         if order.startswith("MODEL"):
-            refuse_no_model(*inputs)
+            refuse_no_model(inputs[0])
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
             from sfm_shapefit.base.kernel_cache import measure_compilation
             from sfm_shapefit.files.colmap.quiet import hear_pycolmap

@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.intrinsics import (
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import FOCAL, Origin
 from tests.scenes import RING, copied, edit_database, fingerprint, read_from
 
 MODELS = {"SIMPLE_RADIAL": 2, "PINHOLE": 1, "OPENCV_FISHEYE": 5}
@@ -46,7 +46,7 @@ def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, 
     assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0").images) == {}
     marked, may_change = read_from(path, lambda file: settle_intrinsics(images, file, "auto"))
     assert [lens.origin for lens in marked.lenses] == [origin]
-    assert may_change.focal.tolist() == [origin is not None and model != "OPENCV_FISHEYE"]
+    assert may_change.parts[:, FOCAL].tolist() == [origin is not None and model != "OPENCV_FISHEYE"]
     kept, stays = read_from(path, lambda file: settle_intrinsics(images, file, "held"))
     assert [lens.origin for lens in kept.lenses] == [origin]
     assert kept.lenses[0].parameters == images.lenses[0].parameters

@@ -193,7 +193,7 @@ def test_the_scale_is_that_of_the_rigs_and_what_else_is_told_checks_it(workspace
     images, every = read_model(workspace / "truth").images, np.arange(36)
     apart = float(np.linalg.norm(images.centers[0] - images.centers[20]))
     distances = ((images.names[0], images.names[20], 2.0 * apart),)
-    rigid = rigs_stage.rigid_parts(images, every < 0)
+    rigid = rigs_stage.find_rigid_parts(images, every < 0)
     rule = GaugeRule(images, rigid, "unit", made_priors(3.0 * images.centers), distances)
     chosen = rule.choose(every, 0.1 * images.centers, 0.1)
     assert chosen.scale == "rig"
