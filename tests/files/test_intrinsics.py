@@ -50,7 +50,7 @@ def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, 
     kept, stays = read_from(path, lambda file: settle_intrinsics(images, file, "held"))
     assert [lens.origin for lens in kept.lenses] == [origin]
     assert kept.lenses[0].parameters == images.lenses[0].parameters
-    assert not stays.focal.any()
+    assert not stays.parts.any()
     assert not stays.distortion.any()
 
 
