@@ -20,7 +20,7 @@ principal point 0. Its residuals are then those of an ideal camera, not exactly 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
@@ -214,10 +214,10 @@ class AdjustmentProblem:
 
     def _check_rig(self) -> None:
         c = self.num_cameras
-        shapes = (self.rig.frame_of_camera.shape, self.rig.rotations.shape, self.rig.translations.shape)
-        if shapes != ((c,), (c, 3, 3), (c, 3)):
+        shapes = tuple(np.shape(getattr(self.rig, one.name)) for one in fields(self.rig))
+        if shapes != ((c,), (c, 3, 3), (c, 3), (c,)):
             raise InputError(
-                f"the rig's arrays have shapes {shapes}, they must be ({c},), ({c}, 3, 3), ({c}, 3)"
+                f"the rig's arrays have shapes {shapes}, they must be ({c},), ({c}, 3, 3), ({c}, 3), ({c},)"
             )
         _check_range(self.rig.frame_of_camera, self.num_frames, "frame")
         _check_rotations(self.rig.rotations, "rotation of a sensor in its rig")

@@ -54,8 +54,8 @@ ExecutorName = Annotated[
         "--executor",
         metavar="serial|processes|dask[:ADDRESS]",
         callback=_check_executor,
-        help="Where pairs are measured and tracks triangulated: in this process, in as many others as "
-        "--threads says, or on a cluster of dask, started here or that of a running scheduler's address.",
+        help="Where pairs are measured: in this process, in as many others as --threads says, or on a "
+        "cluster of dask, started here or that of a running scheduler's address.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]

@@ -9,15 +9,14 @@ from sfm_shapefit.files.lines import refuse_database
 REQUIRED_FILES = ("cameras", "images", "points3D")
 
 
-def refuse_no_model(*paths: Path | None) -> None:
-    """Refuse folders without a model, before what reads models is loaded; other paths pass.
+def refuse_no_model(path: Path | None) -> None:
+    """Refuse a folder without a model, before what reads models is loaded; other paths pass.
 
     Raises:
         InputError: as `model_suffix`.
     """
-    for path in paths:
-        if path is not None and path.is_dir():
-            model_suffix(path)
+    if path is not None and path.is_dir():
+        model_suffix(path)
 
 
 def model_suffix(folder: Path) -> str:

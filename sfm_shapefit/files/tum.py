@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
-from sfm_shapefit.files.lines import is_number, lines_of_cells
+from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
@@ -32,8 +32,11 @@ def read_tum(file: Path) -> ListedPoses:
         InputError: if a line is none of a trajectory.
     """
     names, numbers = [], []
-    for number, words in lines_of_cells(file):
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
         values = np.array([float(word) for word in words if is_number(word)])
+        if not words:
+            continue
         if not (len(words) == len(values) == 8 and np.isfinite(values).all() and np.linalg.norm(values[4:])):
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
         names.append(words[0])

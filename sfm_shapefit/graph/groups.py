@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray, frozen, sum_by
+from sfm_shapefit.base.errors import InputError
 
 _COINCIDENT = 1e-12  # share of the largest offset; a smaller offset within a group is rounding
 
@@ -38,9 +39,22 @@ class RigidGroups:
     """(B,) c, the unit of each group, 0..S-1, of which some node has an offset; None: all share one."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "group_of", frozen(np.array(self.group_of, dtype=np.int64)))
-        object.__setattr__(self, "offsets", frozen(np.array(self.offsets, dtype=np.float64)))
-        units = np.zeros(self.num_groups) if self.unit_of is None else self.unit_of
+        labels = np.array(self.group_of, dtype=np.int64)
+        offsets = np.array(self.offsets, dtype=np.float64)
+        if labels.ndim != 1 or offsets.ndim != 2 or len(labels) != len(offsets):
+            raise InputError(
+                f"groups have {labels.shape} labels and {offsets.shape} offsets; give one row per node"
+            )
+        if not np.isfinite(offsets).all():
+            raise InputError(
+                f"the offset of node {int(np.argmin(np.isfinite(offsets).all(axis=1)))} is not finite"
+            )
+        present = np.unique(labels)
+        if not np.array_equal(present, np.arange(len(present))):
+            raise InputError("groups must be numbered 0, 1, ... without gaps")
+        object.__setattr__(self, "group_of", frozen(labels))
+        object.__setattr__(self, "offsets", frozen(offsets))
+        units = np.zeros(len(present)) if self.unit_of is None else self.unit_of
         object.__setattr__(self, "unit_of", frozen(np.asarray(units, dtype=np.int64)))
 
     @property

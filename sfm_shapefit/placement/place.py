@@ -7,7 +7,7 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -239,9 +239,14 @@ def _place_piece(
 
 @one_blas_thread()
 def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placement:
-    """Return a placement with other locations of the same nodes, and which directions agree with these."""
-    agreement = find_agreement(placement.measured_part(), refined.locations, refined.right)
-    return replace(placement, refined=refined, agreement=agreement)
+    """Return a placement with other locations of the same nodes, and which directions agree with these.
+
+    What was judged of a placement is not of these.
+    """
+    moved = {item.name: getattr(placement, item.name) for item in fields(Placement)}
+    moved["refined"] = refined
+    moved["agreement"] = find_agreement(placement.measured_part(), refined.locations, refined.right)
+    return Placement(**moved)
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

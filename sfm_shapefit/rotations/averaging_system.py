@@ -98,8 +98,9 @@ class AveragingSystem:
 
     def sum_at_nodes(self, blocks: FloatArray) -> FloatArray:
         """Return the sums (n, b, b) of the blocks (k, b, b) of the pairs at their two nodes."""
-        rows = np.repeat(blocks.reshape(len(blocks), -1), 2, axis=0)
-        return sum_by(self.pairs.ravel(), rows, self.num_nodes).reshape(-1, *blocks.shape[1:])
+        rows = blocks.reshape(len(blocks), -1)
+        sums = sum(sum_by(ends, rows, self.num_nodes) for ends in self.pairs.T)
+        return np.asarray(sums).reshape(-1, *blocks.shape[1:])
 
     def ground_blocks(self, blocks: FloatArray) -> CholeskyFactor:
         """Return the factor of the Laplacian of blocks without ridge, grounded at its last node."""

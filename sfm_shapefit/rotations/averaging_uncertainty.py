@@ -125,7 +125,8 @@ def _sampled(
     share = references / references.sum()
     total, roots, (i, j) = np.zeros(n), np.zeros((k, 3, 3)), system.pairs.T
     counts = last.blocks[:, 0, 0] > 0.0
-    roots[counts] = np.linalg.cholesky(last.blocks[counts])
+    rounding = 1e-14 * np.trace(last.blocks[counts], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    roots[counts] = np.linalg.cholesky(last.blocks[counts] + rounding)  # some are singular but for it
     for _ in range(_SAMPLES):
         pulls = np.einsum("kab,kb->ka", roots, rng.normal(size=(k, 3)))
         right = sum_by(i, pulls, n) - sum_by(j, pulls, n)  # D^T B^(1/2) g

@@ -23,7 +23,7 @@ from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton.dense import solve_newton_dense
 from sfm_shapefit.solver.newton.sparse import solve_newton_reduced, solve_newton_sparse
-from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
+from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverOptions, SolverResult, Status, Watch
 from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
 from sfm_shapefit.solver.reduction import Reduction
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
@@ -131,10 +131,7 @@ def solve(
         status = Status.CONVERGED
     elif watch.cancelled:
         status = Status.CANCELLED
-    elif status is Status.INACCURATE and certified and may_split:
-        found = solve(graph, options, solver="admm", on_iteration=on_iteration)
-        return replace(found, method_reason=_STALLED, seconds=time.perf_counter() - start)
-    return SolverResult(
+    found = SolverResult(
         locations=frozen(locations),
         status=status,
         objective=certificate.objective,
@@ -146,6 +143,29 @@ def solve(
         seconds=time.perf_counter() - start,
         method=choice.method,
         method_reason="; ".join(filter(None, [choice.reason, run.note])),
+    )
+    if status is Status.INACCURATE and certified and may_split:
+        found = _split_stalled(graph, found, options, on_iteration)
+    return found
+
+
+def _split_stalled(
+    graph: ViewGraph, stalled: SolverResult, options: SolverOptions, on_iteration: OnIteration | None
+) -> SolverResult:
+    """Return what splitting finds where Newton steps have stalled, or what these found if that is nearer."""
+    before = stalled.iterations
+
+    def go_on(info: IterationInfo) -> bool | None:
+        return on_iteration(replace(info, iteration=before + info.iteration)) if on_iteration else None
+
+    found = solve(graph, options, solver="admm", max_iterations=None, on_iteration=go_on)
+    nearer = found if found.gap < stalled.gap else stalled
+    return replace(
+        nearer,
+        status=found.status if found.status is Status.CANCELLED else nearer.status,
+        iterations=before + found.iterations,
+        seconds=stalled.seconds + found.seconds,
+        method_reason=_STALLED if nearer is found else stalled.method_reason,
     )
 
 

@@ -91,6 +91,13 @@ def test_a_matrix_that_is_no_pose_is_refused_by_its_key(tmp_path, matrix, messag
         read_nerf(nerf_file(tmp_path, {"transform_matrix": matrix}))
 
 
+def test_a_trajectory_may_have_commas_and_comments(tmp_path):
+    (tmp_path / "poses.txt").write_text("# stamp, then pose\n\n1.5, 1 2 3, 0 0 0 1,  # the start\n")
+    found = read_tum(tmp_path / "poses.txt")
+    assert found.names == ("1.5",)
+    np.testing.assert_array_equal(found.centers, [[1.0, 2.0, 3.0]])
+
+
 @pytest.mark.parametrize("line", ["1 2 3", "1 2 3 4 0 0 0 0", "1 2 3 4 0 0 0 nan", "time x y z 0 0 0 1"])
 def test_a_line_that_is_none_of_a_trajectory_is_refused_by_its_number(tmp_path, line):
     (tmp_path / "poses.txt").write_text(f"# a comment\n1 0 0 0 0 0 0 1\n{line}\n")

@@ -52,6 +52,19 @@ def test_groups_with_fixed_nodes_become_one_whole_frames_with_them():
     np.testing.assert_allclose(centered(joined.offsets[:4]), centered(expected), atol=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("labels", "offsets", "message"),
+    [
+        ([0, 2], np.zeros((2, 3)), "without gaps"),
+        ([0, 1], np.zeros((3, 3)), "one row per node"),
+        ([0, 1], np.full((2, 3), np.nan), "offset of node 0 is not finite"),
+    ],
+)
+def test_groups_that_make_no_sense_are_refused(labels, offsets, message):
+    with pytest.raises(InputError, match=message):
+        RigidGroups(group_of=labels, offsets=offsets)
+
+
 def written_out(edges, groups, blocks):
     """A^T D^T S D A and A, dense."""
     n, d = groups.offsets.shape

@@ -60,6 +60,7 @@ def test_objective_and_lengths_are_those_of_the_formulas():
     q=st.sampled_from([0.0, 0.3, 1.0]),
 )
 @example(seed=1816, d=2, sigma=1e-6, q=0.3)  # Newton steps end at a gap of 1.007e-8
+@example(seed=196, d=2, sigma=1e-6, q=0.0)
 @example(seed=4156, d=2, sigma=1e-6, q=0.3)  # and here at 3e-4
 def test_every_result_proves_what_it_claims(seed, d, sigma, q):
     graph, _ = problem(seed, n=12, p=0.9, d=d, sigma=sigma, q=q, weighted=True)
@@ -145,8 +146,23 @@ def test_where_newton_steps_stall_in_the_plane_splitting_follows_unless_newton_w
     assert found.converged
     assert asked.status is Status.INACCURATE
     assert not solve(graph, certified=False).converged  # where nothing is proven, nothing is solved again
-    few = solve(graph, max_iterations=3)
+    few, many = solve(graph, max_iterations=3), solve(graph, max_iterations=100)
     assert (few.method, few.status) == ("newton", Status.MAX_ITERATIONS)
+    assert many.converged  # the limit of Newton steps is none of splitting's
+
+
+def test_splitting_after_newton_steps_counts_on_and_gives_nothing_away_where_it_is_cancelled():
+    graph, _ = problem(4156, n=12, p=0.9, d=2, sigma=1e-6, q=0.3, weighted=True)
+    newton, told = solve(graph, solver="newton"), []
+
+    def hear(info):
+        told.append(info.iteration)
+        return info.iteration < newton.iterations + 3
+
+    found = solve(graph, on_iteration=hear)
+    assert told == [*range(1, newton.iterations + 4)]
+    assert (found.status, found.method, found.iterations) == (Status.CANCELLED, "newton", len(told))
+    assert found.gap == newton.gap
 
 
 def test_auto_says_what_it_chose_and_why():
