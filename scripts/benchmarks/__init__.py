@@ -17,7 +17,7 @@ INDEX = {
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
-    "real": "Real scenes against their ground truth, before and after bundle adjustment.",
+    "real": "Real scenes against their ground truth, as delivered and by the placement alone.",
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
     "rough": "Rough poses of other programs made exact, beside map from scratch; wrong ones named.",
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",

@@ -1,4 +1,4 @@
-"""Real scenes: camera positions against ground truth, before and after bundle adjustment, and their time.
+"""Real scenes: camera positions against ground truth, as delivered and placed alone, and their time.
 
 Every set is measured in its own fresh process, one after the other, so that the first run is a cold one and
 the peak of memory is the set's own. Order in the process: cold run, peak memory read, warm runs. Rotations

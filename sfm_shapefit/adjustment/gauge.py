@@ -72,7 +72,7 @@ def _null_space(matrix: FloatArray) -> FloatArray:
 def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) -> Values:
     """Return the values moved by that similarity of the `free_similarities` that brings centers nearest.
 
-    It is to the centers of the problem, the start.
+    Nearest to the centers of the problem, which are those of the start.
     """
     if free.shape[1] == _DIMENSION:
         motion = _best_similarity(problem, values)

@@ -183,7 +183,7 @@ class GroupFacts(Record):
 
     @classmethod
     def of_placement(cls, placement: Placement, kept: BoolArray, fixed: BoolArray | None) -> Self | None:
-        """Return what moved together, and how many images (n,) are fixed; None where each moves by itself."""
+        """Return what moved together, by which images (n,) are `fixed`; None where each moves by itself."""
         if placement.groups is None:
             return None
         cameras = placement.groups.group_of[: placement.num_cameras]
@@ -216,7 +216,7 @@ class FactsOfModel(Facts):
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
-        """Return the answer in lines; of the pairs how many are `against` it, that of all, and `more`."""
+        """Return the answer in lines: how many pairs are `against` it, of how many, and `more` of matches."""
         error_px = self.mean_reprojection_error_px
         points = f", mean reprojection error {error_px:.2f} px" if error_px is not None else ""
         source = _from_here(self.inputs.database) if self.inputs.database else self.inputs.directions
@@ -308,7 +308,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return super().expert_sentences() + ([f"{said[:1].upper()}{said[1:]}."] if said else [])
 
     def told(self, left_out: Sequence[str], centers: str) -> Telling:
-        """Return what the terminal says; `left_out` are images with the reason, `centers` their origin."""
+        """Return what the terminal says; `left_out` has images and why, `centers` where centers come from."""
         rows = [
             Row("not placed", left_out),
             *self.piece_rows(),

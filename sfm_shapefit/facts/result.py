@@ -190,7 +190,7 @@ class LocateResult(_Placed):
     """Distances that the user gave between its images."""
     scores: FloatArray | None = None
     """(m, 2) scores of the `directions` by their triangles, and matched shares, see `pairs.missing_matches`;
-    NaN where a pair has none; None where `map` did not average."""
+    NaN where a pair has none, shares of all where pairs are too many; None where `map` did not average."""
     loops: tuple[Loop, ...] = ()
     """Loops of the videos among the images, where `map` looked for some."""
     prior_fit: PriorFit | None = None

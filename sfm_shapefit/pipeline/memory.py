@@ -3,7 +3,7 @@
 The peak is that of the worst stage, for memory is handed back between stages. Every stage is linear in what
 it works on: keypoints, matches, pairs, edges of the graph, and entries of the factor, which the symbolic
 analysis knows beforehand. The bytes per item below were fitted to runs on seven sets of 25 to 10,000 images:
-forecasts are 1.03 to 1.2 times the peaks, with a limit of 1,500 MB at 10,000 images, too.
+forecasts are 1.02 to 1.2 times the peaks, with a limit of 1,500 MB at 10,000 images, too.
 
 The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
 known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.

@@ -93,7 +93,7 @@ def measure_rotations(
 ) -> RelativeRotations:
     """Return relative rotations estimated from matches; pairs are indices into the view's images.
 
-    The images are in axes of their cameras, see `Images.apart`.
+    The images are in axes of their cameras, see `Images.apart`. Without a clock, all cores work.
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.

@@ -90,7 +90,7 @@ class SolverOptions(Settings):
         "auto",
         'Which solver: "newton" is primal-dual Newton, "admm" splitting (with Newton steps at the end if the '
         'gap needs them) for large graphs, "conic" the generic conic program through cvxpy and Clarabel; '
-        '"auto" picks by size and predicted fill, and says why.',
+        '"auto" picks by size and predicted fill, splits where "newton" stalls in the plane, and says why.',
     )
     tol: float = option(
         1e-8,

@@ -250,6 +250,20 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere_nor_in_an_executor(
     np.testing.assert_array_equal(*centers)
 
 
+def test_pairs_of_fixed_images_are_left_out_in_an_executor_too(tmp_path):
+    model, database, names = RING / "sparse" / "0", RING / "database.db", tmp_path / "names.txt"
+    fixed = read_model(model).images.names[:3]
+    names.write_text("\n".join(fixed))
+    with ThreadPoolExecutor(2) as pool:
+        shared = sfm_shapefit.locate(model, database, fix=str(names), executor=pool)
+    alone = sfm_shapefit.locate(model, database, fix=str(names))
+    assert len(shared.directions.pairs) > 0
+    assert not np.isin(shared.directions.pairs, range(3)).all(axis=1).any()
+    np.testing.assert_array_equal(shared.directions.pairs, alone.directions.pairs)
+    centers = [found.table("cameras")["x"] for found in (shared, alone)]
+    np.testing.assert_array_equal(*centers)
+
+
 class Counting(ThreadPoolExecutor):
     """Counts the tasks of each kind."""
 
@@ -497,7 +511,7 @@ def check_joined_folder(folder, found):
     )  # its models are adjusted
 
 
-def test_models_are_joined_by_position_priors(tmp_path):
+def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
     truth, out = read_model(RING / "sparse" / "0").images, tmp_path / "out"
     database = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
     table = write_priors(tmp_path / "priors.txt", by_name(truth, truth.centers))
@@ -517,3 +531,6 @@ def test_models_are_joined_by_position_priors(tmp_path):
     )
     run(*arguments, "--overwrite")
     assert "join no models: " in json.loads((out / "map.json").read_text())["warnings"][-1]
+    facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
+    assert facts["joins"] == []
+    assert not (out / "joined_0").exists()

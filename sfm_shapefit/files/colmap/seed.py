@@ -28,16 +28,16 @@ _POINTS_AT_ONCE = 2**16  # points whose bytes are put together at once; all of 1
 
 
 class PickedPoints(NamedTuple):
-    """Some of a model's points."""
+    """Some of a model's points, p of which are drawn; a `Drawing` leaves out those far outside."""
 
     xyz: FloatArray
     """(p, 3)"""
     colors: npt.NDArray[np.uint8]
     """(p, 3)"""
     lengths: IntArray
-    """(p,) observations."""
+    """(q,) observations of those that were picked, q >= p."""
     errors_px: FloatArray
-    """(p,) mean reprojection errors; negative where unknown."""
+    """(q,) mean reprojection errors of these; where unknown negative, NaN in a `Drawing`."""
     num_all: int
     """Number of points that the model has."""
 
