@@ -7,7 +7,7 @@ Images that the averaging drops form components of their own.
 """
 
 from concurrent.futures import Executor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ def map_opened(
     models = locate_components(run, relative, visits, reasons)
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
-    with clock("join"):
+    with clock("join") if options.join == "safe" else nullcontext():
         joins, joined, told = join_mapped(models, run)
     left_out = {
         name: reasons[frame]

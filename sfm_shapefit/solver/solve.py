@@ -153,11 +153,9 @@ def _split_stalled(
     graph: ViewGraph, stalled: SolverResult, options: SolverOptions, on_iteration: OnIteration | None
 ) -> SolverResult:
     """Return what splitting finds where Newton steps have stalled, or what these found if that is nearer."""
-    before = stalled.iterations
-
-    def go_on(info: IterationInfo) -> bool | None:
-        return on_iteration(replace(info, iteration=before + info.iteration)) if on_iteration else None
-
+    before, go_on = stalled.iterations, on_iteration
+    if on_iteration is not None:  # where nobody hears of them, iterations compute no objective
+        go_on = partial(_go_on, on_iteration, before)
     found = solve(graph, options, solver="admm", max_iterations=None, on_iteration=go_on)
     nearer = found if found.gap < stalled.gap else stalled
     return replace(
@@ -167,6 +165,11 @@ def _split_stalled(
         seconds=stalled.seconds + found.seconds,
         method_reason=_STALLED if nearer is found else stalled.method_reason,
     )
+
+
+def _go_on(on_iteration: OnIteration, before: int, info: IterationInfo) -> bool | None:
+    """Tell of an iteration of a run that follows another of so many iterations."""
+    return on_iteration(replace(info, iteration=before + info.iteration))
 
 
 def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:

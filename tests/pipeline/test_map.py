@@ -112,6 +112,7 @@ def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_
     first = Mock(wraps=adjust_first_placement)
     monkeypatch.setattr("sfm_shapefit.pipeline.first_placement.adjust_first_placement", first)
     found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
+    assert "join" not in found.timings_s
     assert first.call_count == 2  # priors that are given up leave what came before them
     scales = {model.names[0] in truth.names[:4]: model.located for model in found.models}
     assert {is_first: one.gauge.scale for is_first, one in scales.items()} == {True: "unit", False: "prior"}
