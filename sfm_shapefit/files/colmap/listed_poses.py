@@ -44,7 +44,7 @@ def read_source(source: ModelSource, database: Path | str | None) -> tuple[Colma
     if isinstance(source, Path | str) and is_list(source):
         model, guessed = read_list(Path(source), database)
         return read_model(model), guessed
-    return read_model(source), frozenset()
+    return read_model(source, rotations_suffice=True), frozenset()
 
 
 def read_list(file: Path, database: Path | str | None) -> tuple[pycolmap.Reconstruction, frozenset[int]]:
