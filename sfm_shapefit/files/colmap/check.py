@@ -38,11 +38,10 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.files.colmap.points import Observed
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
+from sfm_shapefit.files.norms import may_be_rotation
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
-MOST_NORM = 1.5
-"""Largest norm of a rotation quaternion that is normalized, and the inverse of the smallest."""
 
 NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
@@ -106,7 +105,7 @@ def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float
     if not all(map(math.isfinite, pose[:4])) or any(map(math.isinf, pose[4:])):
         raise source.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if not 1.0 / MOST_NORM <= norm <= MOST_NORM:
+    if not may_be_rotation(norm):
         raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 

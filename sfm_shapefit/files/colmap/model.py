@@ -22,12 +22,13 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.wording import counted, counted_are, first_of
-from sfm_shapefit.files.colmap.check import MOST_NORM, UNIT_QUATERNION_TOLERANCE, check_model_files
+from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files
 from sfm_shapefit.files.colmap.images import images_of
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.model_folder import model_suffix
+from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
@@ -167,19 +168,14 @@ def _with_unit_quaternions(
     That of the user is not modified. A quaternion that is no rotation stays, to be refused.
     """
     norms = np.array([np.linalg.norm(pose.rotation.quat) for pose, _ in _poses_in(reconstruction)])
-    with np.errstate(invalid="ignore"):
-        off = (np.abs(norms - 1.0) > UNIT_QUATERNION_TOLERANCE) & (
-            np.abs(np.log(norms + 1e-300)) <= np.log(MOST_NORM)
-        )
+    off = are_off(norms)
     if not off.any():
         return reconstruction, ""
     own = pycolmap.Reconstruction(reconstruction) if reconstruction is source else reconstruction
     for (pose, put), norm, is_off in zip(_poses_in(own), norms.tolist(), off.tolist(), strict=True):
         if is_off:
             put(pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation.quat / norm), pose.translation))
-    worst = norms[off][np.argmax(np.abs(norms[off] - 1.0))]
-    said = f"{counted_are(int(off.sum()), 'rotation quaternion')} normalized, the worst of norm {worst:.3g}"
-    return own, f"{said} instead of 1; correct what wrote the model"
+    return own, say_normalized(norms)
 
 
 def _poses_in(
