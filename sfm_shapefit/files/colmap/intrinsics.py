@@ -74,10 +74,10 @@ def find_uncalibrated(
         if number not in found and name in rows:
             database_id, width, height, params, prior = rows[name]
             is_same = np.array(lens.parameters, dtype="<f8").tobytes() == params
-            if is_same or lens.id in listed:
-                camera = camera_of(lens)
-                focal = camera.focal_length_idxs()[0]
-                ratio = float(np.frombuffer(params, "<f8")[focal] / lens.parameters[focal])
+            camera = camera_of(lens)
+            focal = camera.focal_length_idxs()[:1]  # none of an equirectangular picture
+            if focal and (is_same or lens.id in listed):
+                ratio = float(np.frombuffer(params, "<f8")[focal[0]] / lens.parameters[focal[0]])
                 origin = _origin(camera, width, height, prior)
                 found[number] = Uncalibrated(origin, database_id, ratio)
     origins = [one.origin for one in found.values()]
