@@ -1,8 +1,8 @@
 """Camera models as programs other than COLMAP write them, read as the models of COLMAP that they are.
 
-- SPHERE of SphereSfM, SPHERICAL and OPENCV_SPHERICAL of others are EQUIRECTANGULAR. Their parameters are w, h as
-  COLMAP has them, or f, cx, cy with the middle of the picture, or none. These programs number the models as
-  COLMAP numbers others (11, 12, 16), so that in binary files the number of parameters tells them apart.
+- SPHERE of SphereSfM, SPHERICAL and OPENCV_SPHERICAL of others are EQUIRECTANGULAR. Their parameters are w, h
+  as COLMAP has them, or f, cx, cy with the middle of the picture, or none. These programs number the models
+  as COLMAP numbers others (11, 12, 16), so that in binary files the number of parameters tells them apart.
 - A model of two focal lengths whose list ends early lacks distortion, which is none then. One focal length
   (f, cx, cy, ...: Project Aria, radial models of openMVG) is told by the fourth value, which is no cy.
 
@@ -41,9 +41,7 @@ def num_params_of_model() -> dict[int, tuple[str, int]]:
     return {int(m): (m.name, len(_defaults(m.name))) for m in models}
 
 
-def read_camera(
-    model: str | int, size: tuple[float, float], params: Sequence[float]
-) -> CameraVariant | None:
+def read_camera(model: str | int, size: tuple[float, float], params: Sequence[float]) -> CameraVariant | None:
     """Return the camera that a model's name or id and its parameters are; None if they are of no model.
 
     Args:
