@@ -95,7 +95,7 @@ def read_images(file: DatabaseFile) -> UnposedImages:
     notes = list(cameras.notes(lost))
     if model.num_images() < 2:
         raise InputError(f"{path}: fewer than two images are left; {'; '.join(notes)}")
-    file.notes += notes
+    file.notes += [note for note in notes if note not in file.notes]
     rigs = read_rigs(file, model, cameras.impossible)
     return UnposedImages(
         images=_put_in_rigs(images_of(model), rigs),
