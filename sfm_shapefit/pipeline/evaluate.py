@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +43,10 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    read = read_model(reconstruction).images, read_model(reference).images
-    poses, truth = (NamedPoses(images.names, images.rotations, images.centers) for images in read)
-    return evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    read = read_model(reconstruction), read_model(reference)
+    poses, truth = (NamedPoses(m.images.names, m.images.rotations, m.images.centers) for m in read)
+    found = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    return replace(found, warnings=(*read[0].notes, *read[1].notes, *found.warnings))
 
 
 def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEvaluation:

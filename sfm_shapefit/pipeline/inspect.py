@@ -81,6 +81,7 @@ def inspect(
                 diagnosis=diagnose(with_points, options.placement, confirmed),
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(images, grouped),
+                warnings=(*model.notes, *matches.matches.notes),
             )
 
 

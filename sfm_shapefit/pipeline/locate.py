@@ -100,6 +100,7 @@ def locate(
                 refuse_admm(options.placement.solver)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
+            notes = model.notes
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
             source = replace(source, fixed=rigid.fixed if rigid.fixed.any() else None)
@@ -116,10 +117,10 @@ def locate(
         )
         place = partial(settle, options=options, clock=clock)
         sigma_rad = told.pull_rad
-        if sigma_rad is None or not _ROUGH_RAD <= sigma_rad < np.inf:
-            return act(place, told, source, options)
-        if rigid.fixed.any():
-            found = act(place, told, source, options)
-            return replace(found, warnings=(_NOT_CORRECTED, *found.warnings))
-        place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
-        return act(place, told, source, options)
+        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf:
+            if rigid.fixed.any():
+                notes = (*notes, _NOT_CORRECTED)
+            else:
+                place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
+        found = act(place, told, source, options)
+        return replace(found, warnings=(*notes, *source.matches.notes, *found.warnings))

@@ -24,7 +24,9 @@ import pycolmap
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files
+from sfm_shapefit.files.colmap.foreign_cameras import with_own_cameras
 from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.model_folder import model_suffix
@@ -93,6 +95,7 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
     """
     is_checked, source = False, model_of(source)
     observed: Observed = {}
+    notes: tuple[str, ...] = ()
     if not isinstance(source, pycolmap.Reconstruction | Path | str):
         raise InputError(
             f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
@@ -100,25 +103,25 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
     else:
-        label, (reconstruction, observed) = str(Path(source)), _load(Path(source))
+        label, (reconstruction, observed, notes) = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"
     try:
         with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
             reconstruction, note = _with_unit_quaternions(reconstruction, source)
             model = _posed_model(label, reconstruction, observed)
-            model = replace(model, notes=(note,)) if note else model
+            model = replace(model, notes=(*notes, *filter(None, [note])))
             return model if rotations_suffice else _with_positions(label, model)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed]:
-    """Check the files of a model and only then let pycolmap read them."""
+def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed, tuple[str, ...]]:
+    """Check the files of a model and only then let pycolmap read them; with it come `ColmapModel.notes`."""
     observed = check_model_files(folder)
     try:
-        with quiet_log():
-            return pycolmap.Reconstruction(folder), observed
+        with quiet_log(), with_own_cameras(folder, model_suffix(folder)) as (own, notes):
+            return pycolmap.Reconstruction(own), observed, notes
     except PYCOLMAP_ERRORS as error:
         raise InputError(
             f"{folder} cannot be read as a COLMAP model ({_first_line(error)}); write it again with COLMAP"
@@ -232,10 +235,9 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: 
         absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", ids, np.where(absurd, np.inf, 0.0))
     for lens in images.lenses:
-        if not (np.isfinite(lens.focal_px) and lens.focal_px > 0.0):
-            raise InputError(
-                f"{label}: camera {lens.id} has focal length {lens.focal_px:g} px; it must be > 0"
-            )
+        for focal in focal_lengths(lens):
+            if not (np.isfinite(focal) and focal > 0.0):
+                raise InputError(f"{label}: camera {lens.id} has focal length {focal:g} px; it must be > 0")
     return ColmapModel(reconstruction=reconstruction, images=images, observed=observed)
 
 
