@@ -85,7 +85,7 @@ def convert(
     if FORMATS[name].text_of:
         module, _, function = FORMATS[name].text_of.partition(":")
         text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(model.images)
-        _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
+        _write_file(text.encode(errors="backslashreplace"), path, overwrite=overwrite)
         return name
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")

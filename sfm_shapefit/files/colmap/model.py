@@ -11,7 +11,7 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.wording import counted, first_of
+from sfm_shapefit.base.wording import counted, counted_are, first_of
 from sfm_shapefit.files.colmap.check import (
     UNIT_QUATERNION_TOLERANCE,
     ContradictionError,
@@ -30,13 +30,14 @@ from sfm_shapefit.files.colmap.check import (
     name_contradiction,
     walk_files,
 )
-from sfm_shapefit.files.colmap.images import images_of, name_of
+from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, name_of
 from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.model_copies import with_own_cameras, without_points
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import names_among
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
@@ -83,6 +84,20 @@ class ColmapModel:
     def image_names(self) -> tuple[str, ...]:
         """Names of all images, posed or not."""
         return tuple(name_of(image) for image in self.reconstruction.images.values())
+
+
+def renamed_as(model: ColmapModel, names: Sequence[str]) -> ColmapModel:
+    """Return a model whose images have the names that the same images have among others."""
+    called, _ = names_among(model.image_names, names)
+    changed = {old: new for old, new in called.items() if new != old}
+    if not changed:
+        return model
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for image in copy.images.values():
+        image.name = bytes_of_name(changed.get(name_of(image), name_of(image)))
+    old, new = next(iter(changed.items()))
+    note = f"{counted_are(len(changed), 'image')} called otherwise in an earlier model, such as {old} {new}"
+    return replace(read_model(copy), notes=(*model.notes, note))
 
 
 def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> ColmapModel:
