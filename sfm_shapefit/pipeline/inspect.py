@@ -59,7 +59,7 @@ def inspect(
         )
     clock = Clock.of(progress, options.placement.solver)
     with clock("read"):
-        model, _ = read_source(source, database)
+        model, _ = read_source(source, database, rotations_suffice=True)
         inputs = choose_inputs(source, database, options.source.directions)
         inputs = read_left_out(inputs, model.images.names, options.directions.without)
     images = model.images
@@ -86,6 +86,6 @@ def inspect(
 
 
 def _is_graph(source: Path, database: Path | str | None) -> bool:
-    """Return whether a source is a bare graph; a .txt is a trajectory if a database has its matches."""
-    may_be_graph = not is_list(source) or (source.suffix.lower() == ".txt" and database is None)
+    """Return whether a source is a bare graph; a table is a trajectory if a database has its matches."""
+    may_be_graph = not is_list(source) or (source.suffix.lower() in {".txt", ".csv"} and database is None)
     return source.is_file() and may_be_graph

@@ -84,7 +84,7 @@ def locate(
     clock = Clock.of(progress, options.placement.solver, executor)
     with ExitStack() as stack:
         with clock("read"):
-            model, listed = read_source(reconstruction, database)
+            model, listed = read_source(reconstruction, database, rotations_suffice=True)
             given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
             inputs = read_left_out(inputs, given.names, options.directions.without)

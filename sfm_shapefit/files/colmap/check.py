@@ -44,9 +44,10 @@ from sfm_shapefit.files.colmap.camera_variants import (
 )
 from sfm_shapefit.files.colmap.points import Observed
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
+from sfm_shapefit.files.norms import may_be_rotation
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
-"""A quaternion printed with 4 digits still passes; a wrong one does not."""
+"""A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
 
 NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
@@ -95,11 +96,11 @@ def check_model_files(folder: Path) -> Observed:
 
 
 def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float]) -> None:
-    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names."""
-    if not all(map(math.isfinite, pose)):
+    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names; NaN is an unknown position."""
+    if not all(map(math.isfinite, pose[:4])) or any(map(math.isinf, pose[4:])):
         raise source.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if abs(norm - 1.0) > UNIT_QUATERNION_TOLERANCE:
+    if not may_be_rotation(norm):
         raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 
@@ -414,13 +415,13 @@ class _Line:
         """Return the error that names this line."""
         return InputError(f"{self.path}:{self.number}: {reason}")
 
-    def finite(self, tokens: Sequence[str], what: str) -> list[float]:
-        """Return the tokens as numbers."""
+    def finite(self, tokens: Sequence[str], what: str, *, or_unknown: bool = False) -> list[float]:
+        """Return the tokens as numbers, which may be NaN if `or_unknown`."""
         try:
             values = list(map(float, tokens))
         except ValueError:
             raise self.fault(f"{what} holds something that is not a number") from None
-        if not all(map(math.isfinite, values)):
+        if not all(math.isfinite(value) or (or_unknown and math.isnan(value)) for value in values):
             raise self.fault(f"{what} holds a number that is not finite")
         return values
 
@@ -473,7 +474,8 @@ def _check_image_lines(path: Path) -> None:
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME "
                 "(a name with spaces needs the .bin format)"
             )
-        _refuse_pose(line, f"image {tokens[0]}", line.finite(tokens[1:8], "the pose"))
+        pose = line.finite(tokens[1:5], "the pose"), line.finite(tokens[5:8], "the pose", or_unknown=True)
+        _refuse_pose(line, f"image {tokens[0]}", [*pose[0], *pose[1]])
         if tokens[9] in names:
             raise line.fault(f"the name {tokens[9]} stands in line {names[tokens[9]]} already")
         names[tokens[9]] = line.number
