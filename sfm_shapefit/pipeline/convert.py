@@ -50,8 +50,8 @@ def convert(
     """Write the posed images of a model in another format.
 
     Args:
-        source: a COLMAP folder, which may be an output, a reconstruction, a result, or OpenSfM's
-            reconstruction.json.
+        source: a COLMAP folder, which may be an output, a reconstruction, a result, OpenSfM's
+            reconstruction.json, or a list of poses: transforms.json, a trajectory.
         target: the file, or for COLMAP's formats the folder, to be made.
         target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
@@ -63,10 +63,9 @@ def convert(
         InputError: if the source cannot be read, the format cannot hold it, or the target exists already.
     """
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
-    from sfm_shapefit.files.colmap.other_programs import reconstruction_of
     from sfm_shapefit.files.colmap.seed import write_model
-    from sfm_shapefit.files.opensfm import read_opensfm
 
     path = Path(target)
     name = target_format or _format_of(path)
@@ -74,8 +73,8 @@ def convert(
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
     source = model_of(source)
     protect = [source] if isinstance(source, Path | str) else []
-    if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
-        source = reconstruction_of(read_opensfm(Path(source)))
+    if is_list(source):
+        source = read_by_itself(source, with_lenses=name not in {"tum", "csv"}).reconstruction
     if name in {"glb", "ply"}:
         from sfm_shapefit.report.mesh import mesh_bytes
 

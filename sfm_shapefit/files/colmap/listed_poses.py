@@ -8,12 +8,11 @@ import itertools
 import re
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from decimal import Decimal
-from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -36,6 +35,7 @@ from sfm_shapefit.files.tum import number_of, read_tum, stem_of
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.listed_poses import ListedPoses
+from sfm_shapefit.scene.same_images import same_images
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum, ".csv": read_tum}
 _UNKNOWN = Lens("SIMPLE_PINHOLE", (1.0, 0.0, 0.0))  # without a size
@@ -74,13 +74,12 @@ def read_source(
     return replace(read, notes=(*notes, *read.notes)), guessed
 
 
-def read_by_itself(source: ModelSource) -> ColmapModel:
+def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapModel:
     """Return the model that a source is: COLMAP's, OpenSfM's, or a list of poses, without points.
 
-    Where the list has no whole lens of an image, that has one of width 0.
-
     Raises:
-        InputError: as `read_model`, and as the readers of the formats.
+        InputError: as `read_model` and the readers of the formats; and if a list lacks whole lenses, which
+            are wanted. Else an image without one has a lens of width 0.
     """
     if not (isinstance(source, Path | str) and is_list(source)):
         return read_model(source)
@@ -89,6 +88,11 @@ def read_by_itself(source: ModelSource) -> ColmapModel:
         return read_model(reconstruction_of(read_opensfm(file)))
     poses = _READERS[file.suffix.lower()](file)
     lenses = [lens or _UNKNOWN for lens in poses.lenses]
+    if with_lenses and _UNKNOWN in lenses:
+        name = poses.names[lenses.index(_UNKNOWN)]
+        raise InputError(
+            f"{file} has no whole lens of {name} (w, h, fl_x and a camera_model that is read); add it"
+        )
     known = list(dict.fromkeys(lenses))
     ids = np.arange(1, len(lenses) + 1)
     images = Images(
@@ -122,7 +126,7 @@ def read_list(
     with closing(DatabaseFile(database)) as opened:
         read = read_images(opened)
         uncalibrated = find_uncalibrated(opened, read.images)
-    rows = _find(file, poses.names, read.images.names)
+    rows = find_images(file, poses.names, read.images.names)
     if np.sum(rows >= 0) < 2:
         raise InputError(
             f"{file} and {database} have fewer than two images in common: "
@@ -221,19 +225,19 @@ def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
     return True
 
 
-def _find(file: Path, listed: tuple[str, ...], names: tuple[str, ...]) -> IntArray:
-    """Return which image (n,) each listed name is of; -1 where none, or not one alone.
+def find_images(file: Path, listed: Sequence[str], names: Sequence[str]) -> IntArray:
+    """Return which image (n,) each name of a list is of; -1 where none, or not one alone.
 
-    By the name without more leading folders than needed, else without suffix, else by the number that it is.
+    By the name but for folders, else by the last part without suffix, else by the number that it is.
 
     Raises:
         InputError: if two names are of one image.
     """
-    found = np.full(len(listed), -1)
-    for match in (partial(_by_keys, _tails), partial(_by_keys, _stem), _by_numbers):
-        taken, left = set(found.tolist()), np.flatnonzero(found < 0).tolist()
-        rows = match([listed[k] for k in left], names)
-        found[left] = [-1 if row in taken else row for row in rows]
+    found = same_images(listed, names).places
+    for match in (_by_stems, _by_numbers):
+        left = np.flatnonzero(found < 0).tolist()
+        if left:
+            found[left] = match([listed[k] for k in left], names)
     for row, count in Counter(found[found >= 0].tolist()).items():
         if count > 1:
             first, second = (listed[k] for k in np.flatnonzero(found == row)[:2].tolist())
@@ -243,23 +247,18 @@ def _find(file: Path, listed: tuple[str, ...], names: tuple[str, ...]) -> IntArr
     return found
 
 
-def _by_keys(keys_of: Callable[[str], list[str]], listed: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return which image each listed name is of by keys, the first key of images."""
-    keys = [keys_of(name)[0] for name in names]
-    once = {key for key, count in Counter(keys).items() if count == 1}
-    row_of = {key: row for row, key in enumerate(keys) if key in once}
-    return [next((row_of[key] for key in keys_of(name) if key in row_of), -1) for name in listed]
+def named_as(file: Path, listed: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of a list, those of images by the names that these have elsewhere."""
+    rows = find_images(file, listed, names).tolist()
+    return tuple(own if row < 0 else names[row] for own, row in zip(listed, rows, strict=True))
 
 
-def _tails(name: str) -> list[str]:
-    """Return a name, and it without one leading folder after the other."""
-    parts = PurePosixPath(name.replace("\\", "/")).parts
-    return ["/".join(parts[k:]) for k in range(len(parts))]
-
-
-def _stem(name: str) -> list[str]:
-    """Return a name without folders and suffix; a number keeps what follows its point."""
-    return [stem_of(name)]
+def _by_stems(listed: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return which image each listed name is of by the last part without suffix, where no other has that."""
+    stems = [stem_of(name) for name in names]
+    counts = Counter(stems)
+    row_of = {stem: row for row, stem in enumerate(stems) if counts[stem] == 1}
+    return [row_of.get(stem_of(name), -1) for name in listed]
 
 
 def _by_numbers(listed: Sequence[str], names: Sequence[str]) -> list[int]:

@@ -235,7 +235,11 @@ def _with_positions(label: str, model: ColmapModel) -> ColmapModel:
     if np.sum(known) < 2:
         raise InputError(f"{label}: {said}; {remedy}")
     note = f"{said}, so that these have no pose here: {first_of(unknown)}; {remedy}"
-    return replace(model, images=images.part(np.flatnonzero(known)), notes=(*model.notes, note))
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for frame_id in images.frames.ids[~images.frames.is_posed].tolist():
+        copy.deregister_frame(frame_id)
+    images = images.part(np.flatnonzero(known))
+    return replace(model, reconstruction=copy, images=images, observed={}, notes=(*model.notes, note))
 
 
 def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: Observed) -> ColmapModel:
