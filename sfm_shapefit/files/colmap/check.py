@@ -269,11 +269,10 @@ def name_contradiction(files: ModelFiles) -> str:
     for heads, elements in _points_of(file):
         tracked = np.repeat(heads["id"], heads["length"].astype(np.int64)).tolist()
         for point, (image_id, keypoint) in zip(tracked, elements.tolist(), strict=True):
-            owner = owners.get((image_id, keypoint))
+            owner = owners.get((image_id, keypoint), point)  # pycolmap takes those of none for the track's
             if owner != point:
-                other = "none" if owner is None else f"3D point {owner}"
                 said = f"the track of 3D point {point} has keypoint {keypoint} of image {image_id}"
-                return str(file.fault(f"{said}, to which {file.beside('images')} gives {other}"))
+                return str(file.fault(f"{said}, to which {file.beside('images')} gives 3D point {owner}"))
     return ""
 
 
