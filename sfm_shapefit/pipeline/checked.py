@@ -14,7 +14,7 @@ scripts/results/notes.md.
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,7 @@ from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
@@ -118,6 +119,8 @@ def check_source(
         if fits is not None and second is not None:
             evidence = evidence.beside(second, fits.sides[1])
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
+    if verdict.is_bad and (recognized := ask_convention(matches, clock.threads)):
+        verdict = replace(verdict, reasons=(recognized.sentence, *verdict.reasons))
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
