@@ -1,4 +1,4 @@
-"""Ask pairs whether poses are in another program's convention, where the matches contradict them."""
+"""Ask whether an input is in another program's convention, or resolution, where its matches contradict it."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,8 +8,11 @@ import numpy as np
 
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from sfm_shapefit.judgement.conventions import Recognized, Written, recognize_convention
 from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade
+from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
 from sfm_shapefit.pipeline.inputs import MatchSource
 
@@ -35,9 +38,18 @@ def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     return recognize_convention(source.images.rotations, ask_rotations(source, asked, threads), written)
 
 
+def _ask_input(source: MatchSource, threads: int) -> Recognized | None:
+    """Return what an input seems to be instead; without a database its points tell, too."""
+    view, recognized = source.view, None
+    if isinstance(source.matches, TrackMatches):
+        pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
+        recognized = recognize_resolution(source.matches.points_of(view.images), view.images, pictures)
+    return recognized or ask_convention(source, threads)
+
+
 @contextmanager
 def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
-    """Say in what convention the poses look to be, where they cannot be placed.
+    """Say in what convention the input seems to be, where its cameras cannot be placed.
 
     Raises:
         UnsolvableError: that says so, or as before.
@@ -45,14 +57,14 @@ def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
     try:
         yield
     except UnsolvableError as error:
-        if recognized := ask_convention(source, threads):
+        if recognized := _ask_input(source, threads):
             raise UnsolvableError(recognized.sentence) from error
         raise
 
 
 def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> LocateResult:
     """Return a result that is not good with the convention that its input is in, if that can be told."""
-    recognized = None if found.verdict.grade is Grade.GOOD else ask_convention(source, threads)
+    recognized = None if found.verdict.grade is Grade.GOOD else _ask_input(source, threads)
     if recognized is None:
         return found
     others = [reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE)]
