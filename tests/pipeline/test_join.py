@@ -114,7 +114,9 @@ def test_models_that_share_images_are_joined_without_a_database_and_whatever_the
 
 def assert_tracks_hold(model):
     """Each observation of a point is that of its keypoint, and no keypoint observes what does not see it."""
-    seen = {(e.image_id, e.point2D_idx): i for i, point in model.points3D.items() for e in point.track.elements}
+    seen = {
+        (e.image_id, e.point2D_idx): i for i, point in model.points3D.items() for e in point.track.elements
+    }
     told = {
         (i, k): point.point3D_id
         for i, image in model.images.items()
@@ -135,9 +137,7 @@ def other_keypoints(model, *, noise_px, seed=0):
     for i in ids:
         xy = np.array([point.xy for point in model.image(i).points2D])
         xy = (xy + rng.normal(0.0, noise_px, xy.shape))[np.argsort(place[i])]
-        image = pycolmap.Image(
-            name=model.image(i).name, keypoints=xy, camera_id=camera.camera_id, image_id=i
-        )
+        image = pycolmap.Image(name=model.image(i).name, keypoints=xy, camera_id=camera.camera_id, image_id=i)
         other.add_image_with_trivial_frame(image, model.image(i).cam_from_world())
     for point in model.points3D.values():
         elements = [(e.image_id, int(place[e.image_id][e.point2D_idx])) for e in point.track.elements]
@@ -206,7 +206,7 @@ def test_a_second_model_that_is_bent_is_not_called_good(tmp_path):
     for i in IDS[5:]:
         frame = second.frame(second.image(i).frame_id)
         pose = frame.rig_from_world
-        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + [1.0, 0.0, 0.0])
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
     found = sfm_shapefit.join([piece(IDS[:5]), second])
     assert found.verdict.grade != "good"
 

@@ -138,15 +138,15 @@ def _add_keypoints(image: pycolmap.Image, other: pycolmap.Image) -> IntArray:
     if len(own) and len(others):
         from scipy.spatial import KDTree  # here, since it takes long to import
 
-        apart, nearest = KDTree(own).query(others)
-        is_mutual = KDTree(others).query(own)[1][nearest] == np.arange(len(others))
+        apart, nearest = map(np.asarray, KDTree(own).query(others))
+        is_mutual = np.asarray(KDTree(others).query(own)[1])[nearest] == np.arange(len(others))
         is_same = is_mutual & (apart <= _SAME_PIXEL)
         places[is_same] = nearest[is_same]
     fresh = np.flatnonzero(places < 0)
     places[fresh] = len(own) + np.arange(len(fresh))
     points2d = [*image.points2D, *pycolmap.Image(keypoints=others[fresh]).points2D]
     image.points2D.clear()  # the setter insists on it
-    image.points2D = points2d
+    image.points2D = pycolmap.Point2DList(points2d)
     return places
 
 
