@@ -67,6 +67,6 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     recognized = None if found.verdict.grade is Grade.GOOD else _ask_input(source, threads)
     if recognized is None:
         return found
-    others = [reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE)]
-    suspicions, warnings = (recognized.clause, *others), (recognized.sentence, *found.warnings)
-    return replace(found, suspicions=suspicions, warnings=warnings)
+    others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
+    warnings = (recognized.sentence, *found.warnings)
+    return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)
