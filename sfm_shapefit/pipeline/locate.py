@@ -23,6 +23,7 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
 from sfm_shapefit.pipeline.gauge_choice import between_images
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
@@ -124,5 +125,6 @@ def locate(
                 notes = (*notes, _NOT_CORRECTED)
             else:
                 place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
-        found = act(place, told, source, options)
+        with naming_convention(source, clock.threads):
+            found = tell_convention(act(place, told, source, options), source, clock.threads)
         return replace(found, warnings=(*notes, *source.matches.notes, *found.warnings))

@@ -297,7 +297,7 @@ def test_a_broken_record_is_named(tmp_path, case):
 
 
 CONTRADICTIONS = {
-    "no such point": (_set("images", 1, 4, [(5.0, 6.0, 8)]), "image 2 observes 3D point 8, which points3D.bin"),
+    "no such point": (_set("images", 1, 4, [(5.0, 6.0, 8)]), "image 2 observes 3D point 8, which points3D."),
     "track of no image": (_set("points3D", 0, 2, [(1, 0), (9, 0)]), "refers to point 0 of image 9, which"),
     "track of no pixel": (_set("points3D", 0, 2, [(1, 0), (2, 1)]), "refers to point 1 of image 2, which"),
     "other point": (_set("images", 0, 4, 0, (1.0, 2.0, 9)), "point 7 has keypoint 0 of image 1, to which i"),
@@ -347,7 +347,7 @@ BROKEN_LINES = {
     "no whole number": ("images", "2 1 0", "2x 1 0", r"images.txt:3: the image holds .* not a whole number"),
     "large number": ("images", "2 1 0", f"{2**32} 1 0", r"images.txt:3: a number is out of its range"),
     "huge number": ("cameras", "640", "9" * 5000, r"cameras.txt:2: the camera holds .* not a whole number"),
-    "unknown camera": ("images", "1 b.jpg", "4 b.jpg", r"images.txt: image 2 refers to camera 4, which camer"),
+    "unknown camera": ("images", "1 b.jpg", "4 b.jpg", r"images.txt: image 2 refers to camera 4, which cam"),
     "image twice": ("images", "2 1 0", "1 1 0", r"images.txt: image 1 \(b.jpg\) stands twice"),
 }
 

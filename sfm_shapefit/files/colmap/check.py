@@ -49,7 +49,7 @@ from sfm_shapefit.files.colmap.camera_variants import (
 from sfm_shapefit.files.colmap.points import Observed
 from sfm_shapefit.files.colmap.text_model import binary_records
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
-from sfm_shapefit.files.norms import may_be_rotation
+from sfm_shapefit.files.norms import may_be_rotations
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
@@ -143,7 +143,7 @@ def _refuse_pose(file: "_BinaryFile", label: str, pose: Sequence[float]) -> None
     if not all(map(math.isfinite, pose[:4])) or any(map(math.isinf, pose[4:])):
         raise file.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if not may_be_rotation(norm):
+    if not may_be_rotations(np.array([norm])).all():
         raise file.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 

@@ -41,7 +41,7 @@ from sfm_shapefit.files.colmap.binary_records import (
     SENSOR,
 )
 from sfm_shapefit.files.colmap.camera_variants import num_params_of_model, read_camera
-from sfm_shapefit.files.norms import may_be_rotation
+from sfm_shapefit.files.norms import may_be_rotations
 
 _EXACT = 2.0**53  # whole numbers from here on may be others as floating-point numbers
 _TWO_LINES = "each image has two lines, its own and that of its points, which may be empty"
@@ -110,7 +110,7 @@ class _Line:
             values = list(map(float, words[:9]))
         except ValueError:
             return False
-        if len(words) < 10 or not may_be_rotation(math.hypot(*values[1:5])):
+        if len(words) < 10 or not may_be_rotations(np.array([math.hypot(*values[1:5])])).all():
             return False
         try:
             return len([float(word) for word in self.text.split()]) % 3 != 0
