@@ -59,15 +59,12 @@ class _Line:
         """Return the error that names this line."""
         return InputError(f"{self.path}:{self.number}: {reason}")
 
-    def numbers(self, words: Sequence[str], what: str, *, finite: bool = True) -> list[float]:
-        """Return words as numbers."""
+    def numbers(self, words: Sequence[str], what: str) -> list[float]:
+        """Return words as numbers, finite or not."""
         try:
-            values = list(map(float, words))
+            return list(map(float, words))
         except ValueError:
             raise self.fault(f"{what} holds something that is not a number") from None
-        if finite and not all(map(math.isfinite, values)):
-            raise self.fault(f"{what} holds a number that is not finite")
-        return values
 
     def integers(self, words: Sequence[str], what: str) -> list[int]:
         """Return words as whole numbers; other programs write some of them as 1920.0."""
@@ -84,13 +81,6 @@ class _Line:
             return (struct.Struct(layout) if isinstance(layout, str) else layout).pack(*values)
         except struct.error:
             raise self.fault("a number is out of its range") from None
-
-    def pose(self, words: Sequence[str]) -> list[float]:
-        """Return the words QW .. TZ as numbers; a position that is NaN is unknown."""
-        values = self.numbers(words, "the pose", finite=False)
-        if not all(map(math.isfinite, values[:4])) or any(map(math.isinf, values)):
-            raise self.fault("the pose holds a number that is not finite")
-        return values
 
     @property
     def is_record(self) -> bool:
@@ -212,7 +202,7 @@ def _image_head(line: _Line) -> bytes:
     if len(words) < 10:
         raise line.fault(f"expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME: {_TWO_LINES}")
     image_id, camera_id = line.integers([words[0], words[8]], "the image")
-    head = line.pack(IMAGE, image_id, *line.pose(words[1:8]), camera_id)
+    head = line.pack(IMAGE, image_id, *line.numbers(words[1:8], "the pose"), camera_id)
     name = words[9].rstrip(" \t\r\n").encode("utf-8", "surrogateescape")
     if b"\0" in name:
         raise line.fault("the name holds a byte that is zero")
@@ -227,8 +217,6 @@ def _points2d(line: _Line, words: list[str]) -> bytes:
         values = np.array(words, dtype=np.float64).reshape(-1, 3)
     except ValueError:
         raise line.fault("a point holds something that is not a number") from None
-    if not np.isfinite(values).all():
-        raise line.fault("a point holds a number that is not finite")
     points = np.empty(len(values), dtype=POINT2D)
     points["xy"] = values[:, :2]
     if (np.abs(values[:, 2]) < _EXACT).all():
@@ -244,13 +232,17 @@ def _points(lines: Iterator[_Line]) -> Iterator[bytes]:
         words = line.text.split()
         if len(words) < 8 or len(words) % 2:
             raise line.fault("expected POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as pairs")
-        xyz = line.numbers(words[1:4], "the 3D point")
-        (error_px,) = line.numbers(words[7:8], "the 3D point", finite=False)
-        point_id, *color = line.integers([words[0], *words[4:7]], "the 3D point")
-        track = line.integers(words[8:], "the track")
-        color = [part % 256 for part in color]
-        head = line.pack(POINT, point_id, *xyz, *color, error_px, len(track) // 2)
-        yield head + line.pack(f"<{len(track)}I", *track)
+        floats, color, track = [*words[1:4], words[7]], words[4:7], words[8:]
+        try:
+            number, (*xyz, error_px) = int(words[0]), map(float, floats)
+            values = (number, *xyz, *map(int, color), error_px, len(track) // 2, *map(int, track))
+            yield struct.pack(f"{POINT.format}{len(track)}I", *values)
+        except (ValueError, struct.error):  # one by one, to name what is wrong or read what is only unusual
+            *xyz, error_px = line.numbers(floats, "the 3D point")
+            number, *rgb = line.integers([words[0], *color], "the 3D point")
+            rgb, elements = [part % 256 for part in rgb], line.integers(track, "the track")
+            head = line.pack(POINT, number, *xyz, *rgb, error_px, len(track) // 2)
+            yield head + line.pack(f"<{len(track)}I", *elements)
 
 
 def _rigs(lines: Iterator[_Line]) -> Iterator[bytes]:
@@ -263,7 +255,9 @@ def _rigs(lines: Iterator[_Line]) -> Iterator[bytes]:
             if k > 0:
                 (has_pose,) = line.integers(_taken(line, words, 1), "the rig")
                 record += line.pack(HAS_POSE, has_pose)
-                record += line.pack(POSE, *line.pose(_taken(line, words, 7))) if has_pose else b""
+                record += (
+                    line.pack(POSE, *line.numbers(_taken(line, words, 7), "the pose")) if has_pose else b""
+                )
         yield record
 
 
@@ -271,7 +265,7 @@ def _frames(lines: Iterator[_Line]) -> Iterator[bytes]:
     for line in _records(lines):
         words = iter(line.text.split())
         frame_id, rig_id = line.integers(_taken(line, words, 2), "the frame")
-        pose = line.pose(_taken(line, words, 7))
+        pose = line.numbers(_taken(line, words, 7), "the pose")
         (count,) = line.integers(_taken(line, words, 1), "the frame")
         record = line.pack(FRAME, frame_id, rig_id, *pose, count)
         for _ in range(count):
