@@ -1,4 +1,4 @@
-"""Text models of COLMAP and other programs are read by our own reader, plain ones to the bit as by pycolmap."""
+"""Text models of COLMAP and other programs, read by our own reader; plain ones to the bit as by pycolmap."""
 
 import re
 from collections.abc import Callable
