@@ -4,6 +4,7 @@ import numpy as np
 
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
 from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated, with_focal_length
+from sfm_shapefit.files.colmap.pair_focals import read_pair_focals
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
@@ -34,7 +35,13 @@ def settle_intrinsics(
     for k, found in guessed.items():
         lenses[k] = images.lenses[k].in_doubt(found.origin)
     if file is not None and guessed and wanted != "held":
-        by_database = calibrate_view_graph(file, [g.database_id for g in guessed.values()], left_out)
+        asked = [found.database_id for found in guessed.values()]
+        by_database = calibrate_view_graph(file, asked, left_out)
+        by_database |= {
+            i: one.factor
+            for i, one in read_pair_focals(file, asked).items()
+            if one.is_one_sided or i not in by_database
+        }
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0

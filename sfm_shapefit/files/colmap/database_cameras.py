@@ -49,7 +49,7 @@ class DatabaseCameras(NamedTuple):
             each = ": each" if len(ids) > 1 else ""
             yield (
                 f"{cameras} of the database{each} {why}: {counted_are(len(lost), 'image')} left out "
-                f"({first_of(lost)}); correct the camera, or set its prior_focal_length to 0 for COLMAP's guess"
+                f"({first_of(lost)}); correct that, or set prior_focal_length to 0 for COLMAP's guess"
             )
 
 
