@@ -140,7 +140,7 @@ def find_hold(
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes
     holding = inliers & ~np.isin(graph.edges, open_nodes).any(axis=1)
-    propagate_all = _propagate_nodes if measured.groups is None else _propagate_groups
+    propagate_all = _propagate_groups if measured.has_scale else _propagate_freely
     covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
     leverages[inliers & ~holding] = np.nan
     if sampled is None and measured.evidence is not None:
@@ -178,7 +178,7 @@ def _infinite_covariances(locations: FloatArray) -> FloatArray:
     return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
 
 
-def _propagate_nodes(
+def _propagate_freely(
     measured: MeasuredGraph,
     locations: FloatArray,
     inliers: BoolArray,
@@ -186,21 +186,24 @@ def _propagate_nodes(
     sampled: _Sampled | None,
     max_bytes: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances (n, d, d) and the leverages (m,).
+    """Return the covariances (n, d, d) and the leverages (m,) of locations whose scale is open.
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid. Where
-    baselines of very different lengths make that singular, only its nodes within some radii have any.
+    baselines of very different lengths make that singular, only its nodes within some radii have any. A rigid
+    group, whose nodes are then at one place, counts as one node.
     """
-    graph, num_cameras = measured.graph, measured.num_cameras
+    graph, node_of = measured.graph, measured.moving
+    ends, locations = node_of[graph.edges], locations[np.unique(node_of, return_index=True)[1]]
+    num_cameras = int(node_of[: measured.num_cameras].max(initial=-1)) + 1
     covariances, leverages = _infinite_covariances(locations), np.where(inliers, np.nan, 0.0)
     distances = distances_in_spreads(locations, locations[:num_cameras])
     for reach in _REACHES:
-        used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
-        rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
-        nodes, edges = np.unique(graph.edges[rows], return_inverse=True)
+        used = np.flatnonzero(inliers & (distances[ends] <= reach).all(axis=1))
+        rows = used[parallel_rigid_pieces(len(locations), ends[used], graph.dimension) == 0]
+        nodes, edges = np.unique(ends[rows], return_inverse=True)
         cameras = int(np.sum(nodes < num_cameras))
         if cameras < SMALLEST_SHAPE:
-            return covariances, leverages
+            break
         try:
             samples = None if sampled is None else sampled.parts(graph.directions, rows)
             found = propagate(
@@ -209,13 +212,16 @@ def _propagate_nodes(
         except UnsolvableError:  # singular in spite of the ridge
             continue
         if found is None:
+            covariances[:] = np.nan
             break
         inside = locations[nodes[distances[nodes] <= INSIDE]]
         is_held = ~(found.sigmas > _extent(inside)).any(axis=1)
         covariances[nodes[is_held]] = found.covariances[is_held]
         leverages[rows] = found.leverages
-        return covariances, leverages
-    return np.full_like(covariances, np.nan), leverages
+        break
+    else:
+        covariances[:] = np.nan
+    return covariances[node_of], leverages
 
 
 def _extent(locations: FloatArray) -> float:
