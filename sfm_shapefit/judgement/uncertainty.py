@@ -41,7 +41,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import distances_in_spreads, median_spread
 from sfm_shapefit.graph.groups import RigidGroups
-from sfm_shapefit.judgement.limits import FEW
+from sfm_shapefit.judgement.limits import FEW, SMALLEST_SHAPE
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, regauged, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
@@ -65,6 +65,9 @@ class CameraUncertainty:
     """(m,) in [0, 1]."""
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
+    scale_sigma: float = np.inf
+    """Relative standard deviation of the scale that offsets inside rigid groups tell; infinite without any, 0
+    where one group is held."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -197,7 +200,16 @@ def propagate_groups(
         covariances=covariances[groups.group_of],
         leverages=terms.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,
+        scale_sigma=_scale_sigma(factor, groups.split(groups.center().fit(locations)[0])[0], share > 0.0),
     )
+
+
+def _scale_sigma(factor: CholeskyFactor, centers: FloatArray, gauge: BoolArray) -> float:
+    """Return the relative standard deviation of the scale of groups at centers (B, d), read off some (B,)."""
+    if np.sum(gauge) < SMALLEST_SHAPE - 1:
+        return 0.0
+    size = _gauge_pair(centers, gauge & (distances_in_spreads(centers, centers[gauge]) <= _FAR))[1][:, :, -1]
+    return float(np.sqrt(max(np.vdot(size, factor.solve(size)), 0.0)))
 
 
 def scatter(samples: FloatArray) -> FloatArray:

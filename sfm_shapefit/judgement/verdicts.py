@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
+from sfm_shapefit.base.geometry import METRIC_SIGMA, distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import INSIDE, SMALLEST_SHAPE
@@ -108,7 +108,9 @@ def assess(
         agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     agreement = agreement or find_agreement(measured, locations)
-    covariances, leverages, held = find_hold(measured, locations, agreement, undetermined_nodes, max_bytes)
+    covariances, leverages, held, _ = find_hold(
+        measured, locations, agreement, undetermined_nodes, max_bytes
+    )
     judged = judge_cameras(measured, locations, agreement.agrees, standard_deviations(covariances), held)
     return Assessment(
         **{item.name: getattr(judged, item.name) for item in fields(CameraTrust)},
@@ -121,14 +123,27 @@ def assess(
     )
 
 
+class Hold(NamedTuple):
+    """How well the agreeing pairs hold each location."""
+
+    covariances: FloatArray
+    """(n, d, d), see `Assessment`."""
+    leverages: FloatArray
+    """(m,)"""
+    conditioning: Conditioning
+    scale_sigma: float
+    """Relative standard deviation of the scale that the offsets inside rigid groups tell, infinite where they
+    tell none. From a tenth on, the covariances leave its errors out, but for groups around a fixed one."""
+
+
 def find_hold(
     measured: MeasuredGraph,
     locations: FloatArray,
     agreement: AngularAgreement,
     undetermined_nodes: IntArray | None,
     max_bytes: int,
-) -> tuple[FloatArray, FloatArray, Conditioning]:
-    """Return covariances, leverages (see `Assessment`), and how well the agreeing pairs hold each camera."""
+) -> Hold:
+    """Return how well the agreeing pairs hold each location."""
     graph, freedom, inliers = measured.graph, measured.graph.dimension - 1, agreement.agrees
     own, excess, bases = own_covariances(measured), agreement.excess_rad, tangent_bases(graph.directions)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
@@ -140,14 +155,19 @@ def find_hold(
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes
     holding = inliers & ~np.isin(graph.edges, open_nodes).any(axis=1)
-    propagate_all = _propagate_groups if measured.has_scale else _propagate_freely
-    covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
+    known, scale_sigma = (measured, locations, holding, information, sampled, max_bytes), np.inf
+    if measured.has_scale:
+        covariances, leverages, scale_sigma = _propagate_groups(*known)
+        scale_sigma *= scale
+    if not measured.has_scale or (scale_sigma > METRIC_SIGMA and measured.fixed_group is None):
+        covariances, leverages = _propagate_freely(*known)
     leverages[inliers & ~holding] = np.nan
     if sampled is None and measured.evidence is not None:
         covariances = covariances / measured.evidence.facts_per_match
     covariances = scale**2 * covariances
     k, sigmas = measured.num_cameras, standard_deviations(covariances)
-    return covariances, leverages, condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
+    return Hold(covariances, leverages, conditioning, scale_sigma)
 
 
 class _Sampled(NamedTuple):
@@ -236,8 +256,11 @@ def _propagate_groups(
     information: FloatArray,
     sampled: _Sampled | None,
     max_bytes: int,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, float]:
     """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale given.
+
+    The third value is the relative standard deviation of that scale: infinite where the pairs tie no two
+    groups, 0 where it was not computed.
 
     Only the groups that the inlier pairs tie at these locations have any: those around the fixed one, or most
     cameras.
@@ -251,7 +274,7 @@ def _propagate_groups(
     inside = np.isin(groups.group_of, tied)
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
-        return covariances, leverages
+        return covariances, leverages, np.inf
     nodes = np.flatnonzero(inside)
     edges = np.searchsorted(nodes, graph.edges[rows])
     share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
@@ -262,8 +285,8 @@ def _propagate_groups(
     except UnsolvableError:
         found = None
     if found is None:
-        return np.full_like(covariances, np.nan), leverages
+        return np.full_like(covariances, np.nan), leverages, 0.0
     is_held = ~(found.sigmas > _extent(locations[nodes])).any(axis=1)
     covariances[nodes[is_held]] = found.covariances[is_held]
     leverages[rows] = found.leverages
-    return covariances, leverages
+    return covariances, leverages, found.scale_sigma

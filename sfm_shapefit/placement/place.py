@@ -31,7 +31,7 @@ from sfm_shapefit.solver.tied import largest_tied
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
-_LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means nothing
+_LEAST_OFFSETS = 1e-6  # median baselines; with shorter ones their scale means nothing
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
@@ -148,6 +148,15 @@ class Placement(Displayed):
         return self.measured.part(self.edges)[0]
 
 
+class ContradictedOffsetsError(UnsolvableError):
+    """The offsets inside rigid groups come out with no length, or a negative one."""
+
+    def __init__(self, message: str, placement: Placement) -> None:
+        """Keep the placement, which is right where offsets are too short to tell a scale."""
+        super().__init__(message)
+        self.placement = placement
+
+
 def place_pieces(
     measured: MeasuredGraph,
     options: PlacementOptions,
@@ -226,8 +235,8 @@ def _place_piece(
         refined = refine_starts(part, solved, how.options, certified=how.certified)
     else:
         refined = stay_near(part, solved, centers, near.refined)
-    unit = measure_unit(part, refined.locations) if part.has_scale else None
-    return Placement(
+    unit, length = measure_unit(part, refined.locations) if part.has_scale else (None, np.inf)
+    placement = Placement(
         measured=measured,
         pieces=pieces,
         piece=k,
@@ -237,6 +246,13 @@ def _place_piece(
         history=tuple(history),
         unit=unit,
     )
+    if not length > _LEAST_OFFSETS:
+        raise ContradictedOffsetsError(
+            "the directions contradict the known offsets between cameras: their scale comes out as "
+            f"{length:.1e} of a baseline; check the rigs, or which cameras are fixed",
+            placement,
+        )
+    return placement
 
 
 @one_blas_thread()
@@ -303,15 +319,10 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
     return RigidPiece(nodes=np.unique(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
 
 
-def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
-    """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
+def measure_unit(part: MeasuredGraph, locations: FloatArray) -> tuple[float, float]:
+    """Return the length of the offsets' unit at locations (n, d), and that of the offsets in baselines."""
     assert part.groups is not None
     unit = float(part.groups.split(part.groups.fit(locations)[0])[1][0])
     size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())
     baseline = float(np.median(np.linalg.norm(differences(locations, part.graph.edges), axis=1)))
-    if not unit * size > _LEAST_UNIT * baseline:
-        raise UnsolvableError(
-            "the directions contradict the known offsets between cameras: their scale comes out as "
-            f"{unit * size / baseline:.1e} of a baseline; check the rigs, or which cameras are fixed"
-        )
-    return unit
+    return unit, unit * size / baseline
