@@ -131,10 +131,6 @@ class RigidGroups:
         moved[sizes <= _COINCIDENT * largest] = 0.0
         return replace(self, offsets=moved)
 
-    def without_offsets(self) -> "RigidGroups":
-        """Return the same groups with all nodes of each at one place."""
-        return replace(self, offsets=np.zeros_like(self.offsets))
-
     def normalize(self) -> "RigidGroups":
         """Return the same groups centered, in units in which their offsets have root mean square 1."""
         centered, units = self.center(), self.units

@@ -35,6 +35,7 @@ _LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nod
 # Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
 # not say how large the scene is.
 _REACHES = (np.inf, 1e3, INSIDE)
+_SCALE_APART = 0.02  # relative; half of what makes a camera loose that is two spreads from the middle
 _UNCHECKED_LEVERAGE = 0.99  # leverage; from here on agreement means nothing, 1 % of an error shows
 
 
@@ -66,6 +67,8 @@ class Assessment(CameraTrust):
     """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
     cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
     NaN, all of them, where the graph is too large for its factor."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale that offsets in rigid groups tell, if it is above a tenth."""
     doubts: Doubts | None = None
     """What the pairs' own rotations say of those given; None if they were not asked."""
 
@@ -108,18 +111,20 @@ def assess(
         agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     agreement = agreement or find_agreement(measured, locations)
-    covariances, leverages, held, _ = find_hold(
-        measured, locations, agreement, undetermined_nodes, max_bytes
+    found = find_hold(
+        measured, locations, agreement, undetermined_nodes, max_bytes, apart_from_scale=_SCALE_APART
     )
-    judged = judge_cameras(measured, locations, agreement.agrees, standard_deviations(covariances), held)
+    held, sigmas = found.conditioning, standard_deviations(found.covariances)
+    judged = judge_cameras(measured, locations, agreement.agrees, sigmas, held)
     return Assessment(
         **{item.name: getattr(judged, item.name) for item in fields(CameraTrust)},
         residuals_deg=np.degrees(agreement.angles_rad),
         inliers=agreement.agrees,
-        leverages=leverages,
+        leverages=found.leverages,
         level_deg=float(np.degrees(agreement.level_rad)),
         loose_groups=held.groups,
-        covariances=covariances,
+        covariances=found.covariances,
+        scale_sigma=found.scale_sigma if METRIC_SIGMA < found.scale_sigma < np.inf else None,
     )
 
 
@@ -133,7 +138,7 @@ class Hold(NamedTuple):
     conditioning: Conditioning
     scale_sigma: float
     """Relative standard deviation of the scale that the offsets inside rigid groups tell, infinite where they
-    tell none. From a tenth on, the covariances leave its errors out, but for groups around a fixed one."""
+    tell none."""
 
 
 def find_hold(
@@ -142,8 +147,14 @@ def find_hold(
     agreement: AngularAgreement,
     undetermined_nodes: IntArray | None,
     max_bytes: int,
+    *,
+    apart_from_scale: float = np.inf,
 ) -> Hold:
-    """Return how well the agreeing pairs hold each location."""
+    """Return how well the agreeing pairs hold each location.
+
+    A scale of a larger relative standard deviation than `apart_from_scale` is no part of that, unless a group
+    is fixed: all cameras would seem loose that are far from the middle.
+    """
     graph, freedom, inliers = measured.graph, measured.graph.dimension - 1, agreement.agrees
     own, excess, bases = own_covariances(measured), agreement.excess_rad, tangent_bases(graph.directions)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
@@ -159,7 +170,7 @@ def find_hold(
     if measured.has_scale:
         covariances, leverages, scale_sigma = _propagate_groups(*known)
         scale_sigma *= scale
-    if not measured.has_scale or (scale_sigma > METRIC_SIGMA and measured.fixed_group is None):
+    if not measured.has_scale or (scale_sigma > apart_from_scale and measured.fixed_group is None):
         covariances, leverages = _propagate_freely(*known)
     leverages[inliers & ~holding] = np.nan
     if sampled is None and measured.evidence is not None:
@@ -279,7 +290,7 @@ def _propagate_groups(
     edges = np.searchsorted(nodes, graph.edges[rows])
     share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
     samples = None if sampled is None else sampled.parts(graph.directions, rows)
-    gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum())
+    gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum(), cameras[tied] > 0)
     try:
         found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, max_bytes)
     except UnsolvableError:

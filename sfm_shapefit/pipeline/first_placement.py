@@ -104,7 +104,7 @@ def start_from_first(
     images, adjusted = source.images, first.adjusted
     intrinsics = given.intrinsics.after(adjusted, images.lenses_of(adjusted.images))
     images = images.with_lenses_of(adjusted.images, adjusted.is_tried)
-    if adjusted.refines_sensors or not adjusted.images.sensors.translations.any():  # or left out
+    if adjusted.refines_sensors:
         images = images.with_sensors_of(adjusted.images)
     source = source.at(images.turned_to(first.rotations))
     rigid = find_rigid_parts(source.images)

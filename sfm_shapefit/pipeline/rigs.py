@@ -23,8 +23,9 @@ from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.judgement.verdicts import Hold, find_hold
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import ContradictedOffsetsError, Near, Placement, place_pieces
+from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.solver.tied import largest_tied
@@ -32,9 +33,6 @@ from sfm_shapefit.tracks.options import NodeOptions
 
 _FITTING = 0.95  # share of pairs that agree with a placement; from here on no other is tried
 _MOST_TRIED = 5_000  # nodes; more take seconds
-# Relative standard deviation of a scale by pairs alone, from which it counts as open: the offsets are five
-# times their error then, which errors that pairs share make twice as large.
-_OPEN_SCALE = 0.2
 _COINCIDENT = 1e-9  # extent of fixed centers over their distance from the origin; less is rounding
 
 Place = Callable[[MeasuredGraph], Iterator[Placement]]
@@ -108,36 +106,16 @@ def place_cameras(
     *,
     certified: bool = True,
 ) -> Iterator[Placement]:
-    """Place the rigid pieces of a graph; groups whose offsets tell no scale as if each were at one place."""
+    """Place the rigid pieces of a graph; with offsets in groups, 3D points take part only if they are needed.
+
+    Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
+    take part with groups only if they are wanted always, or if cameras hang loose without them.
+    """
     hand_back_memory()  # what the graph was made of is gone
     placed = partial(
         place_pieces, options=options, near=near, certified=certified, on_iteration=clock.iteration
     )
-    if not measured.has_scale:
-        yield from placed(measured)
-        return
-    assert measured.groups is not None
-    try:
-        first = next(_place_by_offsets(measured, placed, options, nodes))
-    except ContradictedOffsetsError as error:
-        if not _is_scale_open(error.placement, options):
-            raise
-        first = error.placement
-    if _is_scale_open(first, options):
-        yield from placed(replace(measured, groups=measured.groups.without_offsets()))
-    else:
-        yield first
-
-
-def _place_by_offsets(
-    measured: MeasuredGraph, placed: Place, options: PlacementOptions, nodes: NodeOptions
-) -> Iterator[Placement]:
-    """Place rigid groups whose offsets tell the scale; 3D points take part only where they are needed.
-
-    Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
-    take part only if they are wanted always, or if cameras hang loose without them.
-    """
-    if not measured.num_points or nodes.points == "always":
+    if not measured.has_scale or not measured.num_points or nodes.points == "always":
         yield from placed(measured)
         return
     first = second = None
@@ -188,19 +166,14 @@ def _count_held(placement: Placement, options: PlacementOptions) -> int:
     Whether the agreeing pairs tie them is not enough: in the park of fisheyes (kerry-park) they do, and hold
     18 of 48 cameras so loosely that points are needed.
     """
-    return _hold(placement, options).conditioning.causes.count(None)
-
-
-def _is_scale_open(placement: Placement, options: PlacementOptions) -> bool:
-    """Return whether no offsets at all would be as likely as those that rigs have; what is fixed has some."""
-    return placement.measured.fixed_group is None and _hold(placement, options).scale_sigma > _OPEN_SCALE
+    return measure_hold(placement, options.solver.factor_bytes).conditioning.causes.count(None)
 
 
 @one_blas_thread()  # as `judge`, which asks the same where the cameras stay
-def _hold(placement: Placement, options: PlacementOptions) -> Hold:
-    """Return how well the agreeing pairs hold the placed cameras."""
+def measure_hold(placement: Placement, max_bytes: int = DEFAULT_FACTOR_BYTES) -> Hold:
+    """Return how well the agreeing pairs hold the placed cameras, by a factor of `max_bytes` at most."""
     hand_back_memory()  # what the solve took
-    part, refined, max_bytes = placement.measured_part(), placement.refined, options.solver.factor_bytes
+    part, refined = placement.measured_part(), placement.refined
     return find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, max_bytes)
 
 

@@ -323,12 +323,6 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     yield from stand.failures
     if stand.gauge.warning:
         yield stand.gauge.warning
-    longest = float(np.abs(stand.given.images.sensors.translations).max(initial=0.0))
-    if longest > 0.0 and not stand.source.images.sensors.translations.any():
-        yield (
-            f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to tell "
-            "its scale, so the sensors of a rig are taken to share one center"
-        )
     if stand.source.economy.statement:
         limit = f"max_memory_mb={found.options.memory.max_memory_mb}"
         yield f"to stay below {limit}, {stand.source.economy.statement}"

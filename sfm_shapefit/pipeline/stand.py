@@ -67,14 +67,7 @@ class Stand(NamedTuple):
         placement: Placement,
         options: PlacingOptions,
     ) -> "Stand":
-        """Return where cameras are placed, before anything is adjusted: in the gauge of all of them.
-
-        Sensors whose offsets were left out, as they tell no scale, share one center from here on.
-        """
-        if given.rigid.has_scale and placement.groups is not None and not placement.groups.have_extent:
-            sensors = source.images.sensors
-            at_one = np.zeros_like(sensors.translations)
-            source = source.at(source.images.with_sensors(sensors.rotations, at_one))
+        """Return where cameras are placed, before anything is adjusted: in the gauge of all of them."""
         gauge = given.rule.choose(placement.cameras, placement.locations, placement.unit)
         lenses, has_rigs = given.intrinsics, given.rigid.groups is not None
         freedom = Freedom.asked(options.freedom, lenses.parts, rigs=has_rigs)

@@ -268,7 +268,7 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
 
 
 def order_pieces(measured: MeasuredGraph) -> list[RigidPiece]:
-    """Return the rigid pieces, most cameras first; of rigid groups, those that their directions alone make."""
+    """Return the rigid pieces, most cameras first; of rigid groups, those that directions alone make."""
     if measured.groups is None:
         pieces = rigid_pieces(measured.graph)
     else:
@@ -277,7 +277,7 @@ def order_pieces(measured: MeasuredGraph) -> list[RigidPiece]:
 
 
 def count_large(pieces: list[RigidPiece], measured: MeasuredGraph) -> int:
-    """Return how many of the pieces, most cameras first, have three cameras or more that move by themselves."""
+    """Return how many of the pieces, most cameras first, have three or more that move by themselves."""
     return sum(_count_moving(piece.nodes, measured) >= SMALLEST_PIECE for piece in pieces)
 
 
