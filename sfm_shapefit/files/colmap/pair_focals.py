@@ -1,7 +1,7 @@
 """Focal lengths that COLMAP found pair by pair, from 4.2 on, where one of the two lenses is a guess.
 
-Where the other lens is calibrated, or both images share the guessed one, COLMAP verifies a pair by solving for
-pose and focal length together, and keeps the lens that it found in `camera1` or `camera2` of the pair:
+Where the other lens is calibrated, or both images share the guessed one, COLMAP verifies a pair by solving
+for pose and focal length together, and keeps the lens that it found in `camera1` or `camera2` of the pair:
 
     camera  id u32, model i32, width u64, height u64, prior_focal_length u8, count u64, params f64 each
 
@@ -20,6 +20,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 
 _HEAD = struct.Struct("<IiQQBQ")
 _WIDTH = 0.03  # scatter of logs of focal lengths; that of right pairs of castle-P30 and lego100
@@ -40,8 +41,12 @@ class PairFocal(NamedTuple):
     """Whether the other lenses of most of these are calibrated; else they are the same guess."""
 
 
-def read_pair_focals(database: DatabaseFile, asked: Collection[int]) -> dict[int, PairFocal]:
+def read_pair_focals(
+    database: DatabaseFile, asked: Collection[int], left_out: PairNames = frozenset()
+) -> dict[int, PairFocal]:
     """Return what the pairs of a database say of the cameras asked, by their ids there.
+
+    Pairs that are left out, by the names of their images, say nothing.
 
     Raises:
         InputError: if the database cannot be read.
@@ -50,11 +55,13 @@ def read_pair_focals(database: DatabaseFile, asked: Collection[int]) -> dict[int
     where = f"WHERE coalesce(camera1, camera2) IS NOT NULL ORDER BY rows DESC, pair_id LIMIT {_MOST_PAIRS}"
     table = "two_view_geometries"
     rows = database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {where}"})
-    cameras = read_cameras(database).usable
+    cameras, ids = read_cameras(database).usable, dict(database.query("SELECT name, image_id FROM images"))
+    ends = indices_of_pairs(ids, left_out).tolist()
+    unwanted = {MAX_NUM_IMAGES * min(pair) + max(pair) for pair in ends}
     found: dict[int, list[tuple[float, float, float]]] = {}
-    for _, count, *blobs in rows:
+    for pair_id, count, *blobs in rows:
         is_one_sided = None in blobs
-        for blob in blobs:
+        for blob in blobs if pair_id not in unwanted else ():
             camera_id, focal = _focal(blob)
             if camera_id in cameras and camera_id in asked and isinstance(count, int) and focal > 0.0:
                 own = found.setdefault(camera_id, [])
