@@ -164,7 +164,7 @@ def pieces_of(placement: Placement, solved: Iterable[tuple[int, str, int]]) -> l
     facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
     n, graph = placement.num_cameras, placement.graph
     rows = []
-    for k, piece in enumerate(placement.pieces[: max(count_large(placement.pieces, n), 1)]):
+    for k, piece in enumerate(placement.pieces[: max(count_large(placement.pieces, placement.measured), 1)]):
         scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
         rows.append(
             Piece(

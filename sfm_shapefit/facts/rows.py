@@ -51,7 +51,7 @@ def camera_rows(
     graph = placement.graph
     # Each camera's home is the first piece of three cameras or more that holds it, or the largest.
     homes: list[int | None] = [None] * graph.num_nodes
-    for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
+    for k in reversed(range(max(count_large(placement.pieces, placement.measured), 1))):
         for camera in placement.pieces[k].nodes.tolist():
             homes[camera] = k
     reasons = left_out_reasons(graph, placement.pieces)

@@ -205,8 +205,8 @@ def _intrinsics(lens: Lens) -> dict[str, Any]:
     name, num_focals, keys = _MODELS[lens.model]
     focals, (cx, cy, *coefficients) = lens.parameters[:num_focals], lens.parameters[num_focals:]
     distortion = dict(zip(keys, coefficients, strict=True))
-    denominator = [distortion.pop(key) for key in _DENOMINATOR if key in distortion]
-    if any(denominator):
+    denominator = _DENOMINATOR if lens.model == "FULL_OPENCV" else ()
+    if any(distortion.pop(key) for key in denominator):
         raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
     return {
         "camera_model": name,

@@ -78,6 +78,11 @@ class RigidGroups:
         """Number of units, S."""
         return int(np.max(self.units, initial=0) + 1)
 
+    @property
+    def have_extent(self) -> bool:
+        """Whether two nodes of a group stand apart; else their offsets say nothing of the scale."""
+        return bool(self.center().offsets.any())
+
     def split(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return f (B, d) and s (S,) of an x."""
         return x[: self.num_groups], x[self.num_groups :, 0]

@@ -84,6 +84,19 @@ class MeasuredGraph:
         return (~self.is_pair).astype(np.int64)
 
     @property
+    def moving(self) -> IntArray:
+        """(n,) what moves with each node: the number of its rigid group, or its own without groups."""
+        return np.arange(self.graph.num_nodes) if self.groups is None else self.groups.group_of
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether a group has two nodes apart that others see; else the directions leave the scale open."""
+        if self.groups is None:
+            return False
+        nodes = np.unique(self.graph.edges[self.groups.joins(self.graph.edges)])
+        return bool(len(nodes)) and self.groups.restricted_to(nodes).have_extent
+
+    @property
     def cameras_per_group(self) -> IntArray:
         """(B,) number of cameras in each rigid group; 0 for a point, which is a group of its own."""
         assert self.groups is not None

@@ -27,7 +27,7 @@ class Judged(Placement):
     lens_errors: LensErrors | None = None
     """What these covariances take errors of the lenses for."""
     scale_sigma: float | None = None
-    """Relative standard deviation of the scale, where an adjustment knows it."""
+    """Relative standard deviation of the scale, where an adjustment knows it, or pairs hardly do."""
 
     def loosened(self, loose: BoolArray) -> "Judged":
         """Return the same where nothing says how some of the cameras (k,) stand to the rest."""
@@ -73,4 +73,6 @@ def judge(placement: Placement, options: PlacementOptions) -> Judged:
     if second is not None:
         second = replace(second, cameras=placement.nodes[second.cameras])
     as_placed = {item.name: getattr(placement, item.name) for item in fields(Placement)}
-    return Judged(**as_placed, assessment=assessment, second_configuration=second)
+    return Judged(
+        **as_placed, assessment=assessment, second_configuration=second, scale_sigma=assessment.scale_sigma
+    )

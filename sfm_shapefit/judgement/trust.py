@@ -85,8 +85,7 @@ def judge_cameras(
 
 def _shares(measured: MeasuredGraph, agrees: BoolArray) -> FloatArray:
     """Return the share of each camera's pairs, or of those of its group, that agree; the median of none."""
-    graph, groups = measured.graph, measured.groups
-    labels = np.arange(graph.num_nodes) if groups is None else groups.group_of
+    graph, labels = measured.graph, measured.moving
     ends = labels[graph.edges]
     outer = ends[:, 0] != ends[:, 1]
     count = int(labels.max()) + 1

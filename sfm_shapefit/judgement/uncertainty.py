@@ -65,6 +65,8 @@ class CameraUncertainty:
     """(m,) in [0, 1]."""
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
+    scale_sigma: float = np.inf
+    """Relative standard deviation of the scale that offsets in rigid groups tell; infinite without any."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -159,6 +161,8 @@ class GroupGauge(NamedTuple):
     groups: RigidGroups
     share: FloatArray
     """(B,) not negative, with sum 1: the groups whose weighted mean is held fixed."""
+    has_cameras: BoolArray
+    """(B,) the groups that show how large the scene is."""
 
 
 def propagate_groups(
@@ -179,7 +183,7 @@ def propagate_groups(
         errors: samples, as in `propagate`.
         max_bytes: limit of the factor.
     """
-    groups, share = gauge
+    groups, share, has_cameras = gauge
     terms, d = inform(locations, edges, information), locations.shape[1]
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyze(groups.num_groups, ends)
@@ -197,7 +201,14 @@ def propagate_groups(
         covariances=covariances[groups.group_of],
         leverages=terms.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,
+        scale_sigma=_scale_sigma(factor, groups.split(groups.center().fit(locations)[0])[0], has_cameras),
     )
+
+
+def _scale_sigma(factor: CholeskyFactor, centers: FloatArray, gauge: BoolArray) -> float:
+    """Return the relative standard deviation of the scale of groups at centers (B, d), read off some (B,)."""
+    size = _gauge_pair(centers, gauge & (distances_in_spreads(centers, centers[gauge]) <= _FAR))[1][:, :, -1]
+    return float(np.sqrt(max(float(np.vdot(size, factor.solve(size))), 0.0)))
 
 
 def scatter(samples: FloatArray) -> FloatArray:

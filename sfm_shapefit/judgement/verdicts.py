@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import UnsolvableError
-from sfm_shapefit.base.geometry import distances_in_spreads, tangent_bases
+from sfm_shapefit.base.geometry import METRIC_SIGMA, distances_in_spreads, tangent_bases
 from sfm_shapefit.graph.measured import MeasuredGraph
 from sfm_shapefit.graph.rigidity import parallel_rigid_pieces
 from sfm_shapefit.judgement.limits import INSIDE, SMALLEST_SHAPE
@@ -35,6 +35,7 @@ _LOOSENING_RAD = 1e-4  # radians of noise, at least, in the search for loose nod
 # Median distances within which the uncertainty is computed, the next where that is singular; farther nodes do
 # not say how large the scene is.
 _REACHES = (np.inf, 1e3, INSIDE)
+_SCALE_APART = 0.02  # relative; half of what makes a camera loose that is two spreads from the middle
 _UNCHECKED_LEVERAGE = 0.99  # leverage; from here on agreement means nothing, 1 % of an error shows
 
 
@@ -66,6 +67,8 @@ class Assessment(CameraTrust):
     """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
     cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
     NaN, all of them, where the graph is too large for its factor."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale that offsets in rigid groups tell, if it is above a tenth."""
     doubts: Doubts | None = None
     """What the pairs' own rotations say of those given; None if they were not asked."""
 
@@ -108,17 +111,34 @@ def assess(
         agreement: agreement of the same graph with the same locations; computed anew if None.
     """
     agreement = agreement or find_agreement(measured, locations)
-    covariances, leverages, held = find_hold(measured, locations, agreement, undetermined_nodes, max_bytes)
-    judged = judge_cameras(measured, locations, agreement.agrees, standard_deviations(covariances), held)
+    found = find_hold(
+        measured, locations, agreement, undetermined_nodes, max_bytes, apart_from_scale=_SCALE_APART
+    )
+    held, sigmas = found.conditioning, standard_deviations(found.covariances)
+    judged = judge_cameras(measured, locations, agreement.agrees, sigmas, held)
     return Assessment(
         **{item.name: getattr(judged, item.name) for item in fields(CameraTrust)},
         residuals_deg=np.degrees(agreement.angles_rad),
         inliers=agreement.agrees,
-        leverages=leverages,
+        leverages=found.leverages,
         level_deg=float(np.degrees(agreement.level_rad)),
         loose_groups=held.groups,
-        covariances=covariances,
+        covariances=found.covariances,
+        scale_sigma=found.scale_sigma if METRIC_SIGMA < found.scale_sigma < np.inf else None,
     )
+
+
+class Hold(NamedTuple):
+    """How well the agreeing pairs hold each location."""
+
+    covariances: FloatArray
+    """(n, d, d), see `Assessment`."""
+    leverages: FloatArray
+    """(m,)"""
+    conditioning: Conditioning
+    scale_sigma: float
+    """Relative standard deviation of the scale that the offsets inside rigid groups tell, infinite where they
+    tell none."""
 
 
 def find_hold(
@@ -127,8 +147,14 @@ def find_hold(
     agreement: AngularAgreement,
     undetermined_nodes: IntArray | None,
     max_bytes: int,
-) -> tuple[FloatArray, FloatArray, Conditioning]:
-    """Return covariances, leverages (see `Assessment`), and how well the agreeing pairs hold each camera."""
+    *,
+    apart_from_scale: float = np.inf,
+) -> Hold:
+    """Return how well the agreeing pairs hold each location.
+
+    A scale of a larger relative standard deviation than `apart_from_scale` is no part of that, unless a group
+    is fixed: all cameras would seem loose that are far from the middle.
+    """
     graph, freedom, inliers = measured.graph, measured.graph.dimension - 1, agreement.agrees
     own, excess, bases = own_covariances(measured), agreement.excess_rad, tangent_bases(graph.directions)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
@@ -140,14 +166,19 @@ def find_hold(
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     open_nodes = np.empty(0, np.int64) if undetermined_nodes is None else undetermined_nodes
     holding = inliers & ~np.isin(graph.edges, open_nodes).any(axis=1)
-    propagate_all = _propagate_nodes if measured.groups is None else _propagate_groups
-    covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
+    known, scale_sigma = (measured, locations, holding, information, sampled, max_bytes), np.inf
+    if measured.has_scale:
+        covariances, leverages, scale_sigma = _propagate_groups(*known)
+        scale_sigma *= scale
+    if not measured.has_scale or (scale_sigma > apart_from_scale and measured.fixed_group is None):
+        covariances, leverages = _propagate_freely(*known)
     leverages[inliers & ~holding] = np.nan
     if sampled is None and measured.evidence is not None:
         covariances = covariances / measured.evidence.facts_per_match
     covariances = scale**2 * covariances
     k, sigmas = measured.num_cameras, standard_deviations(covariances)
-    return covariances, leverages, condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
+    return Hold(covariances, leverages, conditioning, scale_sigma)
 
 
 class _Sampled(NamedTuple):
@@ -178,7 +209,7 @@ def _infinite_covariances(locations: FloatArray) -> FloatArray:
     return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
 
 
-def _propagate_nodes(
+def _propagate_freely(
     measured: MeasuredGraph,
     locations: FloatArray,
     inliers: BoolArray,
@@ -186,21 +217,24 @@ def _propagate_nodes(
     sampled: _Sampled | None,
     max_bytes: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances (n, d, d) and the leverages (m,).
+    """Return the covariances (n, d, d) and the leverages (m,) of locations whose scale is open.
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid. Where
-    baselines of very different lengths make that singular, only its nodes within some radii have any.
+    baselines of very different lengths make that singular, only its nodes within some radii have any. A rigid
+    group, whose nodes are then at one place, counts as one node.
     """
-    graph, num_cameras = measured.graph, measured.num_cameras
+    graph, node_of = measured.graph, measured.moving
+    ends, locations = node_of[graph.edges], locations[np.unique(node_of, return_index=True)[1]]
+    num_cameras = int(node_of[: measured.num_cameras].max(initial=-1)) + 1
     covariances, leverages = _infinite_covariances(locations), np.where(inliers, np.nan, 0.0)
     distances = distances_in_spreads(locations, locations[:num_cameras])
     for reach in _REACHES:
-        used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
-        rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
-        nodes, edges = np.unique(graph.edges[rows], return_inverse=True)
+        used = np.flatnonzero(inliers & (distances[ends] <= reach).all(axis=1))
+        rows = used[parallel_rigid_pieces(len(locations), ends[used], graph.dimension) == 0]
+        nodes, edges = np.unique(ends[rows], return_inverse=True)
         cameras = int(np.sum(nodes < num_cameras))
         if cameras < SMALLEST_SHAPE:
-            return covariances, leverages
+            break
         try:
             samples = None if sampled is None else sampled.parts(graph.directions, rows)
             found = propagate(
@@ -209,13 +243,16 @@ def _propagate_nodes(
         except UnsolvableError:  # singular in spite of the ridge
             continue
         if found is None:
+            covariances[:] = np.nan
             break
         inside = locations[nodes[distances[nodes] <= INSIDE]]
         is_held = ~(found.sigmas > _extent(inside)).any(axis=1)
         covariances[nodes[is_held]] = found.covariances[is_held]
         leverages[rows] = found.leverages
-        return covariances, leverages
-    return np.full_like(covariances, np.nan), leverages
+        break
+    else:
+        covariances[:] = np.nan
+    return covariances[node_of], leverages
 
 
 def _extent(locations: FloatArray) -> float:
@@ -230,8 +267,11 @@ def _propagate_groups(
     information: FloatArray,
     sampled: _Sampled | None,
     max_bytes: int,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, float]:
     """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale given.
+
+    The third value is the relative standard deviation of that scale: infinite where the pairs tie no two
+    groups, 0 where it was not computed.
 
     Only the groups that the inlier pairs tie at these locations have any: those around the fixed one, or most
     cameras.
@@ -245,19 +285,19 @@ def _propagate_groups(
     inside = np.isin(groups.group_of, tied)
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
-        return covariances, leverages
+        return covariances, leverages, np.inf
     nodes = np.flatnonzero(inside)
     edges = np.searchsorted(nodes, graph.edges[rows])
     share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
     samples = None if sampled is None else sampled.parts(graph.directions, rows)
-    gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum())
+    gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum(), cameras[tied] > 0)
     try:
         found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, max_bytes)
     except UnsolvableError:
         found = None
     if found is None:
-        return np.full_like(covariances, np.nan), leverages
+        return np.full_like(covariances, np.nan), leverages, 0.0
     is_held = ~(found.sigmas > _extent(locations[nodes])).any(axis=1)
     covariances[nodes[is_held]] = found.covariances[is_held]
     leverages[rows] = found.leverages
-    return covariances, leverages
+    return covariances, leverages, found.scale_sigma

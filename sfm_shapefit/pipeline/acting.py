@@ -1,7 +1,8 @@
 """Act on evidence where that is safe: a lens that is wrong is freed, a camera goes where most pairs put it.
 
 Once only, and what comes of it counts only if less speaks against it afterwards. The side of a seam is never
-guessed: nothing says which of two groups is wrong.
+guessed: nothing says which of two groups is wrong. Sensors whose offsets in their rigs are too short to tell
+the scale are taken to share one center, so that the scale is open.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,11 @@ from sfm_shapefit.files.colmap.intrinsics import with_focal_length
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
+from sfm_shapefit.pipeline.rigs import find_rigid_parts, measure_hold
+from sfm_shapefit.placement.place import ContradictedOffsetsError
 from sfm_shapefit.scene.lens import FOCAL, Origin
+
+_OPEN_SCALE = 0.5  # relative standard deviation; with a larger one the offsets may as well be 0
 
 
 class Remedy(NamedTuple):
@@ -54,7 +59,15 @@ def act(
 
     `place` leads from what is known of the images, and their matches, to a result.
     """
-    found = place(given, source)
+    found = _place_in_scale(place, given, source)
+    if isinstance(found, str):
+        sensors = given.images.sensors
+        at_one = sensors.rotations, np.zeros_like(sensors.translations)
+        images = given.images.with_sensors(*at_one)
+        given = given._replace(images=images, rigid=find_rigid_parts(images, given.rigid.fixed))
+        source = source.at(source.images.with_sensors(*at_one))
+        again = act(place, given, source, options)
+        return replace(again, warnings=(found, *again.warnings))
     remedy = find_remedy(found, given, source, options)
     if remedy is None:
         return found
@@ -62,6 +75,29 @@ def act(
     if not remedy.cures(again, found):
         return found
     return replace(again, warnings=(*remedy.told(again), *again.warnings))
+
+
+def _place_in_scale(
+    place: Callable[[Given, MatchSource], LocateResult], given: Given, source: MatchSource
+) -> LocateResult | str:
+    """Return the result, or why its scale is not that of the rigs, a sentence.
+
+    UnsolvableError: as `place`; that the directions contradict offsets means nothing where these are short.
+    """
+    longest = float(np.linalg.norm(given.images.sensors.translations, axis=1).max(initial=0.0))
+    try:
+        found = place(given, source)
+        sigma = found.placement.scale_sigma
+    except ContradictedOffsetsError as error:
+        sigma = measure_hold(error.placement).scale_sigma
+        if not (longest > 0.0 and sigma > _OPEN_SCALE):
+            raise
+    if longest > 0.0 and sigma is not None and sigma > _OPEN_SCALE:
+        return (
+            f"the offsets of sensors in their rigs, at most {longest:.2g}, are too short for this scene to "
+            "tell its scale, so the sensors of a rig are taken to share one center"
+        )
+    return found
 
 
 def find_remedy(

@@ -123,7 +123,7 @@ def with_uncertainty(placement: Judged, images: Images, known: Estimate, scale: 
         placement,
         adjusted_covariances=own,
         lens_errors=known.lens_errors,
-        scale_sigma=known.scale_sigma,
+        scale_sigma=placement.scale_sigma if known.scale_sigma is None else known.scale_sigma,
     )
 
 

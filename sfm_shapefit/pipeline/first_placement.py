@@ -53,7 +53,7 @@ def adjust_first_placement(
     Raises:
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    images, is_free = source.images, given.rigid.groups is None  # rigid groups need few points
+    images, is_free = source.images, not given.rigid.has_scale  # offsets do what points do
     wanted = Wanted(tracks=wants_points(source, options.nodes), checked=is_free)
     measured = measure(source, options.directions, clock, wanted)
     build = partial(build_graph, images, measured, options.nodes)

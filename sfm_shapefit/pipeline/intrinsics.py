@@ -1,15 +1,25 @@
 """Which intrinsics are in doubt, and the focal lengths of them that the view graph knows beforehand."""
 
+from collections.abc import Iterator, Mapping, Sequence
+
 import numpy as np
 
+from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
-from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated, with_focal_length
+from sfm_shapefit.files.colmap.intrinsics import (
+    Uncalibrated,
+    calibrate_view_graph,
+    find_uncalibrated,
+    with_focal_length,
+)
+from sfm_shapefit.files.colmap.pair_focals import PairFocal, read_pair_focals
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import PARTS, Origin
+from sfm_shapefit.scene.lens import PARTS, Lens, Origin
 from sfm_shapefit.scene.matches import PairNames
 
+_UNLIKE = 1.1  # factor; pairs that agree scatter by a third of that
 _MOST_OFF = 4.0  # factor; a view graph that wants a larger one says more of itself than of the lens
 
 
@@ -33,8 +43,13 @@ def settle_intrinsics(
         lenses[k] = images.lenses[k].in_doubt(Origin.GUESS)
     for k, found in guessed.items():
         lenses[k] = images.lenses[k].in_doubt(found.origin)
+    asked = [found.database_id for found in guessed.values()]
+    by_pairs = read_pair_focals(file, asked, left_out) if file is not None and asked else {}
     if file is not None and guessed and wanted != "held":
-        by_database = calibrate_view_graph(file, [g.database_id for g in guessed.values()], left_out)
+        by_database = calibrate_view_graph(file, asked, left_out)
+        by_database |= {
+            i: one.factor for i, one in by_pairs.items() if one.is_one_sided or i not in by_database
+        }
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
@@ -42,5 +57,31 @@ def settle_intrinsics(
     by_view_graph = factors != 1.0
     for k in np.flatnonzero(by_view_graph).tolist():
         lenses[k] = with_focal_length(lenses[k], factors[k])
+    if file is not None:
+        file.notes += _contradicted_guesses(images.lenses, lenses, guessed, by_pairs)
     parts = np.array(may_move, dtype=np.bool_) & np.isin(list(PARTS), PARTS_FREED[wanted])
     return images.with_lenses(lenses), intrinsics_in_doubt(parts, by_view_graph)
+
+
+def _contradicted_guesses(
+    before: Sequence[Lens],
+    lenses: Sequence[Lens],
+    guessed: Mapping[int, Uncalibrated],
+    by_pairs: Mapping[int, PairFocal],
+) -> Iterator[str]:
+    """Yield which lenses start from another focal length than their pairs were verified with, if any do."""
+    told = []
+    for k, found in guessed.items():
+        if found.database_id not in by_pairs:
+            continue
+        one, focal_px = by_pairs[found.database_id], lenses[k].focal_px
+        asked_px = before[k].focal_px * one.factor * found.ratio
+        if not 1.0 / _UNLIKE < asked_px / focal_px < _UNLIKE:
+            told.append(
+                f"{one.num_pairs} of camera {lenses[k].id} with {asked_px:,.0f} px, not {focal_px:,.0f}"
+            )
+    if told:
+        yield (
+            "COLMAP verified pairs with other focal lengths than their guessed lenses start from: "
+            f"{first_of(told)}; intrinsics=auto lets these change"
+        )

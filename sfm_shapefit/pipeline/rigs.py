@@ -22,9 +22,10 @@ from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.lines import text_of
 from sfm_shapefit.graph.groups import RigidGroups, separate
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.judgement.verdicts import find_hold
+from sfm_shapefit.judgement.verdicts import Hold, find_hold
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.pipeline.clock import Clock
-from sfm_shapefit.placement.place import Near, Placement, is_scaled, place_pieces
+from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.same_images import same_images
@@ -47,6 +48,11 @@ class Rigid(NamedTuple):
     """The images in groups; None where each moves by itself."""
     fixed_group: int | None
     """The group of the fixed images."""
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether images of a group stand apart, so that pairs that see two of them tell a scale."""
+        return self.groups is not None and self.groups.have_extent
 
     def apply(self, measured: MeasuredGraph) -> MeasuredGraph:
         """Return a measured graph of the images with these groups; each of its points is one more."""
@@ -85,7 +91,7 @@ def rigs_statement(images: Images, measured: MeasuredGraph) -> str:
     if groups is None:
         return "none: every image is a frame of its own"
     frames = f"{len(images.frames.ids)} frames of {images.num_images} images"
-    if not is_scaled(groups, edges):
+    if not measured.has_scale:
         return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
     sizes = measured.cameras_per_group
     tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
@@ -101,7 +107,7 @@ def place_cameras(
     *,
     certified: bool = True,
 ) -> Iterator[Placement]:
-    """Place the rigid pieces of a graph; with rigid groups, 3D points take part only where they are needed.
+    """Place the rigid pieces of a graph; with offsets in groups, 3D points take part only if they are needed.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
@@ -110,7 +116,7 @@ def place_cameras(
     placed = partial(
         place_pieces, options=options, near=near, certified=certified, on_iteration=clock.iteration
     )
-    if measured.groups is None or not measured.num_points or nodes.points == "always":
+    if not measured.has_scale or not measured.num_points or nodes.points == "always":
         yield from placed(measured)
         return
     first = second = None
@@ -155,17 +161,21 @@ def _count_agreeing(placement: Placement) -> int:
     return int(placement.agreement.agrees[placement.pairs].sum())
 
 
-@one_blas_thread()  # as `judge`, which asks the same where the cameras stay
 def _count_held(placement: Placement, options: PlacementOptions) -> int:
     """Return how many of the placed cameras do not hang loose.
 
     Whether the agreeing pairs tie them is not enough: in the park of fisheyes (kerry-park) they do, and hold
     18 of 48 cameras so loosely that points are needed.
     """
+    return measure_hold(placement, options.solver.factor_bytes).conditioning.causes.count(None)
+
+
+@one_blas_thread()  # as `judge`, which asks the same where the cameras stay
+def measure_hold(placement: Placement, max_bytes: int = DEFAULT_FACTOR_BYTES) -> Hold:
+    """Return how well the agreeing pairs hold the placed cameras, by a factor of `max_bytes` at most."""
     hand_back_memory()  # what the solve took
-    part, refined, max_bytes = placement.measured_part(), placement.refined, options.solver.factor_bytes
-    _, _, held = find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, max_bytes)
-    return held.causes.count(None)
+    part, refined = placement.measured_part(), placement.refined
+    return find_hold(part, refined.locations, placement.agreement, refined.reset_nodes, max_bytes)
 
 
 def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:

@@ -87,7 +87,7 @@ def settle(
     An adjustment may have the images already; `first` says where then.
     """
     with clock("directions"):
-        checked = first is None and given.rigid.groups is None  # rigid groups need few points
+        checked = first is None and not given.rigid.has_scale  # offsets do what points do
         wanted = Wanted(wants_points(opened, options.nodes), checked, opened.economy.samples, facts=True)
         measured = measure(opened, options.directions, clock, wanted)
     directions = measured.directions

@@ -118,7 +118,7 @@ def diagnose(
         measured = MeasuredGraph(measured)
     options = options or PlacementOptions()
     graph, n, pairs = measured.graph, measured.num_cameras, measured.without_points().graph
-    pieces = order_pieces(graph, n)
+    pieces = order_pieces(measured)
     obstacle = ""
     try:
         refuse_without_triangle(measured, pieces)
@@ -143,7 +143,7 @@ def diagnose(
                 num_cameras=int(np.sum(piece.nodes < n)),
                 hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < n),
             )
-            for piece in pieces[: count_large(pieces, n)]
+            for piece in pieces[: count_large(pieces, measured)]
         ),
         left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
         weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against, confirmed),

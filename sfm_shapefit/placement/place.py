@@ -18,7 +18,7 @@ from sfm_shapefit.base.display import Displayed
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.measured import MeasuredGraph
-from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.graph.rigidity import RigidPiece, rigid_pieces, rigid_pieces_of_groups
 from sfm_shapefit.graph.viewgraph import ViewGraph
 from sfm_shapefit.refinement.agreement import AngularAgreement, find_agreement
 from sfm_shapefit.refinement.near import stay_near
@@ -31,7 +31,7 @@ from sfm_shapefit.solver.tied import largest_tied
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
-_LEAST_UNIT = 1e-6  # median baselines; with smaller offsets their scale means nothing
+_LEAST_OFFSETS = 1e-6  # median baselines; with shorter ones their scale means nothing
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
@@ -65,7 +65,8 @@ class Placement(Displayed):
     history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
     unit: float | None
-    """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
+    """Length of the unit of the offsets inside rigid groups, in the solver's units; None where these, such as
+    sensors that share one center, leave the scale open."""
 
     @property
     def graph(self) -> ViewGraph:
@@ -147,6 +148,15 @@ class Placement(Displayed):
         return self.measured.part(self.edges)[0]
 
 
+class ContradictedOffsetsError(UnsolvableError):
+    """The offsets inside rigid groups come out with no length, or a negative one."""
+
+    def __init__(self, message: str, placement: Placement) -> None:
+        """Keep the placement, which is right where offsets are too short to tell a scale."""
+        super().__init__(message)
+        self.placement = placement
+
+
 def place_pieces(
     measured: MeasuredGraph,
     options: PlacementOptions,
@@ -176,13 +186,14 @@ def place_pieces(
     """
     if measured.groups is not None:
         refuse_admm(options.solver)
+    if measured.has_scale:
         pieces = [find_tied_piece(measured)]
     else:
-        pieces = order_pieces(measured.graph, measured.num_cameras)
+        pieces = order_pieces(measured)
         refuse_without_triangle(measured, pieces)
     how = _How(options, near, certified)
     yield _place_piece(measured, pieces, 0, how, on_iteration)
-    for k in range(1, count_large(pieces, measured.num_cameras)):
+    for k in range(1, count_large(pieces, measured)):
         with suppress(UnsolvableError):
             yield _place_piece(measured, pieces, k, how)
 
@@ -224,8 +235,8 @@ def _place_piece(
         refined = refine_starts(part, solved, how.options, certified=how.certified)
     else:
         refined = stay_near(part, solved, centers, near.refined)
-    unit = None if part.groups is None else measure_unit(part, refined.locations)
-    return Placement(
+    unit, length = measure_unit(part, refined.locations) if part.has_scale else (None, np.inf)
+    placement = Placement(
         measured=measured,
         pieces=pieces,
         piece=k,
@@ -235,6 +246,13 @@ def _place_piece(
         history=tuple(history),
         unit=unit,
     )
+    if not length > _LEAST_OFFSETS:
+        raise ContradictedOffsetsError(
+            "the directions contradict the known offsets between cameras: their scale comes out as "
+            f"{length:.1e} of a baseline; check the rigs, or which cameras are fixed",
+            placement,
+        )
+    return placement
 
 
 @one_blas_thread()
@@ -249,47 +267,45 @@ def replace_locations(placement: Placement, refined: RefinedPlacement) -> Placem
     return Placement(**moved)
 
 
-def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
-    """Return the rigid pieces, most cameras first; nodes from `num_cameras` on are points."""
-    return sorted(rigid_pieces(graph), key=lambda piece: -int(np.sum(piece.nodes < num_cameras)))
+def order_pieces(measured: MeasuredGraph) -> list[RigidPiece]:
+    """Return the rigid pieces, most cameras first; of rigid groups, those that directions alone make."""
+    if measured.groups is None:
+        pieces = rigid_pieces(measured.graph)
+    else:
+        pieces = rigid_pieces_of_groups(measured.graph, measured.groups)
+    return sorted(pieces, key=lambda piece: -int(np.sum(piece.nodes < measured.num_cameras)))
 
 
-def count_large(pieces: list[RigidPiece], num_cameras: int) -> int:
-    """Return how many of the pieces, most cameras first, have three cameras or more."""
-    return sum(int(np.sum(piece.nodes < num_cameras)) >= SMALLEST_PIECE for piece in pieces)
+def count_large(pieces: list[RigidPiece], measured: MeasuredGraph) -> int:
+    """Return how many of the pieces, most cameras first, have three or more that move by themselves."""
+    return sum(_count_moving(piece.nodes, measured) >= SMALLEST_PIECE for piece in pieces)
+
+
+def _count_moving(nodes: IntArray, measured: MeasuredGraph) -> int:
+    """Return the number of cameras among some nodes, or of the groups that these are in."""
+    return len(np.unique(measured.moving[nodes[nodes < measured.num_cameras]]))
 
 
 def refuse_without_triangle(measured: MeasuredGraph, pieces: list[RigidPiece]) -> None:
     """Raise UnsolvableError if a graph of many cameras has no three that are rigid."""
-    num_cameras, num_edges = measured.num_cameras, measured.graph.num_edges
-    if not pieces or np.sum(pieces[0].nodes < num_cameras) < min(SMALLEST_PIECE, num_cameras):
+    num_moving, num_edges = _count_moving(np.arange(measured.num_cameras), measured), measured.graph.num_edges
+    if not pieces or _count_moving(pieces[0].nodes, measured) < min(SMALLEST_PIECE, num_moving):
         cure = "match more pairs, above all pairs that close triangles, if these are the right matches"
         against = () if measured.evidence is None else measured.evidence.contradicting
         if len(against) > num_edges:
             cure = f"{len(against)} pairs contradict the rotations: these are wrong, or of another scene"
-        raise UnsolvableError(
-            f"the {num_edges} usable directions tie no three cameras to one another; {cure}"
-        )
-
-
-def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
-    """Return whether a group has two nodes apart that others see; else the offsets' scale is open."""
-    nodes = np.unique(edges[groups.joins(edges)])
-    return bool(len(nodes)) and bool(groups.restricted_to(nodes).center().offsets.any())
+        one = "cameras" if measured.groups is None else "frames"
+        raise UnsolvableError(f"the {num_edges} usable directions tie no three {one} to one another; {cure}")
 
 
 def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
     """Return the nodes of the groups that the pairs tie to one another, and the edges between these groups.
 
     They are those around the fixed group, or the largest set if none is fixed. UnsolvableError, which says
-    which, if the pairs do not tie the groups, or leave the scale of their offsets open.
+    which, if the pairs do not tie the groups.
     """
     groups, edges = measured.groups, measured.graph.edges
     assert groups is not None
-    if not is_scaled(groups, edges):
-        raise UnsolvableError(
-            "no pair sees two cameras of one rig or of the fixed ones, so that nothing determines the scale"
-        )
     sizes = measured.cameras_per_group
     tied = largest_tied(edges, groups, sizes, around=measured.fixed_group)
     if np.sum(sizes[tied] > 0) < 2:
@@ -303,15 +319,10 @@ def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
     return RigidPiece(nodes=np.unique(edges[rows]), edges=rows, hinges=np.zeros(0, dtype=np.int64))
 
 
-def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
-    """Return the length of the offsets' unit at locations (n, d); UnsolvableError if it means nothing."""
+def measure_unit(part: MeasuredGraph, locations: FloatArray) -> tuple[float, float]:
+    """Return the length of the offsets' unit at locations (n, d), and that of the offsets in baselines."""
     assert part.groups is not None
     unit = float(part.groups.split(part.groups.fit(locations)[0])[1][0])
     size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())
     baseline = float(np.median(np.linalg.norm(differences(locations, part.graph.edges), axis=1)))
-    if not unit * size > _LEAST_UNIT * baseline:
-        raise UnsolvableError(
-            "the directions contradict the known offsets between cameras: their scale comes out as "
-            f"{unit * size / baseline:.1e} of a baseline; check the rigs, or which cameras are fixed"
-        )
-    return unit
+    return unit, unit * size / baseline

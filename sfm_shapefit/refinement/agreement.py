@@ -55,13 +55,13 @@ def find_agreement(
 
     Where most directions may be wrong, the level of all is first that of those that are taken for `right`.
     """
-    graph, groups = measured.graph, measured.groups
-    freedom, covariances = graph.dimension - 1, own_covariances(measured)
+    graph, freedom = measured.graph, measured.graph.dimension - 1
+    covariances = own_covariances(measured)
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
-    num_groups = graph.num_nodes if groups is None else groups.num_groups
-    num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
+    num_moving = graph.num_nodes if measured.groups is None else measured.groups.num_groups
+    num_unknowns = graph.dimension * (num_moving - 1) - (0 if measured.has_scale else 1)
     used: BoolArray = np.ones(graph.num_edges, dtype=np.bool_) if right is None else right
     excess, agrees = _excess(residuals, covariances, behind, num_unknowns, used)
     angles = np.linalg.norm(residuals, axis=1)

@@ -27,6 +27,7 @@ from sfm_shapefit.graph.rigidity.pieces import (
     is_parallel_rigid,
     parallel_rigid_pieces,
     rigid_pieces,
+    rigid_pieces_of_groups,
 )
 from sfm_shapefit.graph.rigidity.reasons import left_out_reasons
 
@@ -36,4 +37,5 @@ __all__ = [
     "left_out_reasons",
     "parallel_rigid_pieces",
     "rigid_pieces",
+    "rigid_pieces_of_groups",
 ]

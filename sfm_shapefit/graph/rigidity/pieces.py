@@ -9,6 +9,7 @@ from sfm_shapefit.base.arrays import Int32Array, IntArray, frozen
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.forests import compact
 from sfm_shapefit.base.jit import kernel
+from sfm_shapefit.graph.groups import RigidGroups
 from sfm_shapefit.graph.rigidity.game import contract, play
 from sfm_shapefit.graph.rigidity.growth import grow_sets, incidence, triangle_sets
 from sfm_shapefit.graph.viewgraph import ViewGraph
@@ -87,21 +88,37 @@ def _is_one_piece(num_nodes: int, edges: IntArray, dimension: int) -> bool:
 
 def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
     """Return the parallel-rigid pieces of a view graph, largest first; single pairs are pieces too."""
-    label = parallel_rigid_pieces(graph.num_nodes, graph.edges, graph.dimension)
+    return _find_pieces(graph.num_nodes, graph.edges, graph.dimension)
+
+
+def rigid_pieces_of_groups(graph: ViewGraph, groups: RigidGroups) -> list[RigidPiece]:
+    """Return the pieces of a view graph the nodes of each of whose groups are at one place."""
+    outer, pieces = np.flatnonzero(groups.joins(graph.edges)), []
+    for piece in _find_pieces(groups.num_groups, groups.group_of[graph.edges[outer]], graph.dimension):
+        edges = outer[piece.edges]
+        nodes = np.unique(graph.edges[edges])
+        hinges = nodes[np.isin(groups.group_of[nodes], piece.hinges)]
+        pieces.append(RigidPiece(frozen(nodes), frozen(edges), frozen(hinges)))
+    return pieces
+
+
+def _find_pieces(num_nodes: int, pairs: IntArray, dimension: int) -> list[RigidPiece]:
+    """Return the pieces of pairs (m, 2), of which some may be given more than once."""
+    label = parallel_rigid_pieces(num_nodes, pairs, dimension)
     if len(label) == 0:
         return []
     num_pieces = int(label.max()) + 1
-    start, nodes, _, _ = incidence(graph.num_nodes, graph.edges, label, num_pieces)
+    start, nodes, _, _ = incidence(num_nodes, pairs, label, num_pieces)
     owner = np.repeat(np.arange(num_pieces), np.diff(start))
     nodes = nodes[np.lexsort((nodes, owner))]
 
     is_large = np.diff(start)[owner] >= 3
-    large_at = np.bincount(nodes[is_large], minlength=graph.num_nodes)
+    large_at = np.bincount(nodes[is_large], minlength=num_nodes)
     is_hinge = large_at[nodes] - is_large > 0
 
     edges = np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
     parts = zip(np.split(nodes, start[1:-1]), edges, np.split(is_hinge, start[1:-1]), strict=True)
-    return [RigidPiece(frozen(own), frozen(pairs), frozen(own[hinge])) for own, pairs, hinge in parts]
+    return [RigidPiece(frozen(own), frozen(rows), frozen(own[hinge])) for own, rows, hinge in parts]
 
 
 @kernel

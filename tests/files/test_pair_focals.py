@@ -1,0 +1,68 @@
+"""Focal lengths that COLMAP keeps with the pairs it verified: what agrees starts guessed lenses."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.files.colmap.pair_focals import read_pair_focals
+from tests.lens_scene import camera_of_model, write_scene
+from tests.scenes import edit_database, read_from
+
+GUESSED, GUESS_PX = (2, 4, 6), 768.0
+
+
+def with_lenses_of_pairs(path, focal_of):
+    """Let pycolmap keep a lens for each pair of a guessed camera and a calibrated one.
+
+    `focal_of` has its focal length, by the number of the pair.
+    """
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera_id in GUESSED:
+            camera = database.read_camera(camera_id)
+            camera.params = [GUESS_PX, *camera.params[1:]]
+            camera.has_prior_focal_length = False
+            database.update_camera(camera)
+        pairs = database.read_two_view_geometries()
+        database.clear_two_view_geometries()
+        for number, (pair_id, found) in enumerate(zip(*pairs, strict=True)):
+            ends = pycolmap.pair_id_to_image_pair(pair_id)
+            guessed = [end in GUESSED for end in ends]
+            if sum(guessed) == 1:
+                camera = database.read_camera(ends[guessed.index(True)])
+                camera.params = [focal_of(number), *camera.params[1:]]
+                setattr(found, f"camera{1 + guessed.index(True)}", camera)
+            database.write_two_view_geometry(*ends, found)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene of eight cameras, three of which are to be guesses."""
+    truth = write_scene(tmp_path, [camera_of_model("SIMPLE_RADIAL", k) for k in range(1, 9)], 8)
+    return tmp_path / "database.db", truth
+
+
+def test_pairs_that_agree_tell_the_focal_length_whatever_others_say(scene):
+    with_lenses_of_pairs(scene[0], lambda number: 60_000.0 if number % 5 == 0 else 500.0 + number % 3)
+    found = read_from(scene[0], read_pair_focals, GUESSED)
+    assert set(found) == {*GUESSED}
+    for one in found.values():
+        assert one.factor * GUESS_PX == pytest.approx(501.0, abs=1.0)
+        assert one.is_one_sided
+    assert not read_from(scene[0], read_pair_focals, (1, 3, 5))
+
+
+def test_pairs_that_do_not_agree_or_are_few_or_damaged_tell_nothing(scene):
+    with_lenses_of_pairs(scene[0], lambda number: 300.0 * 1.2**number)
+    assert not read_from(scene[0], read_pair_focals, GUESSED)
+    edit_database(scene[0], "UPDATE two_view_geometries SET camera1 = x'00', camera2 = 'text'")
+    assert not read_from(scene[0], read_pair_focals, GUESSED)
+
+
+def test_map_starts_from_them_and_tells_where_a_guess_that_is_held_contradicts_them(scene):
+    with_lenses_of_pairs(scene[0], lambda number: 500.0 + np.sin(number))
+    found = sfm_shapefit.map_database(scene[0])
+    assert sfm_shapefit.evaluate(found.reconstruction, scene[1]).position.max < 0.04
+    assert not found.warnings
+    held = sfm_shapefit.map_database(scene[0], intrinsics="held", min_trust=0.0)
+    assert any("of camera 2 with 50" in w and "not 768" in w for w in held.warnings)
