@@ -236,8 +236,9 @@ def find_images(file: Path, listed: Sequence[str], names: Sequence[str]) -> IntA
     found = same_images(listed, names).places
     for match in (_by_stems, _by_numbers):
         left = np.flatnonzero(found < 0).tolist()
+        units = _UNITS if len(left) == len(listed) else _UNITS[:1]
         if left:
-            found[left] = match([listed[k] for k in left], names)
+            found[left] = match([listed[k] for k in left], names, units)
     for row, count in Counter(found[found >= 0].tolist()).items():
         if count > 1:
             first, second = (listed[k] for k in np.flatnonzero(found == row)[:2].tolist())
@@ -253,7 +254,7 @@ def named_as(file: Path, listed: Sequence[str], names: Sequence[str]) -> tuple[s
     return tuple(own if row < 0 else names[row] for own, row in zip(listed, rows, strict=True))
 
 
-def _by_stems(listed: Sequence[str], names: Sequence[str]) -> list[int]:
+def _by_stems(listed: Sequence[str], names: Sequence[str], _: Sequence[Decimal]) -> list[int]:
     """Return which image each listed name is of by the last part without suffix, where no other has that."""
     stems = [stem_of(name) for name in names]
     counts = Counter(stems)
@@ -261,22 +262,19 @@ def _by_stems(listed: Sequence[str], names: Sequence[str]) -> list[int]:
     return [row_of.get(stem_of(name), -1) for name in listed]
 
 
-def _by_numbers(listed: Sequence[str], names: Sequence[str]) -> list[int]:
+def _by_numbers(listed: Sequence[str], names: Sequence[str], units: Sequence[Decimal]) -> list[int]:
     """Return which image each listed number is of, by the numbers that names end with, if no two are equal.
 
-    If hardly any number is an image's, they are in other units: seconds for nanoseconds, or the reverse.
+    Of the units in which they may be listed (seconds, where names have nanoseconds) most numbers choose.
     """
     numbers = [number_of(name) for name in names]
     row_of = {number: row for row, number in enumerate(numbers) if number is not None}
     if len(row_of) < len(numbers) - numbers.count(None):
         return [-1] * len(listed)
     wanted, ordered = [number_of(name, alone=True) for name in listed], sorted(row_of)
-    for unit in _UNITS:
-        found = [None if one is None else _nearest(one, unit, ordered) for one in wanted]
-        rows = [-1 if number is None else row_of[number] for number in found]
-        if sum(row >= 0 for row in rows) > 1:
-            break
-    return rows
+    found = ([None if one is None else _nearest(one, unit, ordered) for one in wanted] for unit in units)
+    most = max(found, key=lambda some: len(some) - some.count(None))
+    return [-1 if number is None else row_of[number] for number in most]
 
 
 def _nearest(number: Decimal, unit: Decimal, ordered: Sequence[Decimal]) -> Decimal | None:
