@@ -43,6 +43,6 @@ def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> 
     own = " x ".join(map(str, np.round(scales * sizes[0]).astype(int).tolist()))
     return Recognized(
         f"points2D look scaled by {by}, as those of pictures {own} where the camera has {width} x {height}: "
-        f"their median reprojection error is {before:.3g} px, and {after:.2g} px at its scale",
+        f"their median reprojection error is {before:.3g} px, and {after:.1f} px at its scale",
         "bring both to one resolution",
     )
