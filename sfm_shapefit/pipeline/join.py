@@ -24,7 +24,7 @@ from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.merge import merge_models
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import read_model, renamed_as
 from sfm_shapefit.pipeline.adjust import bundle_adjust
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
@@ -112,7 +112,8 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
     pieces: list[ModelPiece] = []
     for number, source in enumerate(models):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
-        piece = ModelPiece(label=label, model=read_model(source))
+        names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
+        piece = ModelPiece(label=label, model=renamed_as(read_model(source), list(names)))
         for earlier in pieces:
             if {*piece.model.images.names} <= {*earlier.model.images.names}:
                 raise InputError(
