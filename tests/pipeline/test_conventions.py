@@ -119,8 +119,10 @@ def nowhere(model, count):
 @pytest.mark.parametrize("count", [3, 8])
 def test_positions_that_are_nan_are_unknown_and_no_obstacle(tmp_path, count):
     truth = pycolmap.Reconstruction(RING / "sparse" / "0")
-    nowhere(truth, count).write_binary(tmp_path)
-    for model in (nowhere(truth, count), tmp_path):
+    for name in ("binary", "text"):
+        (tmp_path / name).mkdir()
+        getattr(nowhere(truth, count), f"write_{name}")(tmp_path / name)
+    for model in (nowhere(truth, count), tmp_path / "binary", tmp_path / "text"):
         found = sfm_shapefit.locate(model, RING / "database.db")
         centers, right = centers_of(found.reconstruction), centers_of(truth)
         if count == 8:  # nothing tells scale and origin
