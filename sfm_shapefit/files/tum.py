@@ -27,12 +27,12 @@ from sfm_shapefit.files.norms import may_be_rotations, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
-_COLUMNS = tuple(range(1, 8))  # of tx ty tz qx qy qz qw where no header names them
+_COLUMNS = tuple(range(1, 8))  # columns of tx ty tz qx qy qz qw; a header may name others
 _KEYS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT = re.compile(r"\[.*?\]")
 _TURN = re.compile(r"(^|[^a-z])q|quat|orient|rot")  # in the name of a column of the quaternion
 _NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?$")
-_KITTI = 12  # numbers of a pose of KITTI's, which names no image
+_KITTI = 12  # numbers of a line of KITTI's poses; these name no image
 
 
 def read_tum(file: Path) -> ListedPoses:

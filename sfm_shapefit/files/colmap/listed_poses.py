@@ -39,12 +39,9 @@ from sfm_shapefit.scene.same_images import same_images
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum, ".csv": read_tum}
 _UNKNOWN = Lens("SIMPLE_PINHOLE", (1.0, 0.0, 0.0))  # without a size
-_FOLDER = re.compile(
-    r"(\./|\.\\)?images[/\\]"
-)  # in which transforms.json has the images of COLMAP's workspaces
-_MIDDLE_PX = (
-    0.75  # pixels; where programs count from the first pixel's center, the middle is half a pixel off
-)
+_FOLDER = re.compile(r"(\./|\.\\)?images[/\\]")
+"""Where transforms.json has the images of COLMAP's workspaces."""
+_MIDDLE_PX = 0.75  # pixels; the middle is half a pixel off where the first pixel's center is 0
 _UNITS = [Decimal(10) ** k for k in (0, 9, -9, 6, -6, 3, -3)]  # of time stamps, by those of names
 _DOUBLE = Decimal(2) ** -52  # relative error of a number in double precision, at most
 _FRACTION = -4  # exponent of the last digit from which a number is rounded there; numbers of fewer are exact
