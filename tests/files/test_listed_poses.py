@@ -8,7 +8,8 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.listed_poses import find_images, read_by_itself, read_list
+from sfm_shapefit.files.colmap.listed_poses import read_by_itself, read_list
+from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.pipeline.convert import convert
@@ -163,6 +164,7 @@ def test_a_time_stamp_is_the_image_of_the_same_number_however_both_are_written(t
 def test_two_entries_of_one_image_are_refused_and_whole_names_come_first(tmp_path):
     names = ("a/1.jpg", "b/2.jpg")
     np.testing.assert_array_equal(find_images(tmp_path, ["x/a/1.jpg", "2", "3"], names), [0, 1, -1])
+    np.testing.assert_array_equal(find_images(tmp_path, ["a/1.jpg", "right/1.jpg"], names), [0, -1])
     for listed, both in (
         (["1", "1.0"], "1 and 1.0"),
         (["left/1.jpg", "right/1.jpg"], "left/1.jpg and right/1.jpg"),
