@@ -45,7 +45,7 @@ _MODELS = {
 """By COLMAP's name of a camera model: nerfstudio's, the number of focal lengths, keys of the distortion."""
 _DENOMINATOR = ("k4", "k5", "k6")
 """Terms of FULL_OPENCV that nerfstudio does not have."""
-_NUM_NUMERATOR = 5  # coefficients of FULL_OPENCV that come before these
+_NUM_NUMERATOR = 5  # coefficients of FULL_OPENCV; the terms above come after these
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _OF_PINHOLES = ("fl_x", "fl_y", "cx", "cy")

@@ -863,3 +863,23 @@ def test_rows_are_looked_up_in_the_order_of_their_ids(tmp_path):
         written.commit()
     with contextlib.closing(sqlite_file.DatabaseFile(tmp_path / "database.db")) as file:
         assert file.look_up("squares", "square", rowids) == [(k * k,) for k in rowids]
+
+
+@pytest.mark.parametrize("kind", ["memory", "bin", "txt"])
+def test_quaternions_of_norm_1_01_are_normalized_with_one_warning_and_those_of_the_user_stay(
+    tmp_path, scene, kind
+):
+    model = pycolmap.Reconstruction(scene)
+    frame = model.frame(min(model.frames))
+    pose = frame.rig_from_world
+    unit = pose.rotation.quat.copy()
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(1.01 * unit), pose.translation)
+    if kind != "memory":
+        (model.write_binary if kind == "bin" else model.write_text)(tmp_path)
+    found = read_model(model if kind == "memory" else tmp_path)
+    (note,) = found.notes
+    assert note.startswith("1 rotation quaternion is normalized, the worst of norm 1.01")
+    own = found.reconstruction.frame(frame.frame_id).rig_from_world
+    assert own.rotation.norm() == pytest.approx(1.0, abs=1e-15)
+    np.testing.assert_allclose(own.rotation.quat, unit, atol=1e-15)
+    assert frame.rig_from_world.rotation.norm() == pytest.approx(1.01)

@@ -88,6 +88,12 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).images.lenses
     expected = (100.0, 110.0, 41.0, 48.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(lens.parameters, expected, rtol=1e-15)
+    fisheye = brown | {"projection_type": "fisheye_opencv", "k4": 0.4}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": fisheye}}])).images.lenses
+    np.testing.assert_allclose(lens.parameters, (*expected[:6], 0.3, 0.4), rtol=1e-15)
+    panorama = {"projection_type": "spherical", "width": 200, "height": 100}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": panorama}}])).images.lenses
+    assert (lens.model, lens.parameters) == ("EQUIRECTANGULAR", (200, 100))
 
 
 @pytest.mark.parametrize(
@@ -95,7 +101,7 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     [
         ('"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
         ('"focal": 1.0', '"focal": NaN', r"\[0\]/cameras/c/focal is not finite"),
-        ('"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
+        ('"perspective"', '"dual"', r"projection type 'dual'; perspective, brown"),
         ('"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
         ('"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
         ('"shots"', "shots", r"line 1, column \d+: no JSON"),
