@@ -5,18 +5,18 @@
 so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
-for instant-ngp and the original NeRF. Only poses and focal lengths are read: other programs shrink images,
-and have distortions of their own.
+for instant-ngp and the original NeRF.
 
 Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import FLIP_YZ
 from sfm_shapefit.files.json_node import JsonNode, read_json
@@ -42,15 +42,17 @@ _MODELS = {
 """By COLMAP's name of a camera model: nerfstudio's, the number of focal lengths, keys of the distortion."""
 _DENOMINATOR = ("k4", "k5", "k6")
 """Terms of FULL_OPENCV that nerfstudio does not have."""
+_NUM_NUMERATOR = 5  # coefficients of FULL_OPENCV that come before these
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _ORTHOGONAL = 0.01  # entries of M^T M / s^2 - I; a rotation written with three digits is nearer
 
 
 def read_nerf(file: Path) -> ListedPoses:
-    """Read the poses of a transforms.json.
+    """Read the poses and lenses of a transforms.json, in the world before its `applied_transform`.
 
     Raises:
-        InputError: if it is none, or a matrix is no pose; the message names the key.
+        InputError: if it is none, or a matrix is no pose, or a lens impossible; the message names the key.
     """
     content = JsonNode(file, "", read_json(file))
     if not content.has("frames"):
@@ -58,9 +60,27 @@ def read_nerf(file: Path) -> ListedPoses:
             f"{file} has no key 'frames'; give a transforms.json of NeRF's kind, or a COLMAP folder "
             "(`convert` makes one of OpenSfM's reconstruction.json)"
         )
-    names, rotations, centers, focals = [], [], [], []
-    for frame in content.get("frames").elements():
-        node = frame.get("transform_matrix")
+    frames = content.get("frames").elements()
+    turns, centers = _poses([frame.get("transform_matrix") for frame in frames])
+    if content.has("applied_scale"):
+        centers = centers / content.get("applied_scale").number()
+    if content.has("applied_transform"):
+        (turn,), (shift,) = _poses([content.get("applied_transform")])
+        turns, centers = turn.T @ turns, (centers - shift) @ turn
+    lenses = [_Intrinsics(frame, content) for frame in frames]
+    return ListedPoses(
+        names=tuple(frame.get("file_path").text() for frame in frames),
+        rotations=(turns @ FLIP_YZ).transpose(0, 2, 1),
+        centers=centers,
+        focal_shares=np.array([lens.focal_shares() for lens in lenses]).reshape(-1, 2),
+        lenses=tuple(lens.read() for lens in lenses),
+    )
+
+
+def _poses(nodes: list[JsonNode]) -> tuple[FloatArray, FloatArray]:
+    """Return the rotations (n, 3, 3) and last columns (n, 3) of matrices of 3 or 4 rows."""
+    turns, shifts = np.empty((len(nodes), 3, 3)), np.empty((len(nodes), 3))
+    for k, node in enumerate(nodes):
         rows = np.array([row.numbers(4) for row in node.elements()[:3]])
         turn = rows[:, :3] if len(rows) == 3 else np.zeros((3, 3))
         scale = np.cbrt(np.linalg.det(turn))  # one of the world, in some files
@@ -68,30 +88,81 @@ def read_nerf(file: Path) -> ListedPoses:
         if not (scale > 0.0 and off <= _ORTHOGONAL * scale**2):
             raise node.error("is no pose: its first three columns are no rotation")
         u, _, vt = np.linalg.svd(turn)
-        names.append(frame.get("file_path").text())
-        rotations.append((u @ vt @ FLIP_YZ).T)
-        centers.append(rows[:, 3])
-        focals.append(_focal_shares(frame, content))
-    return ListedPoses(tuple(names), *(np.array(x) for x in (rotations, centers, focals)))
+        turns[k], shifts[k] = u @ vt, rows[:, 3]
+    return turns, shifts
 
 
-def _focal_shares(frame: JsonNode, content: JsonNode) -> tuple[float, float]:
-    """Return focal lengths over width and height, of a frame or else of all; NaN where there is none."""
+class _Intrinsics(NamedTuple):
+    """Keys of a lens: those of a frame, or else of all."""
 
-    def value(key: str) -> float:
-        node = next((node for node in (frame, content) if node.has(key)), None)
-        return np.nan if node is None else node.get(key).number()
+    frame: JsonNode
+    content: JsonNode
 
-    width, height, x, y = (value(key) for key in ("w", "h", "fl_x", "fl_y"))
-    across = x / width if width > 0.0 else np.nan
-    angle = value("camera_angle_x")
-    if np.isnan(across) and _LEAST_ANGLE_RAD < angle < np.pi:
-        across = 0.5 / np.tan(0.5 * angle)
-    return (across, y / height if height > 0.0 else np.nan)
+    def node(self, key: str) -> JsonNode | None:
+        """Return the value of a key; None where there is none, or null."""
+        nodes = (node.get(key) for node in (self.frame, self.content) if node.has(key))
+        return next((node for node in nodes if node.value is not None), None)
+
+    def number(self, key: str, default: float = np.nan) -> float:
+        """Return a number."""
+        node = self.node(key)
+        return default if node is None else node.number()
+
+    def focal_shares(self) -> tuple[float, float]:
+        """Return focal lengths over width and height; NaN where there is none."""
+        found = []
+        for axis, side in zip("xy", "wh", strict=True):
+            share = self.number(f"fl_{axis}") / (self.number(side) or np.nan)
+            angle = self.number(f"camera_angle_{axis}")
+            if np.isnan(share) and _LEAST_ANGLE_RAD < angle < np.pi:
+                share = 0.5 / np.tan(0.5 * angle)
+            found.append(float(share))
+        return found[0], found[1]
+
+    def read(self) -> Lens | None:
+        """Return the lens; None where size or focal length is missing, or COLMAP has no such model."""
+        if not (self.number("w") >= 1.0 and self.number("h") >= 1.0):
+            return None
+        width, height = int(self.number("w")), int(self.number("h"))
+        kind = "OPENCV" if (node := self.node("camera_model")) is None else node.text()
+        if kind == "EQUIRECTANGULAR":
+            return Lens(kind, (width, height), width=width, height=height)
+        family = _MODELS.get(kind, ("", 0, ()))[0]
+        if (node := self.node("is_fisheye")) is not None and node.value is True:
+            kind = family = "OPENCV_FISHEYE"
+        given = np.array([self.number("fl_x"), self.number("fl_y")])
+        focals = np.where(given > 0.0, given, self.focal_shares() * np.array([width, height]))
+        fx, fy = np.where(focals > 0.0, focals, focals[::-1]).tolist()
+        if not (family and fx > 0.0):
+            return None
+        distortion = {key: self.number(key) for key in _DISTORTION if self.node(key) is not None}
+        name = _model_that_has(kind, family, distortion, are_equal=fx == fy)
+        if not name:
+            raise self.frame.error("has a distortion that no lens of COLMAP has; undistort the images first")
+        _, num_focals, keys = _MODELS[name]
+        center = self.number("cx", 0.5 * width), self.number("cy", 0.5 * height)
+        values = (*(fx, fy)[:num_focals], *center, *(distortion.get(key, 0.0) for key in keys))
+        return Lens(name, values, width=width, height=height)
 
 
-def nerf_text(images: Images) -> str:
-    """Return posed images as the text of a transforms.json.
+def _model_that_has(kind: str, family: str, distortion: dict[str, float], *, are_equal: bool) -> str:
+    """Return the model of COLMAP's that a lens is: `kind` if it may be, else the smallest; "" if none is.
+
+    A `kind` that is a family of nerfstudio's is none of the models. Coefficients of 0 count if they stand
+    there and the family has them, so that what was written here comes back as it was.
+    """
+    nonzero = {key for key, value in distortion.items() if value}
+    stated = nonzero | (distortion.keys() & {*_MODELS[family][2]})
+    for name, wanted in [(kind, nonzero)] * (kind != family) + [(name, stated) for name in _MODELS]:
+        own, num_focals, keys = _MODELS[name]
+        has = {*keys[:_NUM_NUMERATOR]}
+        if own == family and wanted <= has and (are_equal or num_focals == 2):
+            return name
+    return ""
+
+
+def nerf_text(images: Images, points_file: str = "") -> str:
+    """Return posed images as the text of a transforms.json, with the name of the file of their points.
 
     Raises:
         InputError: if a camera model has no equivalent there.
@@ -105,7 +176,11 @@ def nerf_text(images: Images) -> str:
     for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
         own = {} if shared else intrinsics[lens]
         frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
-    return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    points = {"ply_file_path": points_file} if points_file else {}
+    return (
+        json.dumps({**shared, **points, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False)
+        + "\n"
+    )
 
 
 def _intrinsics(lens: Lens) -> dict[str, Any]:

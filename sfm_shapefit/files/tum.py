@@ -13,37 +13,76 @@ Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IR
 
 import csv
 import io
-import math
+import re
+from decimal import Decimal
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import is_number, text_of
+from sfm_shapefit.files.norms import may_be_rotation, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
+_COLUMNS = tuple(range(1, 8))  # of tx ty tz qx qy qz qw where no header names them
+_KEYS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
+_UNIT = re.compile(r"\[.*?\]")
+_TURN = re.compile(r"(^|[^a-z])q|quat|orient|rot")  # in the name of a column of the quaternion
+_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?$")
+_KITTI = 12  # numbers of a pose of KITTI's, which names no image
+
 
 def read_tum(file: Path) -> ListedPoses:
-    """Read a trajectory; its images go by their timestamps.
+    """Read a trajectory; its images go by their timestamps, written without an exponent.
+
+    A header may name the columns in another order (EuRoC's tables have w x y z), and further ones.
 
     Raises:
         InputError: if a line is none of a trajectory.
     """
-    names, numbers = [], []
+    columns, names, numbers, norms = _COLUMNS, list[str](), list[FloatArray](), list[float]()
     for number, line in enumerate(text_of(file).splitlines(), start=1):
+        if not names and (header := _columns_of(line.strip().lstrip("#"))):
+            columns = header
+            continue
         words = line.partition("#")[0].replace(",", " ").split()
-        values = np.array([float(word) for word in words if is_number(word)])
         if not words:
             continue
-        if not (len(words) == len(values) == 8 and np.isfinite(values).all() and np.linalg.norm(values[4:])):
+        wanted = [words[k] for k in (0, *columns) if k < len(words) and is_number(words[k])]
+        values = np.array([float(word) for word in wanted[1:]])
+        is_pose = len(wanted) == 1 + len(columns) and len(words) != _KITTI
+        if not (
+            is_pose
+            and np.isfinite([float(wanted[0]), *values]).all()
+            and may_be_rotation(float(np.linalg.norm(values[3:])))
+        ):
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
-        names.append(words[0])
-        numbers.append(values[1:])
+        names.append(f"{Decimal(words[0]):f}")
+        numbers.append(values)
+        norms.append(float(np.linalg.norm(values[3:])))
     rows = np.array(numbers).reshape(-1, 7)
     turns = matrices_of(rows[:, 3:])
-    return ListedPoses(tuple(names), turns.swapaxes(1, 2), rows[:, :3], np.full((len(rows), 2), np.nan))
+    note = say_normalized(np.array(norms))
+    return ListedPoses(
+        names=tuple(names),
+        rotations=turns.swapaxes(1, 2),
+        centers=rows[:, :3],
+        focal_shares=np.full((len(rows), 2), np.nan),
+        lenses=(None,) * len(rows),
+        notes=(note,) if note else (),
+    )
+
+
+def _columns_of(header: str) -> tuple[int, ...]:
+    """Return the columns of tx ty tz qx qy qz qw that a header names; none if it lacks one."""
+    cells = header.split(",") if "," in header else header.split()
+    found: dict[str, int] = {}
+    for k, cell in enumerate(_UNIT.sub("", cell).strip().lower() for cell in cells):
+        found.setdefault(("q" if _TURN.search(cell) else "t") + cell[-1:], k)
+    return tuple(found[key] for key in _KEYS) if found.keys() >= set(_KEYS) else ()
 
 
 def tum_text(images: Images) -> str:
@@ -73,14 +112,19 @@ def poses_csv(images: Images) -> str:
 
 def _timestamps(names: tuple[str, ...]) -> list[str]:
     """Return the timestamp of each image, as text."""
-    stems = [PurePosixPath(name).stem for name in names]
-    if len(set(stems)) == len(stems) and all(map(_is_time, stems)):
-        return stems
+    if len({number_of(name) for name in names} - {None}) == len(names):
+        return [_NUMBER.findall(stem_of(name))[0] for name in names]
     position = {name: k for k, name in enumerate(sorted(names))}
     return [str(position[name]) for name in names]
 
 
-def _is_time(stem: str) -> bool:
-    """Return whether a name is a plain decimal number."""
-    digits = stem.replace(".", "", 1)
-    return digits.isascii() and digits.isdigit() and math.isfinite(float(stem))
+def number_of(name: str, *, alone: bool = False) -> Decimal | None:
+    """Return the number that the name of an image ends with, or is `alone`, without folders and suffix."""
+    found = (_NUMBER.fullmatch if alone else _NUMBER.search)(stem_of(name))
+    return None if found is None else Decimal(found[0])
+
+
+def stem_of(name: str) -> str:
+    """Return a name without folders and suffix; a number keeps what follows its point."""
+    last = PurePosixPath(name.replace("\\", "/"))
+    return last.name if last.suffix[1:].isdigit() else last.stem

@@ -8,7 +8,8 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.map_result import MapResult
 from sfm_shapefit.facts.options import MapOptions
 from sfm_shapefit.files.colmap.database import DatabaseMatches
-from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
+from sfm_shapefit.files.colmap.listed_poses import read_source
+from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.judgement.evidence import fit_pairs
 from sfm_shapefit.pairs.options import DirectionOptions
@@ -29,7 +30,7 @@ def check(
     """Judge a COLMAP model as it stands, whatever program made it; the model is not changed.
 
     Args:
-        model: a reconstruction, a result or a model folder, as for `locate`.
+        model: a reconstruction, a result, a model folder or a list of poses, as for `locate`.
         database: as for `locate`; without one, the pairs are those that share points of the model, which
             agree with it more easily.
         second_opinion: whether `map_database` places the images of the database anew, to compare with; or
@@ -41,7 +42,7 @@ def check(
     """
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
-        posed = read_model(model)
+        posed, _ = read_source(model, database)
         inputs = choose_inputs(model, database)
     other = None
     with open_source(posed, inputs) as source:

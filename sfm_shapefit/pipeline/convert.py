@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
     from sfm_shapefit.pipeline.world import World
 
+_POINTS = "_points.ply"  # behind the stem of a transforms.json
+
 
 class ExportFormat(NamedTuple):
     """A format in which models are written."""
@@ -61,10 +63,10 @@ def convert(
     """Write the posed images of a model in another format.
 
     Args:
-        source: a COLMAP folder, which may be an output, a reconstruction, a result, or OpenSfM's
-            reconstruction.json.
+        source: a COLMAP folder, which may be an output, a reconstruction, a result, OpenSfM's
+            reconstruction.json, or a list of poses: transforms.json, a trajectory.
         target: the file, or for COLMAP's formats the folder, to be made. Beside a .ply with the points stands
-            one with the cameras, *_cameras.ply.
+            one with the cameras, *_cameras.ply; beside a transforms.json one with the points, *_points.ply.
         target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
         crs: system of coordinates on Earth, "utm" or a code of `files.colmap.earth`; empty: the model's own.
@@ -100,10 +102,9 @@ def write_converted(
 ) -> Converted:
     """Write a model in another format, in a system and with an offset; `convert` raises the same."""
     # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.files.colmap.listed_poses import read_by_itself
     from sfm_shapefit.files.colmap.model import model_of, read_model
-    from sfm_shapefit.files.colmap.other_programs import reconstruction_of
     from sfm_shapefit.files.colmap.seed import transform_model
-    from sfm_shapefit.files.opensfm import read_opensfm
     from sfm_shapefit.pipeline.world import world_of
     from sfm_shapefit.pipeline.write import refuse_file
 
@@ -111,21 +112,24 @@ def write_converted(
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
     given, source = source, model_of(source)
-    if isinstance(source, Path | str) and Path(source).suffix.lower() == ".json":
-        source = reconstruction_of(read_opensfm(Path(source)))
     trust = _trust_of(source) if name in {"glb", "ply"} else {}
-    model = read_model(source)
+    model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
+    notes = model.notes
     centers = model.images.centers
     world = world_of(given, centers, *coordinates)
     told = world.statement
     if not (world.is_own or FORMATS[name].is_exact):
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
         told += world.bend_statement(centers)
+    told = "; ".join(filter(None, [told, *notes]))
     if name in {"colmap", "colmap-txt"}:
         _write_folder(model, path, name, world, [given] if isinstance(given, Path | str) else [])
         return Converted(name, (path,), told)
-    contents = _contents(name, _Scene(source, model, world, trust))
-    files = {path.with_name(f"{path.stem}{tail}{path.suffix}"): one for tail, one in contents.items()}
+    contents = _contents(name, _Scene(source, model, world, trust, path.stem))
+    files = {
+        path.with_name(path.stem + (tail if "." in tail else tail + path.suffix)): one
+        for tail, one in contents.items()
+    }
     if world.offset_line:
         files[path.with_name(f"{path.stem}_offset.xyz")] = world.offset_line
     for file in files:  # before the first is written
@@ -143,11 +147,15 @@ class _Scene(NamedTuple):
     world: "World"
     trust: Mapping[str, float]
     """By the names of images."""
+    stem: str
+    """Name of the target without its suffix."""
 
 
 def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
-    """Return the content of each file, by what its name has behind the target's."""
+    """Return the content of each file, by what its name has behind the target's stem: also another suffix."""
     images, world = scene.model.images, scene.world
+    if name == "nerf" and scene.model.reconstruction.num_points3D():
+        return _with_points(scene)
     if name == "ply":
         return _points_and_cameras(scene)
     if name == "glb":
@@ -177,6 +185,17 @@ def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
         "": ply_bytes(world.places(points.xyz), points.colors, **how),
         "_cameras": ply_bytes(world.places(vertices), colors, faces, **how),
     }
+
+
+def _with_points(scene: _Scene) -> dict[str, bytes]:
+    """Return a transforms.json and the points that it names."""
+    from sfm_shapefit.files.colmap.seed import pick_points
+    from sfm_shapefit.files.nerf import nerf_text
+    from sfm_shapefit.report.mesh import ply_bytes
+
+    points = pick_points(scene.model.reconstruction, scene.model.reconstruction.num_points3D())
+    text = nerf_text(scene.model.images, f"{scene.stem}{_POINTS}")
+    return {"": text.encode(errors="surrogateescape"), _POINTS: ply_bytes(points.xyz, points.colors)}
 
 
 def _covariances(scene: _Scene) -> str:

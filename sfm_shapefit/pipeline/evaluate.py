@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.model import ModelSource, read_model
+from sfm_shapefit.files.colmap.listed_poses import is_list, named_as, read_by_itself
+from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
@@ -31,7 +33,8 @@ def evaluate(
     """Return position and rotation errors of a model against a reference, after robust alignment.
 
     Args:
-        reconstruction, reference: results, reconstructions or model folders; cameras are matched by name.
+        reconstruction, reference: results, reconstructions, model folders, or files of other programs that
+            `convert` reads; cameras are matched by name.
         thresholds: position errors, in the reference's units, at which recall and its AUC are wanted too.
         trajectory: whether ATE and RPE are wanted, of the common images in the order of their names.
 
@@ -43,9 +46,14 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    read = read_model(reconstruction).images, read_model(reference).images
-    poses, truth = (NamedPoses(images.names, images.rotations, images.centers) for images in read)
-    return evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    read = read_by_itself(reconstruction), read_by_itself(reference)
+    poses, truth = (NamedPoses(m.images.names, m.images.rotations, m.images.centers) for m in read)
+    if isinstance(reconstruction, Path | str) and is_list(reconstruction):
+        poses = poses._replace(names=named_as(Path(reconstruction), poses.names, truth.names))
+    elif isinstance(reference, Path | str) and is_list(reference):
+        truth = truth._replace(names=named_as(Path(reference), truth.names, poses.names))
+    found = evaluate_poses(poses, truth, thresholds, trajectory=trajectory)
+    return replace(found, warnings=(*read[0].notes, *read[1].notes, *found.warnings))
 
 
 def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEvaluation:
@@ -60,7 +68,7 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     Raises:
         InputError: if either cannot be read, or they have fewer than three cameras in common.
     """
-    posed, (rows, geodetic) = read_model(Path(model)), read_position_table(Path(table))
+    posed, (rows, geodetic) = read_by_itself(Path(model)), read_position_table(Path(table))
     positions = np.array([position for position, _ in rows.values()]).reshape(-1, 3)
     datum, statement = None, "positions as they stand, as if both had the same axes and units"
     if geodetic:

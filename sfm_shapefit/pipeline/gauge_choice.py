@@ -69,7 +69,9 @@ class GaugeRule(NamedTuple):
         centers, fixed = images.centers[cameras], rigid.fixed[cameras]
         has_centers = not coincide(images.frames.centers)
         if not has_centers:
-            centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
+            centers = np.where(
+                np.isfinite(centers), 0.0, np.nan
+            )  # where sensors are in their rig says nothing of positions
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=images.has_rigs)
         if self.distances:

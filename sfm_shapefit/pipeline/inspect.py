@@ -12,6 +12,7 @@ from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
@@ -59,7 +60,7 @@ def inspect(
         )
     clock = Clock.of(progress, options.placement.solver)
     with clock("read"):
-        model, _ = read_source(source, database)
+        model, _ = read_source(source, database, rotations_suffice=True)
         inputs = choose_inputs(source, database, options.source.directions)
         inputs = read_left_out(inputs, model.images.names, options.directions.without)
     images = model.images
@@ -68,7 +69,7 @@ def inspect(
             wanted = Wanted(tracks=wants_points(matches, options.nodes))
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
-        with clock("diagnosis"):
+        with clock("diagnosis"), naming_convention(matches, clock.threads):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
             grouped = find_rigid_parts(images).apply(with_points)
             work = describe_work(grouped, count_work(matches, directions, options), options.placement)
@@ -81,10 +82,11 @@ def inspect(
                 diagnosis=diagnose(with_points, options.placement, confirmed),
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(images, grouped),
+                warnings=(*model.notes, *matches.matches.notes),
             )
 
 
 def _is_graph(source: Path, database: Path | str | None) -> bool:
-    """Return whether a source is a bare graph; a .txt is a trajectory if a database has its matches."""
-    may_be_graph = not is_list(source) or (source.suffix.lower() == ".txt" and database is None)
+    """Return whether a source is a bare graph; a table is a trajectory if a database has its matches."""
+    may_be_graph = not is_list(source) or (source.suffix.lower() in {".txt", ".csv"} and database is None)
     return source.is_file() and may_be_graph

@@ -99,7 +99,8 @@ def join(
     if options.adjust == "full":
         with clock("adjustment"):
             group = group._replace(reconstruction=bundle_adjust(group.reconstruction).reconstruction)
-    told = Told(joins, flat_values(options), inputs)
+    notes = [f"{piece.label}: {note}" for piece in pieces for note in piece.model.notes]
+    told = Told(joins, flat_values(options), inputs, notes=notes)
     with open_source(read_model(group.reconstruction), inputs) as source:
         return tell_group(group, told, source, options.directions, clock)
 

@@ -61,6 +61,8 @@ class Told(NamedTuple):
     distances: Sequence[KnownDistance] = ()
     located: Mapping[int, LocateResult] = MappingProxyType({})
     """The models by number, as far as they are ours, with what is known of their cameras."""
+    notes: Sequence[str] = ()
+    """What was read otherwise than it stands in the models."""
 
 
 class JoinedGroup(NamedTuple):
@@ -109,7 +111,7 @@ def tell_group(
         known_distances=told_distances(told.distances, model.images),
         datum=EarthDatum.of(gauge.datum),
         timings_s=clock.seconds,
-        warnings=[*seen.warnings, *filter(None, [gauge.warning])],
+        warnings=[*told.notes, *seen.warnings, *filter(None, [gauge.warning])],
     )
     return JoinedModel(
         reconstruction=group.reconstruction,

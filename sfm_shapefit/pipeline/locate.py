@@ -23,6 +23,7 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
 from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
@@ -84,7 +85,7 @@ def locate(
     clock = Clock.of(progress, options.placement.solver, executor)
     with ExitStack() as stack:
         with clock("read"):
-            model, listed = read_source(reconstruction, database)
+            model, listed = read_source(reconstruction, database, rotations_suffice=True)
             given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
             inputs = read_left_out(inputs, given.names, options.directions.without)
@@ -100,6 +101,7 @@ def locate(
                 refuse_admm(options.placement.solver)
             has_database = matches.file is not None
             template = template_of(model, matches.num_keypoints > 0 if has_database else None)
+            notes = model.notes
             del model  # whose points and keypoints are large
             source = see_matches(matches, images, inputs, options)
             source = replace(source, fixed=rigid.fixed if rigid.fixed.any() else None)
@@ -116,10 +118,11 @@ def locate(
         )
         place = partial(settle, options=options, clock=clock)
         sigma_rad = told.pull_rad
-        if sigma_rad is None or not _ROUGH_RAD <= sigma_rad < np.inf:
-            return act(place, told, source, options)
-        if rigid.fixed.any():
-            found = act(place, told, source, options)
-            return replace(found, warnings=(_NOT_CORRECTED, *found.warnings))
-        place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
-        return act(place, told, source, options)
+        if sigma_rad is not None and _ROUGH_RAD <= sigma_rad < np.inf:
+            if rigid.fixed.any():
+                notes = (*notes, _NOT_CORRECTED)
+            else:
+                place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
+        with naming_convention(source, clock.threads):
+            found = tell_convention(act(place, told, source, options), source, clock.threads)
+        return replace(found, warnings=(*notes, *source.matches.notes, *found.warnings))

@@ -81,7 +81,7 @@ def map_opened(
         raise UnsolvableError(_explain_failure(path, relative, reasons))
     with clock("join") if options.join == "safe" else nullcontext():
         joins, joined, told = join_mapped(models, run)
-    left_out = {
+    left_out = {**run.read.left_out} | {
         name: reasons[frame]
         for name, frame in zip(run.images.names, run.frame_of_image.tolist(), strict=True)
         if frame in reasons
@@ -92,12 +92,13 @@ def map_opened(
         models=tuple(models),
         joins=joins,
         joined=joined,
-        num_images=run.images.num_images,
+        num_images=run.images.num_images + len(run.read.left_out),
         num_pairs=len(relative.pairs),
         num_video_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=(
+            *file.notes,
             *map_warnings(run.read.rigs.incomplete, models, left_out),
             *told,
             *lost_distances(options.gauge.known_distance, models, joined),

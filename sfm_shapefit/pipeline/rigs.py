@@ -176,6 +176,8 @@ def read_fixed_images(model: ColmapModel, fix: str) -> BoolArray:
     if not fix:
         return np.zeros(model.images.num_images, dtype=np.bool_)
     fixed = _solved_images(model) if fix == FIX_SOLVED else _named_images(model, Path(fix))
+    if not model.images.is_posed[fixed].all():
+        raise InputError("the position of a fixed camera is not known (NaN); fix others, whose position is")
     if fixed.all():
         raise InputError(
             "every posed image of the model would be fixed, so that none is left to place; name fewer, "

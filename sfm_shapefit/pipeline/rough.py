@@ -76,7 +76,7 @@ def _tell_changes(found: LocateResult, rough: Images, given: Images) -> LocateRe
 
 def _moved(given: FloatArray, placed: FloatArray) -> FloatArray | None:
     """Return how far centers (n, 3) are from the given ones; None if these are no places."""
-    there = np.isfinite(placed).all(axis=1)
+    there = np.isfinite(placed).all(axis=1) & np.isfinite(given).all(axis=1)
     if coincide(given[there]):
         return None
     motion = fit_similarity_l1(given[there], placed[there])

@@ -71,15 +71,18 @@ class Gauge:
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
     """Return the gauge of the input's centers: a robust similarity (L1) that keeps the axes.
 
-    It maps `locations` (n, 3) onto `input_centers` (n, 3) of the same cameras in the same axes. Without
-    usable input centers it becomes "unit", and says so.
+    It maps `locations` (n, 3) onto `input_centers` (n, 3) of the same cameras in the same axes; those of
+    NaN are unknown. Without usable input centers it becomes "unit", and says so.
     """
+    known = np.isfinite(input_centers).all(axis=1)
     if coincide(input_centers):
-        return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
+        why = "coincide" if known.any() else "are not known"
+        return unit_gauge(locations, f"the input's centers {why}, so the scale is free; ")
+    every, locations, input_centers = locations, locations[known], input_centers[known]
     size = median_spread(input_centers)
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
     if similarity.scale <= 0.0:
-        return unit_gauge(locations, "the input's centers contradict the answer; ")
+        return unit_gauge(every, "the input's centers contradict the answer; ")
     off = float(np.median(np.linalg.norm(similarity.apply(locations) - input_centers, axis=1))) / size
     warning = ""
     if off > _ROUGH:
@@ -99,7 +102,7 @@ def metric_gauge(
     Args:
         locations: (n, 3) the solver's answer.
         unit: length of the output's unit in theirs.
-        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
+        input_centers: (n, 3) the input's centers of the same cameras, in the same axes; NaN if not known.
         fixed: (n,) the cameras that stay where the input has them.
         has_rigs: whether the scale is that of rigs; else it is that of the fixed cameras.
     """
@@ -108,7 +111,8 @@ def metric_gauge(
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
     elif not coincide(input_centers):
-        shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
+        known = np.isfinite(shifts).all(axis=1)
+        shift, origin = np.median(shifts[known], axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
     statement = f"fixed: scale and {origin}"
@@ -250,7 +254,10 @@ def tell_scale(gauge: Gauge, sigma: float | None) -> Gauge:
 
 
 def coincide(centers: FloatArray) -> bool:
-    """Return whether centers (n, 3) are one point to rounding."""
+    """Return whether the known centers, those of (n, 3) that are not NaN, are one point to rounding."""
+    centers = centers[np.isfinite(centers).all(axis=1)]
+    if not len(centers):
+        return True
     return bool(np.ptp(centers, axis=0).max() <= _COINCIDENT * max(1.0, float(np.abs(centers).max())))
 
 

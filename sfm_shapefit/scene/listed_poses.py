@@ -3,10 +3,11 @@
 from typing import NamedTuple
 
 from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.scene.lens import Lens
 
 
 class ListedPoses(NamedTuple):
-    """Poses of n images, and nothing else that is believed; cameras as in COLMAP."""
+    """Poses of n images, and what is told of their lenses; cameras as in COLMAP."""
 
     names: tuple[str, ...]
     """(n,) as their program writes them: with a folder of its own, without suffix, or a timestamp."""
@@ -16,3 +17,7 @@ class ListedPoses(NamedTuple):
     """(n, 3) camera centers in the world."""
     focal_shares: FloatArray
     """(n, 2) focal lengths over width and height of the image; NaN where unknown."""
+    lenses: tuple[Lens | None, ...]
+    """(n,) whole lenses; None where one is not known."""
+    notes: tuple[str, ...] = ()
+    """What is read otherwise than it stands in the file, a sentence each."""

@@ -139,6 +139,11 @@ class Matches(ABC):
     def __init__(self) -> None:
         self._views: WeakSet[View] = WeakSet()
 
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was read otherwise than it stands in the file, a sentence each."""
+        return ()
+
     def at(self, images: Images, left_out: PairNames = frozenset(), reading: Reading = PLENTY) -> "View":
         """Return the matches as other images see them, which is cheap.
 

@@ -263,7 +263,7 @@ BROKEN_RECORDS = {
     "unknown camera model": (_set("cameras", 0, 1, 99), "camera 1 has the unknown camera model 99"),
     "NaN parameter": (_set("cameras", 0, 4, [NAN, 1.0, 1.0, 1.0]), "camera 1 has a parameter that is not"),
     "camera twice": (_append("cameras", [1, 0, 9, 9, [1.0, 1.0, 1.0]]), "camera 1 stands twice"),
-    "NaN pose": (_set("images", 1, 1, (1.0, 0, 0, 0, NAN, 0, 0)), "image 2 has a pose that is not finite"),
+    "NaN pose": (_set("images", 1, 1, (1.0, NAN, 0, 0, 0, 0, 0)), "image 2 has a pose that is not finite"),
     "zero rotation": (_set("images", 1, 1, (0.0,) * 7), "image 2 has a rotation quaternion of norm 0 "),
     "long rotation": (_set("images", 1, 1, (2.0, *(0.0,) * 6)), "image 2 has a rotation .* of norm 2 "),
     "no camera": (_set("images", 1, 2, 5), "image 2 refers to camera 5"),
@@ -395,7 +395,7 @@ def rigid(qvec, tvec):
 @pytest.mark.parametrize(
     ("part", "name", "value", "message"),
     [
-        ("frame", "rig_from_world", rigid([0.0, 0, 0, 1], [0, NAN, 0]), "position of image 2 is not finite"),
+        ("frame", "rig_from_world", rigid([0.0, 0, 0, 1], [0, INF, 0]), "position of image 2 is not finite"),
         ("frame", "rig_from_world", rigid([NAN] * 4, [0.0, 0, 0]), "image 2 has no valid rotation"),
         ("point3D", "xyz", [NAN, 0.0, 0.0], "3D point 2 is not finite"),
         ("point2D", "xy", [NAN, 0.0], "image 2 has a point"),

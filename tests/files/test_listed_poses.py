@@ -69,7 +69,7 @@ def test_guessed_focal_lengths_are_those_of_the_list_at_the_databases_size_and_m
     (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
     assert read_list(tmp_path / "poses.json", database)[1] == frozenset()
     edit_database(database, "UPDATE cameras SET prior_focal_length = 0")
-    found, guessed = read_list(tmp_path / "poses.json", database)
+    found, guessed, _ = read_list(tmp_path / "poses.json", database)
     (camera,) = found.cameras.values()
     assert guessed == {camera.camera_id}
     assert camera.mean_focal_length() == pytest.approx(1.1 * camera.width)

@@ -23,8 +23,8 @@ import math
 import os
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,11 +36,18 @@ from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.colmap.camera_variants import (
+    OTHER_COUNTS,
+    CameraVariant,
+    num_params_of_model,
+    read_camera,
+)
 from sfm_shapefit.files.colmap.points import Observed
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
+from sfm_shapefit.files.norms import may_be_rotation
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
-"""A quaternion printed with 4 digits still passes; a wrong one does not."""
+"""A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
 
 NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
@@ -82,29 +89,18 @@ def check_model_files(folder: Path) -> Observed:
         )
     if suffix == ".bin":
         return _check_binary_model(folder, with_rigs=has_rigs)
-    _check_camera_lines(folder / "cameras.txt")
+    check_camera_lines(folder / "cameras.txt")
     _check_image_lines(folder / "images.txt")
     _check_point_lines(folder / "points3D.txt")
     return {}
 
 
-@cache
-def _num_params_of_model() -> dict[int, tuple[str, int]]:
-    """Return the name and the number of parameters of each camera model id that pycolmap knows."""
-    table = {}
-    for name, model in pycolmap.CameraModelId.__members__.items():
-        if model != pycolmap.CameraModelId.INVALID:
-            camera = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1)
-            table[int(model)] = (name, len(camera.params))
-    return table
-
-
 def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float]) -> None:
-    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names."""
-    if not all(map(math.isfinite, pose)):
+    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names; NaN is an unknown position."""
+    if not all(map(math.isfinite, pose[:4])) or any(map(math.isinf, pose[4:])):
         raise source.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if abs(norm - 1.0) > UNIT_QUATERNION_TOLERANCE:
+    if not may_be_rotation(norm):
         raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 
@@ -180,7 +176,7 @@ class _Images(NamedTuple):
 
 def _check_binary_model(folder: Path, *, with_rigs: bool) -> Observed:
     """Walk the binary files in the order in which they refer to each other."""
-    camera_ids = _check_cameras(_BinaryFile(folder / "cameras.bin"))
+    camera_ids = set(check_cameras(folder / "cameras.bin"))
     image_file = _BinaryFile(folder / "images.bin")
     images = _check_images(image_file, camera_ids)
     point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
@@ -201,22 +197,44 @@ def _check_binary_model(folder: Path, *, with_rigs: bool) -> Observed:
     return images.observed
 
 
-def _check_cameras(file: _BinaryFile) -> set[int]:
-    """Walk cameras.bin and return the camera ids."""
-    num_params = _num_params_of_model()
-    ids: set[int] = set()
+class FoundCamera(NamedTuple):
+    """A camera as its file has it, and as COLMAP has it."""
+
+    size: tuple[int, int]
+    read: CameraVariant
+
+
+def check_cameras(path: Path) -> dict[int, FoundCamera]:
+    """Walk cameras.bin and return its cameras by their ids; lists of other lengths are tried at last."""
+    try:
+        return _walk_cameras(_BinaryFile(path), {})
+    except InputError:
+        for model_id, count in OTHER_COUNTS:
+            with suppress(InputError):
+                return _walk_cameras(_BinaryFile(path), {model_id: count})
+        raise
+
+
+def _walk_cameras(file: _BinaryFile, counts: dict[int, int]) -> dict[int, FoundCamera]:
+    """Walk cameras.bin, where models may have other `counts` of parameters."""
+    num_params = num_params_of_model()
+    found: dict[int, FoundCamera] = {}
     for _ in range(file.take_count(_CAMERA.size, "cameras")):
-        camera_id, model_id, _, _ = map(int, file.take(_CAMERA, "a camera"))
+        camera_id, model_id, *size = map(int, file.take(_CAMERA, "a camera"))
         if model_id not in num_params:
             raise file.fault(f"camera {camera_id} has the unknown camera model {model_id}")
-        if camera_id in ids:
+        if camera_id in found:
             raise file.fault(f"camera {camera_id} stands twice")
-        ids.add(camera_id)
-        params = file.take(struct.Struct(f"<{num_params[model_id][1]}d"), f"camera {camera_id}")
+        count = counts.get(model_id, num_params[model_id][1])
+        params = file.take(struct.Struct(f"<{count}d"), f"camera {camera_id}")
         if not all(map(math.isfinite, params)):
             raise file.fault(f"camera {camera_id} has a parameter that is not finite")
+        read = read_camera(model_id, (size[0], size[1]), params)
+        if read is None:
+            raise file.fault(f"camera {camera_id} has no parameters of its model")
+        found[camera_id] = FoundCamera((size[0], size[1]), read)
     file.finish()
-    return ids
+    return found
 
 
 def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
@@ -397,13 +415,13 @@ class _Line:
         """Return the error that names this line."""
         return InputError(f"{self.path}:{self.number}: {reason}")
 
-    def finite(self, tokens: Sequence[str], what: str) -> list[float]:
-        """Return the tokens as numbers."""
+    def finite(self, tokens: Sequence[str], what: str, *, or_unknown: bool = False) -> list[float]:
+        """Return the tokens as numbers, which may be NaN if `or_unknown`."""
         try:
             values = list(map(float, tokens))
         except ValueError:
             raise self.fault(f"{what} holds something that is not a number") from None
-        if not all(map(math.isfinite, values)):
+        if not all(math.isfinite(value) or (or_unknown and math.isnan(value)) for value in values):
             raise self.fault(f"{what} holds a number that is not finite")
         return values
 
@@ -425,18 +443,22 @@ def _lines(path: Path, *, records_only: bool = True) -> Iterator[_Line]:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
 
-def _check_camera_lines(path: Path) -> None:
-    """Each line: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
-    num_params = dict(_num_params_of_model().values())
+def check_camera_lines(path: Path) -> dict[int, FoundCamera]:
+    """Return the cameras of lines CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[], by their ids."""
+    num_params, found = dict(num_params_of_model().values()), dict[int, FoundCamera]()
     for line in _lines(path):
-        tokens = line.text.split()
-        if len(tokens) < 4 or tokens[1] not in num_params:
+        camera_id, model, *words = *line.text.split(), "", ""
+        words = words[:-2]
+        if len(words) < 2 or not camera_id.isdigit():
             raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
-        if len(tokens) - 4 != num_params[tokens[1]]:
-            raise line.fault(
-                f"{tokens[1]} has {num_params[tokens[1]]} parameters, but {len(tokens) - 4} are given"
-            )
-        line.finite(tokens[2:], "the camera")
+        width, height, *params = line.finite(words, "the camera")
+        read = read_camera(model, (width, height), params)
+        if read is None and model not in num_params:
+            raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
+        if read is None:
+            raise line.fault(f"{model} has {num_params[model]} parameters, but {len(params)} are given")
+        found[int(camera_id)] = FoundCamera((int(width), int(height)), read)
+    return found
 
 
 def _check_image_lines(path: Path) -> None:
@@ -452,7 +474,8 @@ def _check_image_lines(path: Path) -> None:
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME "
                 "(a name with spaces needs the .bin format)"
             )
-        _refuse_pose(line, f"image {tokens[0]}", line.finite(tokens[1:8], "the pose"))
+        pose = line.finite(tokens[1:5], "the pose"), line.finite(tokens[5:8], "the pose", or_unknown=True)
+        _refuse_pose(line, f"image {tokens[0]}", [*pose[0], *pose[1]])
         if tokens[9] in names:
             raise line.fault(f"the name {tokens[9]} stands in line {names[tokens[9]]} already")
         names[tokens[9]] = line.number

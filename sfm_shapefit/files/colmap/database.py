@@ -85,6 +85,11 @@ class DatabaseMatches(Matches):
         is_kept = float(self.num_matches.sum(dtype=np.float64)) <= MOST_MATCHES
         self._sorted = SortedMatches(self.num_matches) if is_kept else None
 
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was read otherwise than it stands in the file, a sentence each."""
+        return self.file.notes
+
     def close(self) -> None:
         """Close the database."""
         self.file.close()

@@ -2,25 +2,24 @@
 
 Every frame stands at the origin, its axes those of the world. Intrinsics are those of the database:
 calibrated, or COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
+Images of cameras that cannot be are left out, see `database_cameras`.
 """
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
 from sfm_shapefit.files.colmap.images import images_of, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.files.colmap.template import FrameHead, Template
 from sfm_shapefit.scene.images import Frames, Images
-
-_LARGEST_SIDE = 2**31  # pixels; no image has such a side, so that the row is damaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +32,8 @@ class UnposedImages:
     """All cameras and images; each image in a frame of its own."""
     rigs: DatabaseRigs
     """Which of the images were taken together."""
+    left_out: Mapping[str, str]
+    """Why images of the database are not among these, by their names."""
 
     def template(self, images: Images) -> Template:
         """Return the template of a model of some images, all frames at the origin."""
@@ -61,28 +62,26 @@ class UnposedImages:
 def read_images(file: DatabaseFile) -> UnposedImages:
     """Read cameras and images of a database.
 
+    What was read otherwise than it stands there is noted in `file`.
+
     Raises:
-        InputError: if it is no COLMAP database, has fewer than two images, or a camera or image is damaged.
+        InputError: if it is no COLMAP database, an image is damaged, or fewer than two can be used.
     """
-    camera_columns = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
-    image_columns = ("image_id", "name", "camera_id")
-    cameras, images = (
-        file.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
-        for table, columns in (("cameras", camera_columns), ("images", image_columns))
-    )
-    path = file.path
+    columns = ("image_id", "name", "camera_id")
+    cameras, path = read_cameras(file), file.path
+    images = file.rows("images", {columns: f"SELECT {', '.join(columns)} FROM images ORDER BY 1"})
     if len(images) < 2:
         raise InputError(
             f"{path} has {len(images)} images, but two or more are needed; extract features first"
         )
-    model = pycolmap.Reconstruction()
-    for row in cameras:
-        camera = _camera(path, row)
-        if model.exists_camera(camera.camera_id):
-            raise InputError(f"{path}: camera {camera.camera_id} stands twice; remove one of them")
+    model, lost = pycolmap.Reconstruction(), dict[int, list[str]]()
+    for camera in cameras.usable.values():
         model.add_camera_with_trivial_rig(camera)
     for image_id, name, camera_id in images:
         is_sound = is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
+        if is_sound and is_between(camera_id, 0, NO_ID) and camera_id in cameras.impossible:
+            lost.setdefault(camera_id, []).append(name)
+            continue
         if not (is_sound and is_between(camera_id, 0, NO_ID) and model.exists_camera(camera_id)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
@@ -93,8 +92,19 @@ def read_images(file: DatabaseFile) -> UnposedImages:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    rigs = read_rigs(file, model)
-    return UnposedImages(images=_put_in_rigs(images_of(model), rigs), reconstruction=model, rigs=rigs)
+    notes = list(cameras.notes(lost))
+    if model.num_images() < 2:
+        raise InputError(f"{path}: fewer than two images are left; {'; '.join(notes)}")
+    file.notes += [note for note in notes if note not in file.notes]
+    rigs = read_rigs(file, model, cameras.impossible)
+    return UnposedImages(
+        images=_put_in_rigs(images_of(model), rigs),
+        reconstruction=model,
+        rigs=rigs,
+        left_out={
+            name: f"its camera {i} {cameras.impossible[i]}" for i, names in lost.items() for name in names
+        },
+    )
 
 
 def _put_in_rigs(alone: Images, rigs: DatabaseRigs) -> Images:
@@ -118,27 +128,3 @@ def _free_ids(wanted: set[int], taken: Collection[int]) -> dict[int, int]:
     """Return an id for each of the wanted ones: itself unless it is taken."""
     free = (i for i in itertools.count(1) if i not in taken and i not in wanted)
     return {i: next(free) if i in taken else i for i in sorted(wanted)}
-
-
-def _camera(path: Path, row: tuple[object, ...]) -> pycolmap.Camera:
-    """Return the camera of a row of the table cameras."""
-    camera_id, model_id, width, height, params, prior = row
-    sizes = is_between(width, 0, _LARGEST_SIDE) and is_between(height, 0, _LARGEST_SIDE)
-    sound = is_between(camera_id, 0, NO_ID) and isinstance(model_id, int) and sizes
-    if not (sound and isinstance(params, bytes) and len(params) % 8 == 0):
-        raise InputError(f"{path}: the camera with id {camera_id!r} is damaged; extract features again")
-    values = np.frombuffer(params, dtype="<f8")
-    known = {int(model) for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
-    if model_id not in known:
-        raise InputError(f"{path}: camera {camera_id} has the model {model_id}, which pycolmap does not know")
-    camera = pycolmap.Camera(
-        camera_id=camera_id,
-        model=pycolmap.CameraModelId(model_id),
-        width=width,
-        height=height,
-        params=values.tolist(),
-        has_prior_focal_length=bool(prior),
-    )
-    if not (camera.verify_params() and np.isfinite(values).all()):
-        raise InputError(f"{path}: the parameters of camera {camera_id} are damaged; extract features again")
-    return camera

@@ -7,7 +7,7 @@ Source: https://colmap.github.io/database.html, tables rigs, rig_sensors, frames
 and later); `sensor_from_rig` is a quaternion w x y z and a translation, eight bytes each.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,12 +56,15 @@ class DatabaseRigs:
         return copy
 
 
-def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRigs:
+def read_rigs(
+    file: DatabaseFile, images: pycolmap.Reconstruction, lost: Collection[int] = ()
+) -> DatabaseRigs:
     """Read the rigs of a database.
 
     Args:
         file: the database.
         images: its cameras and images.
+        lost: ids of cameras that are not among these; sensors of theirs are none.
 
     Raises:
         InputError: if the database cannot be read, or a rig or a frame is damaged.
@@ -72,7 +75,9 @@ def read_rigs(file: DatabaseFile, images: pycolmap.Reconstruction) -> DatabaseRi
     rig_of_frame = dict(_rows(file, "frames", ("frame_id", "rig_id")))
     data = _rows(file, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
     rigs: dict[int, pycolmap.Rig] = {}
-    incomplete = {rig_id for rig_id, _, pose in sensors if pose is None}
+    incomplete = {rig_id for rig_id, *_ in sensors if references.get(rig_id) in lost}
+    sensors = [row for row in sensors if row[0] not in incomplete and row[1] not in lost]
+    incomplete |= {rig_id for rig_id, _, pose in sensors if pose is None}
     for rig_id, camera_id, pose in sensors:
         _refuse_unknown_camera(path, images, rig_id, references.get(rig_id), camera_id)
         if rig_id in incomplete:

@@ -45,7 +45,7 @@ def put_images(reconstruction: pycolmap.Reconstruction, images: Images) -> None:
     for k, frame_id in enumerate(own):
         rotation, center = images.frames.rotations[k], images.frames.centers[k]
         if not posed[k]:
-            if np.isfinite(centers[k]).all():
+            if np.isfinite(rotations[k]).all():  # its position may be NaN
                 reconstruction.deregister_frame(frame_id)
             continue
         turns = bool((rotation != rotations[k]).any())

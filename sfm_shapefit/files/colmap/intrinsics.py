@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
 from sfm_shapefit.files.colmap.lenses import camera_of
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
@@ -65,21 +66,18 @@ def find_uncalibrated(
     Raises:
         InputError: if the database cannot be read.
     """
-    columns = ("camera_id", "width", "height", "params", "prior_focal_length")
-    query = f"SELECT images.name, {', '.join(columns)} FROM images JOIN cameras USING (camera_id)"
-    rows = {name: row for name, *row in database.rows("cameras", {columns: query})}
+    columns = ("name", "camera_id")
+    rows = database.rows("images", {columns: "SELECT name, camera_id FROM images"})
+    camera_ids, cameras = dict(rows), read_cameras(database).usable
     found: dict[int, Uncalibrated] = {}
     for number, name in zip(images.lens_of.tolist(), images.names, strict=True):
-        lens = images.lenses[number]
-        if number not in found and name in rows:
-            database_id, width, height, params, prior = rows[name]
-            is_same = np.array(lens.parameters, dtype="<f8").tobytes() == params
-            if is_same or lens.id in listed:
-                camera = camera_of(lens)
-                focal = camera.focal_length_idxs()[0]
-                ratio = float(np.frombuffer(params, "<f8")[focal] / lens.parameters[focal])
-                origin = _origin(camera, width, height, prior)
-                found[number] = Uncalibrated(origin, database_id, ratio)
+        lens, camera = images.lenses[number], cameras.get(camera_ids.get(name, -1))
+        if number in found or camera is None or camera.model_name != lens.model:
+            continue
+        focal = camera.focal_length_idxs()[:1]  # none of a panorama
+        if focal and (lens.parameters == tuple(camera.params.tolist()) or lens.id in listed):
+            ratio = float(camera.params[focal[0]] / lens.parameters[focal[0]])
+            found[number] = Uncalibrated(_origin(camera), camera.camera_id, ratio)
     origins = [one.origin for one in found.values()]
     known = {Origin.CALIBRATION}
     if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
@@ -88,13 +86,13 @@ def find_uncalibrated(
     return {number: one for number, one in found.items() if one.origin not in known}
 
 
-def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Origin:
-    """Return where the intrinsics of a row of the table cameras come from, by that row alone."""
-    if not prior:
+def _origin(camera: pycolmap.Camera) -> Origin:
+    """Return where the intrinsics of a camera of a database come from, by itself alone."""
+    if not camera.has_prior_focal_length:
         return Origin.GUESS
     principal = camera.params[camera.principal_point_idxs()]
     extra = camera.params[camera.extra_params_idxs()]
-    is_centered = bool((principal == [0.5 * width, 0.5 * height]).all())
+    is_centered = bool((principal == [0.5 * camera.width, 0.5 * camera.height]).all())
     return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
 
 
@@ -147,21 +145,33 @@ Rows = list[tuple[Any, ...]]
 
 
 def _read_tables(database: DatabaseFile, left_out: PairNames) -> dict[str, Rows]:
-    """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches."""
+    """Return the rows that the view graph is made of: cameras, images, and the pairs of most matches.
+
+    Images of cameras that cannot be, and their pairs, are none of these.
+    """
     most = _MOST_PAIRS + len(left_out)
     which = f"WHERE F IS NOT NULL AND length(F) = 72 ORDER BY rows DESC, pair_id LIMIT {most}"
     found = {
         table: database.rows(table, {columns: f"SELECT {', '.join(columns)} FROM {table} {chosen}"})
         for table, columns, chosen in (
-            ("cameras", ("camera_id", "model", "width", "height", "params", "prior_focal_length"), ""),
             ("images", ("image_id", "name", "camera_id"), ""),
             ("two_view_geometries", ("pair_id", "rows", "config", "F"), which),
         )
     }
-    ids = {name: image_id for image_id, name, _ in found["images"]}
+    cameras = read_cameras(database).usable
+    images = [row for row in found["images"] if row[2] in cameras]
+    ids = {name: image_id for image_id, name, _ in images}
     unwanted = {MAX_NUM_IMAGES * min(ends) + max(ends) for ends in indices_of_pairs(ids, left_out).tolist()}
-    kept = [row for row in found["two_view_geometries"] if row[0] not in unwanted]
-    return found | {"two_view_geometries": kept[:_MOST_PAIRS]}
+    known = {*ids.values()}
+    kept = [
+        row
+        for row in found["two_view_geometries"]
+        if row[0] not in unwanted and known.issuperset(divmod(row[0], MAX_NUM_IMAGES))
+    ]
+    rows: Rows = [
+        (i, int(c.model), c.width, c.height, c.params.astype("<f8").tobytes(), 0) for i, c in cameras.items()
+    ]
+    return {"cameras": rows, "images": images, "two_view_geometries": kept[:_MOST_PAIRS]}
 
 
 def _with_enough_pairs(tables: Mapping[str, Rows], asked: set[int]) -> set[int]:

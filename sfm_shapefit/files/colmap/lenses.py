@@ -17,6 +17,12 @@ def camera_of(lens: Lens) -> pycolmap.Camera:
     return pycolmap.Camera(model=lens.model, params=lens.parameters, camera_id=lens.id, **sizes)
 
 
+def focal_lengths(lens: Lens) -> list[float]:
+    """Return the one or two focal lengths of a lens, in pixels; of a panorama its pixels per radian."""
+    found = [lens.parameters[k] for k in camera_of(lens).focal_length_idxs()]
+    return found or [lens.focal_px]
+
+
 def lens_of(camera: pycolmap.Camera) -> Lens:
     """Return the lens of a camera."""
     return Lens(

@@ -4,9 +4,15 @@ The images are found by their names. Rigs and lenses are those of the database; 
 focal length is that of the list, the median of its images, which is a guess too.
 """
 
+import itertools
+import re
+from bisect import bisect_left
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -14,26 +20,46 @@ import pycolmap
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import mean_rotation_l1
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.intrinsics import find_uncalibrated
+from sfm_shapefit.files.colmap.lenses import camera_of, lens_of
 from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
+from sfm_shapefit.files.colmap.other_programs import reconstruction_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.files.json_node import read_json
 from sfm_shapefit.files.nerf import read_nerf
-from sfm_shapefit.files.tum import read_tum
-from sfm_shapefit.scene.images import Images
+from sfm_shapefit.files.opensfm import OpenSfmModel, read_opensfm
+from sfm_shapefit.files.tum import number_of, read_tum, stem_of
+from sfm_shapefit.scene.images import Frames, Images, Sensors
+from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.listed_poses import ListedPoses
+from sfm_shapefit.scene.same_images import same_images
 
-_READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum}
+_READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum, ".csv": read_tum}
+_UNKNOWN = Lens("SIMPLE_PINHOLE", (1.0, 0.0, 0.0))  # without a size
+_FOLDER = re.compile(
+    r"(\./|\.\\)?images[/\\]"
+)  # in which transforms.json has the images of COLMAP's workspaces
+_MIDDLE_PX = (
+    0.75  # pixels; where programs count from the first pixel's center, the middle is half a pixel off
+)
+_UNITS = [Decimal(10) ** k for k in (0, 9, -9, 6, -6, 3, -3)]  # of time stamps, by those of names
+_DOUBLE = Decimal(2) ** -52  # relative error of a number in double precision, at most
+_FRACTION = -4  # exponent of the last digit from which a number is rounded there; numbers of fewer are exact
+_SAME_SHAPE = 0.01  # largest relative difference of the aspect ratios of pictures that differ in size alone
 
 
 def is_list(source: object) -> bool:
-    """Return whether a source of a model is the file of a list."""
+    """Return whether a source of a model is a file of another program's, not a folder."""
     is_named_so = isinstance(source, Path | str) and Path(source).suffix.lower() in _READERS
     return is_named_so and not Path(str(source)).is_dir()
 
 
-def read_source(source: ModelSource, database: Path | str | None) -> tuple[ColmapModel, frozenset[int]]:
+def read_source(
+    source: ModelSource, database: Path | str | None, *, rotations_suffice: bool = False
+) -> tuple[ColmapModel, frozenset[int]]:
     """Return the model that a source is, or that a list of poses makes of the images of a database.
 
     With it come the ids of the cameras whose focal lengths are those of the list.
@@ -41,19 +67,56 @@ def read_source(source: ModelSource, database: Path | str | None) -> tuple[Colma
     Raises:
         InputError: as `read_model` and `read_list`.
     """
-    if isinstance(source, Path | str) and is_list(source):
-        model, guessed = read_list(Path(source), database)
-        return read_model(model), guessed
-    return read_model(source), frozenset()
+    if not (isinstance(source, Path | str) and is_list(source)):
+        return read_model(source, rotations_suffice=rotations_suffice), frozenset()
+    model, guessed, notes = read_list(Path(source), database)
+    read = read_model(model)
+    return replace(read, notes=(*notes, *read.notes)), guessed
 
 
-def read_list(file: Path, database: Path | str | None) -> tuple[pycolmap.Reconstruction, frozenset[int]]:
-    """Return the images of a database with the poses of a list, and ids of cameras as `read_source`.
-
-    Images that the list lacks have no pose.
+def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapModel:
+    """Return the model that a source is: COLMAP's, OpenSfM's, or a list of poses, without points.
 
     Raises:
-        InputError: if a file cannot be used, or hardly an image is in both.
+        InputError: as `read_model` and the readers of the formats; and if a list lacks whole lenses, which
+            are wanted. Else an image without one has a lens of width 0.
+    """
+    if not (isinstance(source, Path | str) and is_list(source)):
+        return read_model(source)
+    file = Path(source)
+    if file.suffix.lower() == ".json" and isinstance(read_json(file), list):
+        return read_model(reconstruction_of(read_opensfm(file)))
+    poses = _READERS[file.suffix.lower()](file)
+    lenses = [lens or _UNKNOWN for lens in poses.lenses]
+    if with_lenses and _UNKNOWN in lenses:
+        name = poses.names[lenses.index(_UNKNOWN)]
+        raise InputError(
+            f"{file} has no whole lens of {name} (w, h, fl_x and a camera_model that is read); add it"
+        )
+    known = list(dict.fromkeys(lenses))
+    ids = np.arange(1, len(lenses) + 1)
+    images = Images(
+        names=tuple(_FOLDER.sub("", name, count=1) for name in poses.names),
+        ids=ids,
+        frame_of=ids - 1,
+        lens_of=np.array([known.index(lens) for lens in lenses], dtype=np.int64),
+        frames=Frames(ids=ids, rotations=poses.rotations, centers=poses.centers),
+        lenses=tuple(replace(lens, id=k) for k, lens in enumerate(known, start=1)),
+        sensors=Sensors.references(len(known)),
+    )
+    read = read_model(reconstruction_of(OpenSfmModel.without_points(images)))
+    return replace(read, notes=(*poses.notes, *read.notes))
+
+
+def read_list(
+    file: Path, database: Path | str | None
+) -> tuple[pycolmap.Reconstruction, frozenset[int], tuple[str, ...]]:
+    """Return the images of a database with the poses of a list, ids of cameras as `read_source`, and notes.
+
+    Images that the list lacks come only where another of their frame is in it.
+
+    Raises:
+        InputError: if a file cannot be used, hardly an image is in both, or two poses are of one image.
     """
     if not file.is_file():
         raise InputError(f"{file} does not exist; give a COLMAP folder, transforms.json or a trajectory")
@@ -62,23 +125,28 @@ def read_list(file: Path, database: Path | str | None) -> tuple[pycolmap.Reconst
         raise InputError(f"{file} has poses but no matches; give the database that has them (database=FILE)")
     with closing(DatabaseFile(database)) as opened:
         read = read_images(opened)
-        images = read.images
-        uncalibrated = find_uncalibrated(opened, images)
-    rows = _find(poses.names, images.names)
+        uncalibrated = find_uncalibrated(opened, read.images)
+    rows = find_images(file, poses.names, read.images.names)
     if np.sum(rows >= 0) < 2:
         raise InputError(
             f"{file} and {database} have fewer than two images in common: "
-            f"{poses.names[0] if poses.names else 'none'} in the one, {images.names[0]} in the other"
+            f"{poses.names[0] if poses.names else 'none'} in the one, {read.images.names[0]} in the other"
         )
+    there = np.isin(read.images.frame_of, read.images.frame_of[rows[rows >= 0]])
+    images, place = read.images.part(np.flatnonzero(there)), np.append(np.cumsum(there) - 1, -1)
     model = read.template(images).build()
-    put_images(model, _pose(images, rows, poses))
-    lens_of = np.where(rows >= 0, images.lens_of[rows], -1)
+    put_images(model, _pose(images, place[rows], poses))
+    lenses = np.where(rows >= 0, read.images.lens_of[rows], -1)
     guessed = {
-        images.lenses[k].id
+        read.images.lenses[k].id
         for k in uncalibrated
-        if _set_focal_length(model.camera(images.lenses[k].id), poses.focal_shares[lens_of == k])
+        if _set_lens(model.camera(read.images.lenses[k].id), poses, np.flatnonzero(lenses == k))
     }
-    return model, frozenset(guessed)
+    lost = [name for name, row in zip(poses.names, rows.tolist(), strict=True) if row < 0]
+    said = (
+        [f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"] if lost else []
+    )
+    return model, frozenset(guessed), (*poses.notes, *said)
 
 
 def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
@@ -103,6 +171,42 @@ def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
     return images.posed(rotations, centers)
 
 
+def _set_lens(camera: pycolmap.Camera, poses: ListedPoses, rows: IntArray) -> bool:
+    """Give a camera the lens that some poses of a list have, and return whether that is a guess still.
+
+    A list that has distortion, or a principal point outside of the middle, was calibrated: its lens is taken
+    as a whole. Of any other it is the focal length. Where several differ, it is the median.
+    """
+    lenses = [scaled for k in rows.tolist() if (scaled := _scaled(poses.lenses[k], camera)) is not None]
+    same = [lens.parameters for lens in lenses if lens.model == lenses[0].model]
+    if len(lenses) == len(rows) and any(map(_is_calibrated, lenses)):
+        camera.model = pycolmap.CameraModelId.__members__[lenses[0].model]
+        camera.params = np.median(same, axis=0).tolist()
+        return False
+    return _set_focal_length(camera, poses.focal_shares[rows])
+
+
+def _scaled(lens: Lens | None, camera: pycolmap.Camera) -> Lens | None:
+    """Return a lens at the size of a camera's pictures; None if these are not the same but for their size."""
+    if lens is None or (lens.width, lens.height) == (camera.width, camera.height):
+        return lens
+    scales = camera.width / lens.width, camera.height / lens.height
+    if abs(scales[0] / scales[1] - 1.0) > _SAME_SHAPE:
+        return None
+    scaled = camera_of(lens)
+    scaled.rescale(camera.width, camera.height)
+    return lens_of(scaled)
+
+
+def _is_calibrated(lens: Lens) -> bool:
+    """Return whether a lens is more than a focal length."""
+    if "FISHEYE" in lens.model or lens.model == "EQUIRECTANGULAR":
+        return True
+    camera = camera_of(lens)
+    off_px = np.abs(camera.params[camera.principal_point_idxs()] - [0.5 * lens.width, 0.5 * lens.height])
+    return bool(camera.params[camera.extra_params_idxs()].any() or off_px.max() > _MIDDLE_PX)
+
+
 def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
     """Give a camera the median focal length of its images, if any is known, and return whether one is.
 
@@ -121,41 +225,68 @@ def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
     return True
 
 
-def _find(listed: tuple[str, ...], names: tuple[str, ...]) -> IntArray:
-    """Return which image (n,) each listed name is of; -1 where none, or not one alone.
+def find_images(file: Path, listed: Sequence[str], names: Sequence[str]) -> IntArray:
+    """Return which image (n,) each name of a list is of; -1 where none, or not one alone.
 
-    By the name without more leading folders than needed, else without suffix, else, where all images have
-    different numbers for names, by the number that it is. The first of two entries of an image counts.
+    By the name but for folders, else by the last part without suffix, else by the number that it is.
+
+    Raises:
+        InputError: if two names are of one image.
     """
-    found = np.full(len(listed), -1)
-    numbers = {_number(name)[0] for name in names}
-    are_numbers = len(numbers) == len(names) and not any(np.isnan(number) for number in numbers)
-    for keys_of in (_tails, _stem, _number) if are_numbers else (_tails, _stem):
-        keys = [keys_of(name)[0] for name in names]
-        once = {key for key, count in Counter(keys).items() if count == 1}
-        row_of = {key: row for row, key in enumerate(keys) if key in once}
-        for k in np.flatnonzero(found < 0).tolist():
-            found[k] = next((row_of[key] for key in keys_of(listed[k]) if key in row_of), -1)
-    _, first = np.unique(found, return_index=True)
-    found[np.setdiff1d(np.arange(len(found)), first)] = -1
+    found = same_images(listed, names).places
+    for match in (_by_stems, _by_numbers):
+        left = np.flatnonzero(found < 0).tolist()
+        if left:
+            found[left] = match([listed[k] for k in left], names)
+    for row, count in Counter(found[found >= 0].tolist()).items():
+        if count > 1:
+            first, second = (listed[k] for k in np.flatnonzero(found == row)[:2].tolist())
+            raise InputError(
+                f"{file}: {first} and {second} are both the image {names[row]}; keep one of them"
+            )
     return found
 
 
-def _tails(name: str) -> list[str]:
-    """Return a name, and it without one leading folder after the other."""
-    parts = PurePosixPath(name).parts
-    return ["/".join(parts[k:]) for k in range(len(parts))]
+def named_as(file: Path, listed: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of a list, those of images by the names that these have elsewhere."""
+    rows = find_images(file, listed, names).tolist()
+    return tuple(own if row < 0 else names[row] for own, row in zip(listed, rows, strict=True))
 
 
-def _stem(name: str) -> list[str]:
-    """Return a name without folders and suffix; a number keeps what follows its point."""
-    last = PurePosixPath(name)
-    return [last.name if last.suffix[1:].isdigit() else last.stem]
+def _by_stems(listed: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return which image each listed name is of by the last part without suffix, where no other has that."""
+    stems = [stem_of(name) for name in names]
+    counts = Counter(stems)
+    row_of = {stem: row for row, stem in enumerate(stems) if counts[stem] == 1}
+    return [row_of.get(stem_of(name), -1) for name in listed]
 
 
-def _number(name: str) -> list[float]:
-    """Return the number that a name is, if it is one."""
-    try:
-        return [float(*_stem(name))]
-    except ValueError:
-        return [np.nan]  # which equals nothing
+def _by_numbers(listed: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return which image each listed number is of, by the numbers that names end with, if no two are equal.
+
+    If hardly any number is an image's, they are in other units: seconds for nanoseconds, or the reverse.
+    """
+    numbers = [number_of(name) for name in names]
+    row_of = {number: row for row, number in enumerate(numbers) if number is not None}
+    if len(row_of) < len(numbers) - numbers.count(None):
+        return [-1] * len(listed)
+    wanted, ordered = [number_of(name, alone=True) for name in listed], sorted(row_of)
+    for unit in _UNITS:
+        found = [None if one is None else _nearest(one, unit, ordered) for one in wanted]
+        rows = [-1 if number is None else row_of[number] for number in found]
+        if sum(row >= 0 for row in rows) > 1:
+            break
+    return rows
+
+
+def _nearest(number: Decimal, unit: Decimal, ordered: Sequence[Decimal]) -> Decimal | None:
+    """Return which of some numbers one in other units is, exactly or else, alone, as far as its digits go.
+
+    Digits beyond double precision are none, and whole numbers are exact.
+    """
+    exponent = int(number.as_tuple().exponent)
+    slack = max(number * _DOUBLE, Decimal(5).scaleb(exponent - 1) if exponent <= _FRACTION else Decimal(0))
+    k = bisect_left(ordered, (number - slack) * unit)
+    near = list(itertools.takewhile(lambda one: one <= (number + slack) * unit, ordered[k:]))
+    exact = [one for one in near if one == number * unit]
+    return exact[0] if exact else near[0] if len(near) == 1 else None

@@ -11,7 +11,9 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -20,11 +22,15 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.wording import counted, first_of
 from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files
+from sfm_shapefit.files.colmap.foreign_cameras import with_own_cameras
 from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.files.colmap.lenses import focal_lengths
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
 from sfm_shapefit.files.model_folder import model_suffix
+from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
@@ -65,6 +71,8 @@ class ColmapModel:
 
     observed: Observed
     """What images observe, as far as the files told it already."""
+    notes: tuple[str, ...] = ()
+    """What is read otherwise than it stands in the input, a sentence each."""
 
     @property
     def image_names(self) -> tuple[str, ...]:
@@ -72,12 +80,13 @@ class ColmapModel:
         return tuple(image.name for image in self.reconstruction.images.values())
 
 
-def read_model(source: ModelSource) -> ColmapModel:
+def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> ColmapModel:
     """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
             3.12 on, rigs and frames; or a reconstruction, or a result that has one, which is not modified.
+        rotations_suffice: whether images whose position is NaN have a pose; their centers are NaN then.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
@@ -86,6 +95,7 @@ def read_model(source: ModelSource) -> ColmapModel:
     """
     is_checked, source = False, model_of(source)
     observed: Observed = {}
+    notes: tuple[str, ...] = ()
     if not isinstance(source, pycolmap.Reconstruction | Path | str):
         raise InputError(
             f"a {type(source).__name__} is no model; give a folder, a reconstruction or a result"
@@ -93,22 +103,25 @@ def read_model(source: ModelSource) -> ColmapModel:
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
     else:
-        label, (reconstruction, observed) = str(Path(source)), _load(Path(source))
+        label, (reconstruction, observed, notes) = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"
     try:
         with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
-            return _posed_model(label, reconstruction, observed)
+            reconstruction, note = _with_unit_quaternions(reconstruction, source)
+            model = _posed_model(label, reconstruction, observed)
+            model = replace(model, notes=(*notes, *filter(None, [note])))
+            return model if rotations_suffice else _with_positions(label, model)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed]:
-    """Check the files of a model and only then let pycolmap read them."""
+def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed, tuple[str, ...]]:
+    """Check the files of a model and only then let pycolmap read them; with it come `ColmapModel.notes`."""
     observed = check_model_files(folder)
     try:
-        with quiet_log():
-            return pycolmap.Reconstruction(folder), observed
+        with quiet_log(), with_own_cameras(folder, model_suffix(folder)) as (own, notes):
+            return pycolmap.Reconstruction(own), observed, notes
     except PYCOLMAP_ERRORS as error:
         raise InputError(
             f"{folder} cannot be read as a COLMAP model ({_first_line(error)}); write it again with COLMAP"
@@ -150,6 +163,56 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
         raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
 
 
+def _with_unit_quaternions(
+    reconstruction: pycolmap.Reconstruction, source: ModelSource
+) -> tuple[pycolmap.Reconstruction, str]:
+    """Return a reconstruction whose quaternions are of norm 1, and a sentence if some were not.
+
+    That of the user is not modified. A quaternion that is no rotation stays, to be refused.
+    """
+    norms = np.array([np.linalg.norm(pose.rotation.quat) for pose, _ in _poses_in(reconstruction)])
+    off = are_off(norms)
+    if not off.any():
+        return reconstruction, ""
+    own = pycolmap.Reconstruction(reconstruction) if reconstruction is source else reconstruction
+    for (pose, put), norm, is_off in zip(_poses_in(own), norms.tolist(), off.tolist(), strict=True):
+        if is_off:
+            put(pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation.quat / norm), pose.translation))
+    return own, say_normalized(norms)
+
+
+def _poses_in(
+    model: pycolmap.Reconstruction,
+) -> Iterator[tuple[pycolmap.Rigid3d, Callable[[pycolmap.Rigid3d], None]]]:
+    """Yield the poses of frames and of sensors in rigs, and what puts another in place of each."""
+    for frame in model.frames.values():
+        if frame.has_pose():
+            yield frame.rig_from_world, partial(setattr, frame, "rig_from_world")
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            if pose is not None:
+                yield pose, partial(rig.set_sensor_from_rig, sensor)
+
+
+def _with_positions(label: str, model: ColmapModel) -> ColmapModel:
+    """Return a model without the images whose position is not known, and say how many these are."""
+    images = model.images
+    known = images.is_posed
+    if known.all():
+        return model
+    unknown = [images.names[k] for k in np.flatnonzero(~known).tolist()]
+    said = f"of {len(unknown)} of {counted(len(known), 'image')} the position is not known (NaN)"
+    remedy = "`sfm-shapefit locate` finds positions from rotations and matches"
+    if np.sum(known) < 2:
+        raise InputError(f"{label}: {said}; {remedy}")
+    note = f"{said}, so that these have no pose here: {first_of(unknown)}; {remedy}"
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for frame_id in images.frames.ids[~images.frames.is_posed].tolist():
+        copy.deregister_frame(frame_id)
+    images = images.part(np.flatnonzero(known))
+    return replace(model, reconstruction=copy, images=images, observed={}, notes=(*model.notes, note))
+
+
 def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: Observed) -> ColmapModel:
     """Collect the posed images of a reconstruction."""
     every = images_of(reconstruction)
@@ -172,13 +235,13 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, observed: 
     if not sound.all():
         raise InputError(f"{label}: image {ids[int(np.argmin(sound))]} has no valid rotation")
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
-    absurd = np.abs(translations) > _LARGEST_COORDINATE
-    _refuse_not_finite(label, "the position of image", ids, np.where(absurd, np.inf, translations))
+    with np.errstate(invalid="ignore"):
+        absurd = np.abs(translations) > _LARGEST_COORDINATE
+    _refuse_not_finite(label, "the position of image", ids, np.where(absurd, np.inf, 0.0))
     for lens in images.lenses:
-        if not (np.isfinite(lens.focal_px) and lens.focal_px > 0.0):
-            raise InputError(
-                f"{label}: camera {lens.id} has focal length {lens.focal_px:g} px; it must be > 0"
-            )
+        for focal in focal_lengths(lens):
+            if not (np.isfinite(focal) and focal > 0.0):
+                raise InputError(f"{label}: camera {lens.id} has focal length {focal:g} px; it must be > 0")
     return ColmapModel(reconstruction=reconstruction, images=images, observed=observed)
 
 

@@ -74,6 +74,8 @@ class DatabaseFile:
             InputError: if the file is missing, is no sqlite database, or is locked or damaged.
         """
         self.path, self._stack = Path(path), ExitStack()
+        self.notes: list[str] = []
+        """What was read otherwise than it stands in the file, a sentence each."""
         with _sqlite_errors(self.path):
             self.connection = self._stack.enter_context(_readonly_connection(self.path))
 
