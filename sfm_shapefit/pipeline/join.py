@@ -23,8 +23,8 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.merge import merge_models
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.merge import merge_models, rename_images
+from sfm_shapefit.files.colmap.model import ColmapModel, read_model
 from sfm_shapefit.pipeline.adjust import bundle_adjust
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
@@ -33,6 +33,7 @@ from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces, tie_pieces
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
 from sfm_shapefit.scene.given import PositionPriors
+from sfm_shapefit.scene.same_images import same_images
 from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
@@ -72,10 +73,12 @@ def join(
     options = merge_options(options, JoinOptions, overrides)
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
-        pieces = _read(models)
+        if isinstance(models, Path | str) or len(models) < 2:
+            raise InputError("a join needs two models or more; give their folders one after the other")
+        inputs = choose_inputs(models[0], database)
+        pieces = _read(models, inputs.database)
         names = sorted({name for piece in pieces for name in piece.model.images.names})
         shares = len(names) < sum(piece.model.images.num_images for piece in pieces)
-        inputs = choose_inputs(models[0], database)
         if inputs.database is None or (shares and database is None):
             inputs = _without_foreign(inputs, names)
         inputs = read_left_out(inputs, names, options.directions.without)
@@ -105,14 +108,14 @@ def join(
         return tell_group(group, told, source, options.directions, clock)
 
 
-def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[ModelPiece]:
+def _read(
+    models: "Sequence[pycolmap.Reconstruction | Path | str]", database: Path | None
+) -> list[ModelPiece]:
     """Read the models, and refuse those that have nothing to join."""
-    if isinstance(models, Path | str) or len(models) < 2:
-        raise InputError("a join needs two models or more; give their folders one after the other")
     pieces: list[ModelPiece] = []
-    for number, source in enumerate(models):
-        label = str(source) if isinstance(source, Path | str) else f"model {number}"
-        piece = ModelPiece(label=label, model=read_model(source))
+    for number, model in enumerate(_under_one_name([*map(read_model, models)], database)):
+        label = str(models[number]) if isinstance(models[number], Path | str) else f"model {number}"
+        piece = ModelPiece(label=label, model=model)
         for earlier in pieces:
             if {*piece.model.images.names} <= {*earlier.model.images.names}:
                 raise InputError(
@@ -127,6 +130,24 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
             f"{pieces[rigs.index(False)].label} has none; give both the same rigs"
         )
     return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
+
+
+def _under_one_name(models: Sequence[ColmapModel], database: Path | None) -> Iterator[ColmapModel]:
+    """Yield models whose images go by the names that earlier ones have, unless a database has both names."""
+    every = sorted({name for model in models for name in model.images.names})
+    open_names = {*every}
+    if database is not None:
+        with closing(open_database(database, every)) as matches:
+            open_names = {*matches.missing_names}
+    known: dict[str, None] = {}
+    for model in models:
+        own, others = model.images, [*known]
+        same = zip(own.ids.tolist(), own.names, same_images(own.names, others).places.tolist(), strict=True)
+        pairs = [(i, name, others[k]) for i, name, k in same if k >= 0]
+        names = {i: now for i, name, now in pairs if name != now and {name, now} & open_names}
+        renamed = read_model(rename_images(model.reconstruction, names)) if names else model
+        known |= dict.fromkeys(renamed.images.names)
+        yield replace(renamed, notes=model.notes)
 
 
 def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:

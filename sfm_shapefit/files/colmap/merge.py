@@ -1,6 +1,6 @@
 """Two reconstructions as one: a second one moved into the world of a first."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +56,16 @@ def merge_models(
             new = {point: renamed[one] if now == other else now for point, now in new.items()}
     joined.update_point_3d_errors()
     return joined, renamed, new
+
+
+def rename_images(
+    reconstruction: pycolmap.Reconstruction, names: Mapping[int, str]
+) -> pycolmap.Reconstruction:
+    """Return a copy in which the images of some ids have other names."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    for image_id, name in names.items():
+        copy.image(image_id).name = name
+    return copy
 
 
 def _add_frames(
