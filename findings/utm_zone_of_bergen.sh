@@ -4,7 +4,7 @@
 # Guess: pyproj's query, for which PROJ brings a database of areas of use, knows that UTM has zone 32 where
 #   southwest Norway is (60.39 N, 5.32 E), and odd zones alone on Svalbard, as maps there have it.
 # Seen: it names zone 31 for Bergen and 32 for a place of Svalbard where 33 is, as pycolmap does; the small
-#   package utm names 32 and 33. Eastings of one place differ by 286 km.
+#   package utm names 32 and 33. Eastings of one place differ by 331 km.
 set -euo pipefail
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT

@@ -132,7 +132,9 @@ def covariance_of(row: CameraRow) -> FloatArray:
 def covariances_text(covariances: Mapping[str, FloatArray]) -> str:
     """Return covariances (3, 3) of centers, by the names of cameras, as a CSV; numbers round-trip."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
+    # A carriage return in a name would end its line for others.
+    quoting = csv.QUOTE_NONNUMERIC if any("\r" in name for name in covariances) else csv.QUOTE_MINIMAL
+    writer = csv.writer(stream, lineterminator="\n", quoting=quoting)
     writer.writerow(["name", *(first + second for first in "xyz" for second in "xyz")])
     writer.writerows([name, *covariance.ravel().tolist()] for name, covariance in covariances.items())
     return stream.getvalue()

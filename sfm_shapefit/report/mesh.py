@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Colors = npt.NDArray[np.uint8]
 
 _FLOAT32 = 2.0**-24  # share of a coordinate; what rounding to 32 bits moves it by at most
-_FINE_ENOUGH = 1e-6  # of the spread of vertices; hundredths of a pixel in a picture of the scene
+_FINE_ENOUGH = 1e-6  # share of the spread of vertices; hundredths of a pixel in a picture of the scene
 _TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])  # trusts that have a color; others lie between
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
 """Red, green and blue from 0 to 255 at each of these; the page has the same."""
