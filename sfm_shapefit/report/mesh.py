@@ -42,8 +42,10 @@ def ply_bytes(
 
     Need is where float32 would move vertices by a millionth of their spread.
     """
-    step = np.abs(vertices).max(initial=0.0) * _FLOAT32
-    fine = fine or bool(len(vertices) and step > _FINE_ENOUGH * median_spread(vertices))
+    largest = np.abs(vertices).max(initial=0.0)
+    if len(vertices):
+        fine |= bool(largest * _FLOAT32 > _FINE_ENOUGH * median_spread(vertices))
+        fine |= bool(largest > np.finfo(np.float32).max)
     kind, name = ("<f8", "double") if fine else ("<f4", "float")
     rows = np.empty(len(vertices), [("xyz", kind, 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = vertices, colors
