@@ -180,8 +180,12 @@ def in_flags(text: str) -> str:
 
 
 def make_printable(text: str) -> str:
-    """Return text without control characters: names come from strangers, and may move the cursor."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    """Return text without control characters: names come from strangers, and may move the cursor.
+
+    Bytes that are no UTF-8 are shown as \\xXX.
+    """
+    shown = text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in shown)
 
 
 @contextmanager

@@ -186,7 +186,7 @@ class MapResult(Written):
         rows += [Row("in no model", [f"{name}: {reason}" for name, reason in self.left_out.items()])]
         rows += [Row("warning", self.warnings)]
         usable = [one for one in self.joined if 0 in one.models and not one.verdict.is_bad]
-        step = next_of_model(usable[0].verdict.grade, largest.inputs) if usable else largest.next_step
+        step = next_of_model(usable[0].verdict.grade, largest) if usable else largest.next_step
         folders = (*(one.folder for one in usable), *map(str, range(len(self.models))))
         return Telling(lines, rows, details, elsewhere="see map.json", step=step, folders=folders)
 

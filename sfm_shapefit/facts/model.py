@@ -213,6 +213,7 @@ class FactsOfModel(Facts):
         float | None, "Mean reprojection error of these points; null if there are none."
     ]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+    has_panoramas: Annotated[bool, "Whether some images are EQUIRECTANGULAR: COLMAP undistorts none."] = False
     evidence: Annotated[ToldEvidence, "What speaks against the model although it fits."] = ToldEvidence()
 
     def told_lines(self, against: tuple[int, int], more: str = "") -> list[str]:
@@ -290,7 +291,7 @@ class ModelFacts(FactsOfModel, PlacedFacts):
             model, sigma_deg = shlex.quote(self.inputs.model), self.options["rotations"]
             by = f"--database ITS_DATABASE --rotations {sigma_deg:g}"
             return NextStep(text, f"sfm-shapefit locate {model} {{out}} --overwrite {by}")
-        return next_of_model(self.verdict.grade, self.inputs)
+        return next_of_model(self.verdict.grade, self)
 
     def scene_rows(self) -> list[Row]:
         """Return what is told of lenses, rigs, control points and the scene, where there is something."""
@@ -342,13 +343,17 @@ class ModelFacts(FactsOfModel, PlacedFacts):
         return [f"{usable}: usable ({contradicting} contradict the solution)", *others]
 
 
-def next_of_model(grade: Grade, inputs: ModelInputs) -> NextStep:
+def next_of_model(grade: Grade, facts: FactsOfModel) -> NextStep:
     """Return what to do with a model of ours, by what it was made of."""
+    inputs = facts.inputs
     if grade is Grade.DO_NOT_USE:
         model = "{out}" if inputs.model == IN_MEMORY else shlex.quote(inputs.model)  # `map` has no other
         step = f"sfm-shapefit inspect {model}{inputs.database_flag}"
         return NextStep("Next: find out what is wrong with the input.", step)
     looked = ", once you have looked" if grade is Grade.LOOK else ""
+    if facts.has_panoramas:
+        step = "sfm-shapefit convert {out} transforms.json"
+        return NextStep(f"Next: give the panoramas to nerfstudio or LichtFeld{looked}.", step)
     return NextStep(
         f"Next: undistort the images for splatting or dense reconstruction{looked}.",
         "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
@@ -376,7 +381,7 @@ class CheckedFacts(FactsOfModel):
             second.wrong or second.undecided or second.has_nothing_in_common
         )
         if self.verdict.grade is Grade.GOOD or (self.verdict.grade is Grade.LOOK and is_as_map_has_it):
-            step = next_of_model(self.verdict.grade, self.inputs)
+            step = next_of_model(self.verdict.grade, self)
             return step._replace(command=step.command.format(out=path, out_dense="dense"))
         if second is not None and second.wrong:
             command = f"sfm-shapefit map {shlex.quote(_from_here(str(self.inputs.database)))} mapped"
@@ -395,7 +400,9 @@ class CheckedFacts(FactsOfModel):
         judged = [pair.verdict for pair in pairs if pair.direction]  # the others say nothing of positions
         lines = self.told_lines((judged.count(Verdict.OUTLIER.value), len(judged)))[:2]
         second = row("second opinion", self.evidence.second.statement if self.evidence.second else "")
-        return Telling(lines, [Row("weak", weak), second], elsewhere="see the report", step=self.next_step)
+        notes = Row("warning", [one for one in self.warnings if one not in self.evidence.statements])
+        rows = [Row("weak", weak), second, notes]
+        return Telling(lines, rows, elsewhere="see the report", step=self.next_step)
 
 
 class JoinedFacts(CheckedFacts):
@@ -416,7 +423,7 @@ class JoinedFacts(CheckedFacts):
     @property
     def next_step(self) -> NextStep:
         """What to do next."""
-        return next_of_model(self.verdict.grade, self.inputs)
+        return next_of_model(self.verdict.grade, self)
 
 
 class DatabaseInputs(Record):

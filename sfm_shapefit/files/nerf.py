@@ -7,6 +7,9 @@ COLMAP's. Intrinsics stand at the top if all images share them, else in each fra
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
 for instant-ngp and the original NeRF.
 
+A panorama is EQUIRECTANGULAR. nerfstudio wants half its width and its height for focal lengths; LichtFeld
+takes a file for one of panoramas if none stands at the top, so they stand in the frames.
+
 Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 """
 
@@ -42,8 +45,10 @@ _MODELS = {
 """By COLMAP's name of a camera model: nerfstudio's, the number of focal lengths, keys of the distortion."""
 _DENOMINATOR = ("k4", "k5", "k6")
 """Terms of FULL_OPENCV that nerfstudio does not have."""
-_NUM_NUMERATOR = 5  # coefficients of FULL_OPENCV that come before these
+_NUM_NUMERATOR = 5  # coefficients of FULL_OPENCV; the terms above come after these
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+_OF_PINHOLES = ("fl_x", "fl_y", "cx", "cy")
 
 _ORTHOGONAL = 0.01  # entries of M^T M / s^2 - I; a rotation written with three digits is nearer
 
@@ -168,13 +173,15 @@ def nerf_text(images: Images, points_file: str = "") -> str:
         InputError: if a camera model has no equivalent there.
     """
     intrinsics = [_intrinsics(lens) for lens in images.lenses]
-    shared = intrinsics[0] if len(intrinsics) == 1 else {}
+    shared = dict(intrinsics[0]) if len(intrinsics) == 1 else {}
+    if shared and images.lenses[0].is_panorama:
+        intrinsics[0] = {key: shared.pop(key) for key in _OF_PINHOLES}
     matrices = np.tile(np.eye(4), (images.num_images, 1, 1))
     matrices[:, :3, :3] = images.rotations.swapaxes(1, 2) @ FLIP_YZ
     matrices[:, :3, 3] = images.centers
     frames: list[dict[str, Any]] = []
     for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
-        own = {} if shared else intrinsics[lens]
+        own = {} if shared and not images.lenses[0].is_panorama else intrinsics[lens]
         frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
     points = {"ply_file_path": points_file} if points_file else {}
     return (
@@ -185,6 +192,12 @@ def nerf_text(images: Images, points_file: str = "") -> str:
 
 def _intrinsics(lens: Lens) -> dict[str, Any]:
     """Return a lens's keys."""
+    if lens.is_panorama:
+        width, height = lens.parameters
+        values = (0.5 * width, height, 0.5 * width, 0.5 * height)
+        return {"camera_model": lens.model, "w": lens.width, "h": lens.height} | dict(
+            zip(_OF_PINHOLES, values, strict=True)
+        )
     if lens.model not in _MODELS:
         raise InputError(
             f"the camera model {lens.model} has no equivalent in transforms.json; undistort the images first"
@@ -192,8 +205,8 @@ def _intrinsics(lens: Lens) -> dict[str, Any]:
     name, num_focals, keys = _MODELS[lens.model]
     focals, (cx, cy, *coefficients) = lens.parameters[:num_focals], lens.parameters[num_focals:]
     distortion = dict(zip(keys, coefficients, strict=True))
-    denominator = [distortion.pop(key) for key in _DENOMINATOR if key in distortion]
-    if any(denominator):
+    denominator = _DENOMINATOR if lens.model == "FULL_OPENCV" else ()
+    if any(distortion.pop(key) for key in denominator):
         raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
     return {
         "camera_model": name,

@@ -36,8 +36,11 @@ _MODELS = {
     "perspective": "RADIAL",
     "brown": "FULL_OPENCV",
     "fisheye": "OPENCV_FISHEYE",
+    "fisheye_opencv": "OPENCV_FISHEYE",
     "simple_radial": "OPENCV",
     "radial": "OPENCV",
+    "spherical": "EQUIRECTANGULAR",
+    "equirectangular": "EQUIRECTANGULAR",
 }
 """COLMAP's name of a camera model, by OpenSfM's."""
 
@@ -134,6 +137,8 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
     width, height = node.get("width").integer(), node.get("height").integer()
     if width < 1 or height < 1:
         raise node.error("has no size")
+    if _MODELS[kind] == "EQUIRECTANGULAR":
+        return Lens(_MODELS[kind], (width, height), id=camera_id, width=width, height=height)
     size = float(max(width, height))
 
     def value(key: str) -> float:
@@ -145,6 +150,8 @@ def _lens(node: JsonNode, camera_id: int) -> Lens:
         raise node.error("has a focal length that is not positive")
     center = (size * value("c_x") + width / 2.0, size * value("c_y") + height / 2.0)
     parameters = [fx, fy, *center, value("k1"), value("k2"), 0.0, 0.0]
+    if kind == "fisheye_opencv":
+        parameters[6:] = [value("k3"), value("k4")]
     if kind == "perspective":
         parameters = [fx, *parameters[2:6]]
     elif kind == "brown":

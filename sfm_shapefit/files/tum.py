@@ -15,7 +15,7 @@ import csv
 import io
 import re
 from decimal import Decimal
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -23,16 +23,16 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import is_number, text_of
-from sfm_shapefit.files.norms import may_be_rotation, say_normalized
+from sfm_shapefit.files.listed_names import NUMBER, number_of, stem_of
+from sfm_shapefit.files.norms import may_be_rotations, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
-_COLUMNS = tuple(range(1, 8))  # of tx ty tz qx qy qz qw where no header names them
+_COLUMNS = tuple(range(1, 8))  # columns of tx ty tz qx qy qz qw; a header may name others
 _KEYS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT = re.compile(r"\[.*?\]")
 _TURN = re.compile(r"(^|[^a-z])q|quat|orient|rot")  # in the name of a column of the quaternion
-_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?$")
-_KITTI = 12  # numbers of a pose of KITTI's, which names no image
+_KITTI = 12  # numbers of a line of KITTI's poses; these name no image
 
 
 def read_tum(file: Path) -> ListedPoses:
@@ -43,7 +43,7 @@ def read_tum(file: Path) -> ListedPoses:
     Raises:
         InputError: if a line is none of a trajectory.
     """
-    columns, names, numbers, norms = _COLUMNS, list[str](), list[FloatArray](), list[float]()
+    columns, names, poses = _COLUMNS, list[str](), list[FloatArray]()
     for number, line in enumerate(text_of(file).splitlines(), start=1):
         if not names and (header := _columns_of(line.strip().lstrip("#"))):
             columns = header
@@ -51,21 +51,16 @@ def read_tum(file: Path) -> ListedPoses:
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue
-        wanted = [words[k] for k in (0, *columns) if k < len(words) and is_number(words[k])]
-        values = np.array([float(word) for word in wanted[1:]])
-        is_pose = len(wanted) == 1 + len(columns) and len(words) != _KITTI
-        if not (
-            is_pose
-            and np.isfinite([float(wanted[0]), *values]).all()
-            and may_be_rotation(float(np.linalg.norm(values[3:])))
-        ):
+        cells = [words[k] if k < len(words) else "" for k in (0, *columns)]
+        values = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+        norm = np.linalg.norm(values[None, 4:], axis=1)
+        if len(words) == _KITTI or not (np.isfinite(values).all() and may_be_rotations(norm).all()):
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
         names.append(f"{Decimal(words[0]):f}")
-        numbers.append(values)
-        norms.append(float(np.linalg.norm(values[3:])))
-    rows = np.array(numbers).reshape(-1, 7)
+        poses.append(values[1:])
+    rows = np.array(poses).reshape(-1, 7)
     turns = matrices_of(rows[:, 3:])
-    note = say_normalized(np.array(norms))
+    note = say_normalized(np.linalg.norm(rows[:, 3:], axis=1))
     return ListedPoses(
         names=tuple(names),
         rotations=turns.swapaxes(1, 2),
@@ -113,18 +108,6 @@ def poses_csv(images: Images) -> str:
 def _timestamps(names: tuple[str, ...]) -> list[str]:
     """Return the timestamp of each image, as text."""
     if len({number_of(name) for name in names} - {None}) == len(names):
-        return [_NUMBER.findall(stem_of(name))[0] for name in names]
+        return [NUMBER.findall(stem_of(name))[0] for name in names]
     position = {name: k for k, name in enumerate(sorted(names))}
     return [str(position[name]) for name in names]
-
-
-def number_of(name: str, *, alone: bool = False) -> Decimal | None:
-    """Return the number that the name of an image ends with, or is `alone`, without folders and suffix."""
-    found = (_NUMBER.fullmatch if alone else _NUMBER.search)(stem_of(name))
-    return None if found is None else Decimal(found[0])
-
-
-def stem_of(name: str) -> str:
-    """Return a name without folders and suffix; a number keeps what follows its point."""
-    last = PurePosixPath(name.replace("\\", "/"))
-    return last.name if last.suffix[1:].isdigit() else last.stem

@@ -12,10 +12,10 @@ from sfm_shapefit.scene.images import Images, Pictures
 from sfm_shapefit.scene.points import Points
 
 _GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matter of the resolution
-_VANISHES = 0.25  # largest share of this error that is left at the right scale
-_LEAST_CHANGE = 0.01  # of the scale
-_FAR = 0.25  # share of the picture from its corner on where projections tell the scale
-_MOST_IMAGES = 200  # images that are asked, evenly
+_VANISHES = 0.25  # largest share of this error that is left at the right scale; noise is less
+_LEAST_CHANGE = 0.01  # relative change of the scale; sizes rounded to whole pixels make less
+_FAR = 0.25  # share of the picture; nearer to its corner, noise counts for more than the scale
+_MOST_IMAGES = 200  # images that are asked; a median needs no more
 
 
 def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> Recognized | None:
@@ -43,6 +43,6 @@ def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> 
     own = " x ".join(map(str, np.round(scales * sizes[0]).astype(int).tolist()))
     return Recognized(
         f"points2D look scaled by {by}, as those of pictures {own} where the camera has {width} x {height}: "
-        f"their median reprojection error is {before:.3g} px, and {after:.2g} px at its scale",
+        f"their median reprojection error is {before:.3g} px, and {after:.1f} px at its scale",
         "bring both to one resolution",
     )

@@ -14,7 +14,7 @@ scripts/results/notes.md.
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -123,9 +123,7 @@ def check_source(
     recognized = recognize_resolution(*structure[:3])
     if verdict.is_bad and recognized is None:
         recognized = ask_convention(matches, clock.threads)
-    if recognized is not None:
-        grade = Grade.LOOK if verdict.grade is Grade.GOOD else verdict.grade
-        verdict = replace(verdict, grade=grade, reasons=(recognized.sentence, *verdict.reasons))
+    verdict = verdict.led_by(recognized.sentence if recognized else "")
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}
@@ -271,6 +269,7 @@ def _tell(
         "figures": KeyFigures.of_cameras(cameras, error_deg, *measures),
         "sigma_of": "",
         "scale": "input: those of the model",
+        "has_panoramas": any(lens.is_panorama for lens in model.images.lenses),
         "pieces": [],
         "loose_groups": [],
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},

@@ -10,13 +10,13 @@ from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.facts.result import LocateResult
 from sfm_shapefit.files.colmap.points import ModelPictures
 from sfm_shapefit.files.colmap.track_matches import TrackMatches
-from sfm_shapefit.judgement.conventions import Recognized, Written, recognize_convention
+from sfm_shapefit.judgement.conventions import PoseFile, Recognized, recognize_convention
 from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade
 from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
 from sfm_shapefit.pipeline.inputs import MatchSource
 
-_FIRST_PAIRS = 3  # pairs of each image that are asked, those with most matches
+_FIRST_PAIRS = 3  # pairs of each image; those with most matches are asked
 _MOST_PAIRS = 200  # pairs that are asked at all; a second
 
 
@@ -28,9 +28,9 @@ def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
     view, folder = source.view, source.inputs.folder
     if source.images.has_rigs or not view.num_pairs:
         return None
-    written: Written = "colmap"
+    written: PoseFile = "model"
     if folder is not None and not folder.is_dir():
-        written = "nerf" if folder.suffix.lower() == ".json" else "tum"
+        written = "transforms" if folder.suffix.lower() == ".json" else "trajectory"
     counts = np.repeat(-view.matches.num_matches[view.rows].astype(np.int64), 2)
     rank = rank_within(view.pairs.ravel(), counts).reshape(-1, 2).min(axis=1)
     chosen = np.lexsort((counts[::2], rank))[:_MOST_PAIRS]
@@ -39,7 +39,7 @@ def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
 
 
 def _ask_input(source: MatchSource, threads: int) -> Recognized | None:
-    """Return what an input seems to be instead; without a database its points tell, too."""
+    """Return what an input seems to be instead; without a database, its points are asked first."""
     view, recognized = source.view, None
     if isinstance(source.matches, TrackMatches):
         pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
@@ -67,6 +67,6 @@ def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> L
     recognized = None if found.verdict.grade is Grade.GOOD else _ask_input(source, threads)
     if recognized is None:
         return found
-    others = [reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE)]
-    suspicions, warnings = (recognized.clause, *others), (recognized.sentence, *found.warnings)
-    return replace(found, suspicions=suspicions, warnings=warnings)
+    others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
+    warnings = (recognized.sentence, *found.warnings)
+    return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)

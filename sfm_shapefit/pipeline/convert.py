@@ -172,7 +172,7 @@ def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
     module, _, function = FORMATS[name].text_of.partition(":")
     text_of = getattr(import_module(f"sfm_shapefit.files.{module}"), function)
     text: str = text_of(world.poses(images) if FORMATS[name].is_exact else images)
-    return {"": text.encode(errors="surrogateescape")}
+    return {"": text.encode(errors="backslashreplace")}
 
 
 def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
@@ -199,7 +199,7 @@ def _with_points(scene: _Scene) -> dict[str, bytes]:
 
     points = pick_points(scene.model.reconstruction, scene.model.reconstruction.num_points3D())
     text = nerf_text(scene.model.images, f"{scene.stem}{_POINTS}")
-    return {"": text.encode(errors="surrogateescape"), _POINTS: ply_bytes(points.xyz, points.colors)}
+    return {"": text.encode(errors="backslashreplace"), _POINTS: ply_bytes(points.xyz, points.colors)}
 
 
 def _covariances(scene: _Scene) -> str:

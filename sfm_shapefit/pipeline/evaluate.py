@@ -10,9 +10,10 @@ import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.listed_poses import is_list, named_as, read_by_itself
+from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
+from sfm_shapefit.files.listed_names import named_as
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
     PositionEvaluation,

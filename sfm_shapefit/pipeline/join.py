@@ -5,7 +5,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +23,8 @@ from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
 from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
-from sfm_shapefit.files.colmap.merge import merge_models, rename_images
-from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.merge import merge_models
+from sfm_shapefit.files.colmap.model import read_model, renamed_as
 from sfm_shapefit.pipeline.adjust import bundle_adjust
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
@@ -33,7 +33,6 @@ from sfm_shapefit.pipeline.pieces import ModelPiece, TiedPieces, tie_pieces
 from sfm_shapefit.placement.join import AGREEING_PX, UNTIED, PieceJoin, join_pieces
 from sfm_shapefit.placement.prior_join import PlacedByPriors, join_by_priors, place_by_priors
 from sfm_shapefit.scene.given import PositionPriors
-from sfm_shapefit.scene.same_images import same_images
 from sfm_shapefit.solver.options import SolverOptions
 
 if TYPE_CHECKING:
@@ -113,9 +112,14 @@ def _read(
 ) -> list[ModelPiece]:
     """Read the models, and refuse those that have nothing to join."""
     pieces: list[ModelPiece] = []
-    for number, model in enumerate(_under_one_name([*map(read_model, models)], database)):
-        label = str(models[number]) if isinstance(models[number], Path | str) else f"model {number}"
-        piece = ModelPiece(label=label, model=model)
+    found = [*map(read_model, models)]
+    every = {name for model in found for name in model.images.names}
+    # A database that has all of them, each under its own name, says that they are different images.
+    are_different = database is not None and not _missing(database, every)
+    for number, (source, model) in enumerate(zip(models, found, strict=True)):
+        label = str(source) if isinstance(source, Path | str) else f"model {number}"
+        names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
+        piece = ModelPiece(label=label, model=model if are_different else renamed_as(model, list(names)))
         for earlier in pieces:
             if {*piece.model.images.names} <= {*earlier.model.images.names}:
                 raise InputError(
@@ -132,22 +136,10 @@ def _read(
     return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
 
 
-def _under_one_name(models: Sequence[ColmapModel], database: Path | None) -> Iterator[ColmapModel]:
-    """Yield models whose images go by the names that earlier ones have, unless a database has both names."""
-    every = sorted({name for model in models for name in model.images.names})
-    open_names = {*every}
-    if database is not None:
-        with closing(open_database(database, every)) as matches:
-            open_names = {*matches.missing_names}
-    known: dict[str, None] = {}
-    for model in models:
-        own, others = model.images, [*known]
-        same = zip(own.ids.tolist(), own.names, same_images(own.names, others).places.tolist(), strict=True)
-        pairs = [(i, name, others[k]) for i, name, k in same if k >= 0]
-        names = {i: now for i, name, now in pairs if name != now and {name, now} & open_names}
-        renamed = read_model(rename_images(model.reconstruction, names)) if names else model
-        known |= dict.fromkeys(renamed.images.names)
-        yield replace(renamed, notes=model.notes)
+def _missing(database: Path, names: Collection[str]) -> tuple[str, ...]:
+    """Return the names of images that a database lacks."""
+    with closing(open_database(database, sorted(names))) as matches:
+        return matches.missing_names
 
 
 def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
@@ -155,11 +147,10 @@ def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
     shared, path = "images that the models share", inputs.database
     if path is None:
         return replace(inputs, statement=shared)
-    with closing(open_database(path, names)) as matches:
-        missing = len(matches.missing_names)
+    missing = _missing(path, names)
     if not missing:
         return inputs
-    told = f"{shared}; {path}, found beside the first, lacks {missing} of {len(names)} images"
+    told = f"{shared}; {path}, found beside the first, lacks {len(missing)} of {len(names)} images"
     return replace(inputs, database=None, statement=told)
 
 

@@ -78,7 +78,7 @@ def triangulate_control_points(
     counts = np.bincount(control.points[seen.rows], minlength=len(control.names))
     tracks = ObservedTracks(
         offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        cameras=seen.views,
+        cameras=np.arange(len(seen.rows)),
         keypoints=seen.rows,
         pixels=control.pixels[seen.rows],
         on_plane=seen.on_plane,
@@ -94,18 +94,18 @@ def triangulate_control_points(
         rotations=seen.rotations,
         centers=seen.centers,
         focal_lengths_px=seen.focal_lengths_px,
-        images=np.arange(len(seen.rotations)),
+        images=seen.images,
     )
     triangulated = triangulate_tracks(tracks, stand, limits)
     positions = np.full((len(control.names), 3), np.nan)
     positions[triangulated.tracks] = triangulated.points
     agreeing, errors = np.zeros(len(control.points), dtype=np.bool_), np.full(len(control.points), np.nan)
     agreeing[seen.rows] = triangulated.points_seen >= 0
-    to_point = positions[control.points[seen.rows]] - seen.centers[seen.views]
-    inside = np.einsum("kab,kb->ka", seen.rotations[seen.views], to_point)
+    to_point = positions[control.points[seen.rows]] - seen.centers
+    inside = np.einsum("kab,kb->ka", seen.rotations, to_point)
     with np.errstate(invalid="ignore", divide="ignore"):
         off = np.linalg.norm(inside[:, :2] / inside[:, 2:] - seen.on_plane, axis=1)
-        errors[seen.rows] = seen.focal_lengths_px[seen.views] * off
+        errors[seen.rows] = seen.focal_lengths_px * off
     return TriangulatedControl(positions, errors, agreeing)
 
 

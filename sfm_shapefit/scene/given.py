@@ -104,20 +104,20 @@ def why_too_few(positions: FloatArray, what: str) -> str:
 
 
 class MarkedViews(NamedTuple):
-    """The placed images of a model, and how they see the marks of control points."""
+    """How placed images see the marks of control points, each through a camera of its own."""
 
     rotations: FloatArray
-    """(v, 3, 3) cam_from_world of the placed images."""
+    """(r, 3, 3) cam_from_world: of the image, or turned to the mark where that is not before the image."""
     centers: FloatArray
-    """(v, 3)"""
+    """(r, 3)"""
     focal_lengths_px: FloatArray
-    """(v,)"""
+    """(r,)"""
     rows: IntArray
     """(r,) the marks in placed images, by their place in `ControlPoints`, ascending."""
-    views: IntArray
-    """(r,) placed image of each mark."""
+    images: IntArray
+    """(r,) image of each mark."""
     on_plane: FloatArray
-    """(r, 2) normalized coordinates of each mark; NaN where it has no ray ahead."""
+    """(r, 2) normalized coordinates of each mark; NaN where it has no ray."""
 
 
 class Gravity(NamedTuple):

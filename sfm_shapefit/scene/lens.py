@@ -105,12 +105,30 @@ class Lens:
         return self.model in _PLACES
 
     @property
+    def is_panorama(self) -> bool:
+        """Whether its pictures show all directions, as longitude and latitude."""
+        return self.model == "EQUIRECTANGULAR"
+
+    @property
     def focal_px(self) -> float:
         """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
-        if self.model == "EQUIRECTANGULAR":
+        if self.is_panorama:
             return self.parameters[0] / (2.0 * np.pi)  # its width covers a full turn
         has_one = self.model.startswith(_ONE_FOCAL_LENGTH)
         return self.parameters[0] if has_one else (self.parameters[0] + self.parameters[1]) / 2.0
+
+    def offsets_px(self, found: FloatArray, seen: FloatArray) -> FloatArray:
+        """Return how far pixels `found` are from those `seen`, (k, 2).
+
+        In a panorama the left edge is the right one, and offsets along a circle of latitude, which is as long
+        as the equator there, are as long as on the sphere.
+        """
+        off = found - seen
+        if self.is_panorama:
+            width, height = self.parameters
+            off[:, 0] -= width * np.rint(off[:, 0] / width)
+            off[:, 0] *= np.cos(np.pi * (seen[:, 1] / height - 0.5))
+        return off
 
     def refuse_impossible(self) -> None:
         """Raise InputError if the lens cannot be adjusted, or has impossible parameters."""

@@ -49,6 +49,14 @@ def same_images(names: Sequence[str], others: Sequence[str]) -> SameImages:
     return SameImages(places, ambiguity)
 
 
+def names_among(names: Iterable[str], others: Sequence[str]) -> tuple[dict[str, str], str]:
+    """Return what each of some names is called among others, as far as it is there; and `ambiguity`."""
+    listed = list(names)
+    found = same_images(listed, others)
+    places = zip(listed, found.places.tolist(), strict=True)
+    return {name: others[place] for name, place in places if place >= 0}, found.ambiguity
+
+
 def _match(places: IntArray, names: Sequence[str], others: Sequence[str], rule: Callable[[str], str]) -> str:
     """Fill in the places of names that are one image alone by a rule; return a clause about the rest."""
     ours, theirs = (_grouped(map(rule, own)) for own in (names, others))

@@ -46,8 +46,11 @@ def keypoint_errors_px(
     for k, rows in enumerate(points.rows_of_images(images.num_images)):
         with np.errstate(invalid="ignore"):  # a point that is not finite
             in_camera = (points.xyz[seen[rows]] - centers[k]) @ rotations[k].T
-        off = pictures.project(k, in_camera, ahead=ahead) - pictures.pixels(k, points.keypoints[rows])
-        errors[rows] = np.linalg.norm(off, axis=1)
+        found, pixels = (
+            pictures.project(k, in_camera, ahead=ahead),
+            pictures.pixels(k, points.keypoints[rows]),
+        )
+        errors[rows] = np.linalg.norm(images.lenses[images.lens_of[k]].offsets_px(found, pixels), axis=1)
     return errors
 
 

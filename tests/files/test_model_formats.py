@@ -88,6 +88,12 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).images.lenses
     expected = (100.0, 110.0, 41.0, 48.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(lens.parameters, expected, rtol=1e-15)
+    fisheye = brown | {"projection_type": "fisheye_opencv", "k4": 0.4}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": fisheye}}])).images.lenses
+    np.testing.assert_allclose(lens.parameters, (*expected[:6], 0.3, 0.4), rtol=1e-15)
+    panorama = {"projection_type": "spherical", "width": 200, "height": 100}
+    (lens,) = read_opensfm(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": panorama}}])).images.lenses
+    assert (lens.model, lens.parameters) == ("EQUIRECTANGULAR", (200, 100))
 
 
 @pytest.mark.parametrize(
@@ -95,7 +101,7 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     [
         ('"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
         ('"focal": 1.0', '"focal": NaN', r"\[0\]/cameras/c/focal is not finite"),
-        ('"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
+        ('"perspective"', '"dual"', r"projection type 'dual'; perspective, brown"),
         ('"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
         ('"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
         ('"shots"', "shots", r"line 1, column \d+: no JSON"),
@@ -119,10 +125,9 @@ def test_a_malformed_line_of_tracks_and_a_file_that_is_no_model_are_refused(tmp_
         read_opensfm(tmp_path / "other.json")
 
 
-def test_commands_other_than_convert_say_how_a_foreign_model_is_read(tmp_path):
-    file = opensfm_file(tmp_path)
-    for command in (("locate", file, tmp_path / "out"), ("evaluate", file, RING / "truth")):
-        assert "`convert` makes one of OpenSfM's reconstruction.json" in run(*command, code=3).stderr
+def test_locate_says_how_a_foreign_model_is_read(tmp_path):
+    error = run("locate", opensfm_file(tmp_path), tmp_path / "out", code=3).stderr
+    assert "`convert` makes one of OpenSfM's reconstruction.json" in error
 
 
 @pytest.fixture(scope="module")

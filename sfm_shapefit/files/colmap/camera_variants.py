@@ -18,9 +18,9 @@ import pycolmap
 
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
 _SPHERES = (EQUIRECTANGULAR, "SPHERE", "SPHERICAL", "OPENCV_SPHERICAL")
-_IDS_OF_SPHERES = (11, 12, 16, 17)  # SphereSfM, its converters, colmap#4433, COLMAP
+_IDS_OF_SPHERES = (11, 12, 16, 17)  # ids; those of SphereSfM, its converters, colmap#4433 and COLMAP
 OTHER_COUNTS = ((11, 3), (12, 3), (16, 3), (17, 3), (6, 6), (6, 8), (11, 14), (11, 15))
-"""Numbers of parameters that other programs have written for an id, most likely first."""
+"""Ids with other numbers of parameters; a binary file of another program is only read by trying them."""
 _LEAST_CY = 2.0  # pixels; a smaller absolute value is a distortion, for no picture has its middle there
 _FOCAL_AND_PRINCIPAL = 4  # parameters fx, fy, cx, cy; a model of two focal lengths begins with them
 

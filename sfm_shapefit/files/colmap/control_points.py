@@ -22,6 +22,7 @@ import pycolmap
 
 from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import tangent_bases
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.priors import enu_of
 from sfm_shapefit.files.lines import is_number, text_of
@@ -103,23 +104,25 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
 
 
 def look_at_marks(images: Images, known: ControlPoints) -> MarkedViews:
-    """Return the placed ones of images, and their views of the marks of control points."""
-    placed = np.flatnonzero(images.is_posed)
-    place = np.full(images.num_images, -1)
-    place[placed] = np.arange(len(placed))
-    rows = np.flatnonzero(place[known.images] >= 0)
+    """Return the views that the placed ones of images have of the marks of control points."""
+    rows = np.flatnonzero(images.is_posed[known.images])
+    of, rotations = known.images[rows], images.rotations[known.images[rows]]
     on_plane = np.full((len(rows), 2), np.nan)
     for k, row in enumerate(rows.tolist()):
-        lens = images.lenses[images.lens_of[known.images[row]]]
+        lens = images.lenses[images.lens_of[of[k]]]
         ray = rays_of(lens, known.pixels[row : row + 1])[0]
+        if lens.is_panorama or ray[2] <= 0.0:
+            across = tangent_bases(ray[None])[0, :, 0]
+            turn = np.stack([across, np.cross(ray, across), ray])
+            rotations[k], ray = turn @ rotations[k], turn @ ray
         if ray[2] > 0.0:
             on_plane[k] = ray[:2] / ray[2]
     return MarkedViews(
-        rotations=images.rotations[placed],
-        centers=images.centers[placed],
-        focal_lengths_px=images.focal_lengths_px[placed],
+        rotations=rotations,
+        centers=images.centers[of],
+        focal_lengths_px=images.focal_lengths_px[of],
         rows=rows,
-        views=place[known.images[rows]],
+        images=of,
         on_plane=on_plane,
     )
 

@@ -46,10 +46,10 @@ class DatabaseCameras(NamedTuple):
             yield f"{cameras} of the database: {said}"
         for cameras, ids, why in _alike({i: self.impossible[i] for i in names}):
             lost = [name for camera_id in ids for name in names[camera_id]]
+            each = ": each" if len(ids) > 1 else ""
             yield (
-                f"{cameras} of the database {why}: {counted_are(len(lost), 'image')} left out "
-                f"({first_of(lost)}); "
-                "correct the camera, or set its prior_focal_length to 0 for COLMAP's guess"
+                f"{cameras} of the database{each} {why}: {counted_are(len(lost), 'image')} left out "
+                f"({first_of(lost)}); correct the camera, or set its prior_focal_length to 0 for COLMAP's guess"
             )
 
 

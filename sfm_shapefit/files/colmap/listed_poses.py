@@ -1,17 +1,12 @@
 """Lists of poses, of NeRF's programs or SLAM, as models of a database's images.
 
-The images are found by their names. Rigs and lenses are those of the database; where it guessed a lens, the
-focal length is that of the list, the median of its images, which is a guess too.
+The images are found by their names. Rigs and lenses are those of the database; where it guessed a lens, that
+of the list counts: as a whole if it was calibrated, else its focal length, which is a guess too.
 """
 
-import itertools
 import re
-from bisect import bisect_left
-from collections import Counter
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -29,26 +24,20 @@ from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource, read_model
 from sfm_shapefit.files.colmap.other_programs import reconstruction_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.json_node import read_json
+from sfm_shapefit.files.listed_names import find_images
 from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.opensfm import OpenSfmModel, read_opensfm
-from sfm_shapefit.files.tum import number_of, read_tum, stem_of
+from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.listed_poses import ListedPoses
-from sfm_shapefit.scene.same_images import same_images
 
 _READERS = {".json": read_nerf, ".txt": read_tum, ".tum": read_tum, ".csv": read_tum}
 _UNKNOWN = Lens("SIMPLE_PINHOLE", (1.0, 0.0, 0.0))  # without a size
-_FOLDER = re.compile(
-    r"(\./|\.\\)?images[/\\]"
-)  # in which transforms.json has the images of COLMAP's workspaces
-_MIDDLE_PX = (
-    0.75  # pixels; where programs count from the first pixel's center, the middle is half a pixel off
-)
-_UNITS = [Decimal(10) ** k for k in (0, 9, -9, 6, -6, 3, -3)]  # of time stamps, by those of names
-_DOUBLE = Decimal(2) ** -52  # relative error of a number in double precision, at most
-_FRACTION = -4  # exponent of the last digit from which a number is rounded there; numbers of fewer are exact
-_SAME_SHAPE = 0.01  # largest relative difference of the aspect ratios of pictures that differ in size alone
+_FOLDER = re.compile(r"^(\./)?(images/)?")
+"""Where transforms.json has the images of COLMAP's workspaces."""
+_MIDDLE_PX = 0.75  # pixels; the middle is half a pixel off where the first pixel's center is 0
+_SAME_SHAPE = 0.01  # relative difference of aspect ratios; pictures that are shrunk differ by less
 
 
 def is_list(source: object) -> bool:
@@ -96,7 +85,7 @@ def read_by_itself(source: ModelSource, *, with_lenses: bool = False) -> ColmapM
     known = list(dict.fromkeys(lenses))
     ids = np.arange(1, len(lenses) + 1)
     images = Images(
-        names=tuple(_FOLDER.sub("", name, count=1) for name in poses.names),
+        names=tuple(_FOLDER.sub("", name.replace("\\", "/")) for name in poses.names),
         ids=ids,
         frame_of=ids - 1,
         lens_of=np.array([known.index(lens) for lens in lenses], dtype=np.int64),
@@ -143,10 +132,8 @@ def read_list(
         if _set_lens(model.camera(read.images.lenses[k].id), poses, np.flatnonzero(lenses == k))
     }
     lost = [name for name, row in zip(poses.names, rows.tolist(), strict=True) if row < 0]
-    said = (
-        [f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"] if lost else []
-    )
-    return model, frozenset(guessed), (*poses.notes, *said)
+    said = f"the database lacks {counted(len(lost), 'image')} of {file.name}: {first_of(lost)}"
+    return model, frozenset(guessed), (*poses.notes, said) if lost else poses.notes
 
 
 def _pose(images: Images, rows: IntArray, poses: ListedPoses) -> Images:
@@ -175,7 +162,7 @@ def _set_lens(camera: pycolmap.Camera, poses: ListedPoses, rows: IntArray) -> bo
     """Give a camera the lens that some poses of a list have, and return whether that is a guess still.
 
     A list that has distortion, or a principal point outside of the middle, was calibrated: its lens is taken
-    as a whole. Of any other it is the focal length. Where several differ, it is the median.
+    as a whole. Any other tells the focal length alone. Where several differ, the median counts.
     """
     lenses = [scaled for k in rows.tolist() if (scaled := _scaled(poses.lenses[k], camera)) is not None]
     same = [lens.parameters for lens in lenses if lens.model == lenses[0].model]
@@ -223,70 +210,3 @@ def _set_focal_length(camera: pycolmap.Camera, shares: FloatArray) -> bool:
         params[place] = length
     camera.params = params
     return True
-
-
-def find_images(file: Path, listed: Sequence[str], names: Sequence[str]) -> IntArray:
-    """Return which image (n,) each name of a list is of; -1 where none, or not one alone.
-
-    By the name but for folders, else by the last part without suffix, else by the number that it is.
-
-    Raises:
-        InputError: if two names are of one image.
-    """
-    found = same_images(listed, names).places
-    for match in (_by_stems, _by_numbers):
-        left = np.flatnonzero(found < 0).tolist()
-        if left:
-            found[left] = match([listed[k] for k in left], names)
-    for row, count in Counter(found[found >= 0].tolist()).items():
-        if count > 1:
-            first, second = (listed[k] for k in np.flatnonzero(found == row)[:2].tolist())
-            raise InputError(
-                f"{file}: {first} and {second} are both the image {names[row]}; keep one of them"
-            )
-    return found
-
-
-def named_as(file: Path, listed: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a list, those of images by the names that these have elsewhere."""
-    rows = find_images(file, listed, names).tolist()
-    return tuple(own if row < 0 else names[row] for own, row in zip(listed, rows, strict=True))
-
-
-def _by_stems(listed: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return which image each listed name is of by the last part without suffix, where no other has that."""
-    stems = [stem_of(name) for name in names]
-    counts = Counter(stems)
-    row_of = {stem: row for row, stem in enumerate(stems) if counts[stem] == 1}
-    return [row_of.get(stem_of(name), -1) for name in listed]
-
-
-def _by_numbers(listed: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return which image each listed number is of, by the numbers that names end with, if no two are equal.
-
-    If hardly any number is an image's, they are in other units: seconds for nanoseconds, or the reverse.
-    """
-    numbers = [number_of(name) for name in names]
-    row_of = {number: row for row, number in enumerate(numbers) if number is not None}
-    if len(row_of) < len(numbers) - numbers.count(None):
-        return [-1] * len(listed)
-    wanted, ordered = [number_of(name, alone=True) for name in listed], sorted(row_of)
-    for unit in _UNITS:
-        found = [None if one is None else _nearest(one, unit, ordered) for one in wanted]
-        rows = [-1 if number is None else row_of[number] for number in found]
-        if sum(row >= 0 for row in rows) > 1:
-            break
-    return rows
-
-
-def _nearest(number: Decimal, unit: Decimal, ordered: Sequence[Decimal]) -> Decimal | None:
-    """Return which of some numbers one in other units is, exactly or else, alone, as far as its digits go.
-
-    Digits beyond double precision are none, and whole numbers are exact.
-    """
-    exponent = int(number.as_tuple().exponent)
-    slack = max(number * _DOUBLE, Decimal(5).scaleb(exponent - 1) if exponent <= _FRACTION else Decimal(0))
-    k = bisect_left(ordered, (number - slack) * unit)
-    near = list(itertools.takewhile(lambda one: one <= (number + slack) * unit, ordered[k:]))
-    exact = [one for one in near if one == number * unit]
-    return exact[0] if exact else near[0] if len(near) == 1 else None

@@ -1,6 +1,6 @@
 """Two reconstructions as one: a second one moved into the world of a first."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ import pycolmap
 from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
 from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.files.colmap.seed import transform_model
 
@@ -58,16 +59,6 @@ def merge_models(
     return joined, renamed, new
 
 
-def rename_images(
-    reconstruction: pycolmap.Reconstruction, names: Mapping[int, str]
-) -> pycolmap.Reconstruction:
-    """Return a copy in which the images of some ids have other names."""
-    copy = pycolmap.Reconstruction(reconstruction)
-    for image_id, name in names.items():
-        copy.image(image_id).name = name
-    return copy
-
-
 def _add_frames(
     joined: pycolmap.Reconstruction,
     second: pycolmap.Reconstruction,
@@ -75,14 +66,15 @@ def _add_frames(
     rig_ids: dict[int, int],
 ) -> dict[int, int]:
     """Add the posed frames that only the second model has, and return the new ids of all its posed images."""
-    there = {joined.image(i).name: i for i in joined.reg_image_ids()}
-    ids = {i: there[second.image(i).name] for i in second.reg_image_ids() if second.image(i).name in there}
+    there = {name_of(joined.image(i)): i for i in joined.reg_image_ids()}
+    named = {i: name_of(second.image(i)) for i in second.reg_image_ids()}
+    ids = {i: there[name] for i, name in named.items() if name in there}
     fresh = max([*joined.images, *second.images, *joined.frames, *second.frames], default=0) + 1
     for frame_id in sorted(second.reg_frame_ids()):
         own = [data.id for data in second.frame(frame_id).image_ids]
         if shared := [i for i in own if i in ids]:
             if len(shared) < len(own):
-                name = second.image(shared[0]).name
+                name = named[shared[0]]
                 raise InputError(f"a rig took {name} with images that only one of two models has")
             continue
         for i in own:
@@ -118,7 +110,7 @@ def _add_frame(
     """Add a posed frame of a second model with its images."""
     copies = [
         pycolmap.Image(
-            name=image.name,
+            name=bytes_of_name(name_of(image)),
             keypoints=points2d_xy(image),
             camera_id=renamed.cameras[image.camera_id],
             image_id=renamed.images[image.image_id],
