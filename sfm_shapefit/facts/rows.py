@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -132,7 +132,9 @@ def covariance_of(row: CameraRow) -> FloatArray:
 def covariances_text(covariances: Mapping[str, FloatArray]) -> str:
     """Return covariances (3, 3) of centers, by the names of cameras, as a CSV; numbers round-trip."""
     stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
+    has_return = any("\r" in name for name in covariances)  # which would end its line for others
+    quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if has_return else csv.QUOTE_MINIMAL
+    writer = csv.writer(stream, lineterminator="\n", quoting=quoting)
     writer.writerow(["name", *(first + second for first in "xyz" for second in "xyz")])
     writer.writerows([name, *covariance.ravel().tolist()] for name, covariance in covariances.items())
     return stream.getvalue()

@@ -50,6 +50,8 @@ FORMATS = {
     "covariances": ExportFormat("CSV of the centers' 3 x 3 covariances in an output", is_exact=True),
 }
 
+_FOLDERS = {"colmap", "colmap-txt"}
+
 
 def convert(
     source: "ModelSource",
@@ -111,6 +113,8 @@ def write_converted(
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
+    if name not in _FOLDERS:
+        refuse_file(path, overwrite=overwrite)
     given, source = source, model_of(source)
     trust = _trust_of(source) if name in {"glb", "ply"} else {}
     model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
@@ -122,7 +126,7 @@ def write_converted(
         model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
         told += world.bend_statement(centers)
     told = "; ".join(filter(None, [told, *notes]))
-    if name in {"colmap", "colmap-txt"}:
+    if name in _FOLDERS:
         _write_folder(model, path, name, world, [given] if isinstance(given, Path | str) else [])
         return Converted(name, (path,), told)
     contents = _contents(name, _Scene(source, model, world, trust, path.stem))

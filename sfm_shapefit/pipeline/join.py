@@ -5,7 +5,7 @@ models and matches -> ties between pieces -> votes, program, refinement, judgeme
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -72,10 +72,12 @@ def join(
     options = merge_options(options, JoinOptions, overrides)
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
-        pieces = _read(models)
+        if isinstance(models, Path | str) or len(models) < 2:
+            raise InputError("a join needs two models or more; give their folders one after the other")
+        inputs = choose_inputs(models[0], database)
+        pieces = _read(models, inputs.database)
         names = sorted({name for piece in pieces for name in piece.model.images.names})
         shares = len(names) < sum(piece.model.images.num_images for piece in pieces)
-        inputs = choose_inputs(models[0], database)
         if inputs.database is None or (shares and database is None):
             inputs = _without_foreign(inputs, names)
         inputs = read_left_out(inputs, names, options.directions.without)
@@ -105,15 +107,19 @@ def join(
         return tell_group(group, told, source, options.directions, clock)
 
 
-def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[ModelPiece]:
+def _read(
+    models: "Sequence[pycolmap.Reconstruction | Path | str]", database: Path | None
+) -> list[ModelPiece]:
     """Read the models, and refuse those that have nothing to join."""
-    if isinstance(models, Path | str) or len(models) < 2:
-        raise InputError("a join needs two models or more; give their folders one after the other")
     pieces: list[ModelPiece] = []
-    for number, source in enumerate(models):
+    found = [*map(read_model, models)]
+    every = {name for model in found for name in model.images.names}
+    # A database that has all of them, each under its own name, says that they are different images.
+    are_different = database is not None and not _missing(database, every)
+    for number, (source, model) in enumerate(zip(models, found, strict=True)):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
         names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
-        piece = ModelPiece(label=label, model=renamed_as(read_model(source), list(names)))
+        piece = ModelPiece(label=label, model=model if are_different else renamed_as(model, list(names)))
         for earlier in pieces:
             if {*piece.model.images.names} <= {*earlier.model.images.names}:
                 raise InputError(
@@ -130,16 +136,21 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
     return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
 
 
+def _missing(database: Path, names: Collection[str]) -> tuple[str, ...]:
+    """Return the names of images that a database lacks."""
+    with closing(open_database(database, sorted(names))) as matches:
+        return matches.missing_names
+
+
 def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
     """Return the inputs without a database that was only found, and is that of the first model alone."""
     shared, path = "images that the models share", inputs.database
     if path is None:
         return replace(inputs, statement=shared)
-    with closing(open_database(path, names)) as matches:
-        missing = len(matches.missing_names)
+    missing = _missing(path, names)
     if not missing:
         return inputs
-    told = f"{shared}; {path}, found beside the first, lacks {missing} of {len(names)} images"
+    told = f"{shared}; {path}, found beside the first, lacks {len(missing)} of {len(names)} images"
     return replace(inputs, database=None, statement=told)
 
 

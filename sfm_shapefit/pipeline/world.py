@@ -2,7 +2,7 @@
 
 Systems on Earth are curved, so that places and poses go there one by one: each camera by the turn and scale
 that the system has where it stands. A model goes as one by what they are at its middle, and so keeps its
-reprojection errors; `World.bend` says how far its cameras then stand from their own coordinates.
+reprojection errors; `World.bend_statement` says how far its cameras then stand from their own coordinates.
 """
 
 from dataclasses import dataclass, replace

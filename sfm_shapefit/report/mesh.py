@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Colors = npt.NDArray[np.uint8]
 
 _FLOAT32 = 2.0**-24  # share of a coordinate; what rounding to 32 bits moves it by at most
-_FINE_ENOUGH = 1e-6  # of the spread of vertices; hundredths of a pixel in a picture of the scene
+_FINE_ENOUGH = 1e-6  # share of the spread of vertices; hundredths of a pixel in a picture of the scene
 _TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])  # trusts that have a color; others lie between
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
 """Red, green and blue from 0 to 255 at each of these; the page has the same."""
@@ -42,8 +42,10 @@ def ply_bytes(
 
     Need is where float32 would move vertices by a millionth of their spread.
     """
-    step = np.abs(vertices).max(initial=0.0) * _FLOAT32
-    fine = fine or bool(len(vertices) and step > _FINE_ENOUGH * median_spread(vertices))
+    largest = np.abs(vertices).max(initial=0.0)
+    if len(vertices):
+        fine |= bool(largest * _FLOAT32 > _FINE_ENOUGH * median_spread(vertices))
+        fine |= bool(largest > np.finfo(np.float32).max)
     kind, name = ("<f8", "double") if fine else ("<f4", "float")
     rows = np.empty(len(vertices), [("xyz", kind, 3), ("rgb", "u1", 3)])
     rows["xyz"], rows["rgb"] = vertices, colors

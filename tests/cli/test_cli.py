@@ -42,7 +42,7 @@ def ring_run(tmp_path_factory):
 def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_where_it_is(ring_run):
     result, out = ring_run
     model = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
+    tables = {"locate.json", "cameras.csv", "covariances.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
     placed, matches, known, verdict, report, command = result.stdout.splitlines()

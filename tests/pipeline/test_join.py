@@ -201,6 +201,30 @@ def test_a_database_of_the_first_model_alone_is_said_and_does_not_judge_the_othe
     assert "the database lacks 3 images" in " ".join(told.split())
 
 
+@pytest.mark.parametrize("form", ["images/{}", ".\\images\\{}", "D:\\shots\\{}"])
+def test_images_of_one_name_but_for_folders_are_one(form):
+    second = other_keypoints(piece(IDS[2:], moved=True), noise_px=1.0)
+    for image in second.images.values():
+        image.name = form.format(image.name)
+    found = sfm_shapefit.join([piece(IDS[:5]), second])
+    assert found.verdict.grade == "good"
+    names = [image.name for image in found.reconstruction.images.values()]
+    assert len(names) == 8
+    assert {WHOLE.image(i).name for i in IDS[:5]} <= {*names}
+    assert all(second.image(i).name == form.format(WHOLE.image(i).name) for i in IDS[2:])
+
+
+def test_names_that_a_database_has_both_are_two_images(tmp_path):
+    database = shutil.copy(DATABASE, tmp_path / "both.db")
+    first, last = (WHOLE.image(i).name for i in (IDS[0], IDS[7]))
+    edit_database(tmp_path / "both.db", f"UPDATE images SET name = 'b/{first}' WHERE name = '{last}'")
+    second = piece(IDS[4:], moved=True)
+    second.image(IDS[7]).name = f"b/{first}"
+    found = sfm_shapefit.join([piece(IDS[:4]), second], database)
+    assert found.reconstruction.num_reg_images() == 8
+    assert found.verdict.grade == "good"
+
+
 def test_a_second_model_that_is_bent_is_not_called_good(tmp_path):
     second = other_keypoints(piece(IDS[2:], moved=True), noise_px=1.0)
     for i in IDS[5:]:

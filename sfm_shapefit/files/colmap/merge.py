@@ -131,7 +131,7 @@ def _add_frame(
 def _add_keypoints(image: pycolmap.Image, other: pycolmap.Image) -> IntArray:
     """Return which keypoint of an image each one (k,) of the same image in another model is.
 
-    Those that lie at none of its own are added behind these.
+    What lies at none of its own is added behind these.
     """
     own, others = points2d_xy(image), points2d_xy(other)
     if own.shape == others.shape and (np.abs(own - others) <= _SAME_PIXEL).all():
