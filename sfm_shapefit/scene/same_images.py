@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import IntArray
 _SLASH = re.compile(r"[/\\]")
 _ABSOLUTE = re.compile(r"[/\\]|[A-Za-z]:[/\\]")
 _MOST_FOLDERS = 64  # leading folders that are passed over; each costs a copy of the name
-_MOST_SAID = 3  # names in a clause
+_MOST_SAID = 3  # names; a sentence with more is not read
 
 
 class SameImages(NamedTuple):

@@ -38,7 +38,7 @@ from sfm_shapefit.files.colmap.binary_records import (
     POINT3D,
     POSE,
     RIG,
-    SENSOR,
+    SENSOR_ID,
 )
 from sfm_shapefit.files.colmap.camera_variants import (
     OTHER_COUNTS,
@@ -114,11 +114,11 @@ def binary_files(folder: Path) -> Iterator[ModelFiles]:
     records, notes = binary_records(folder)
     with private_folder() as own:
         for name, of_file in records.items():
-            write_records(own / f"{name}.bin", of_file)
+            write_binary_file(own / f"{name}.bin", of_file)
         yield ModelFiles(own, folder, suffix, tuple(notes))
 
 
-def write_records(path: Path, records: Iterable[bytes]) -> None:
+def write_binary_file(path: Path, records: Iterable[bytes]) -> None:
     """Write a binary file of a private copy.
 
     Raises:
@@ -428,7 +428,7 @@ def _check_rigs(file: _BinaryFile, camera_ids: set[int]) -> dict[int, set[tuple[
         label = f"rig {rig_id}"
         if rig_id in rigs:
             raise file.fault(f"{label} stands twice")
-        file.require_room(num_sensors, SENSOR.size, f"sensors of {label}")
+        file.require_room(num_sensors, SENSOR_ID.size, f"sensors of {label}")
         rigs[rig_id] = {
             _take_sensor(file, label, camera_ids, is_reference=k == 0) for k in range(num_sensors)
         }
@@ -442,7 +442,7 @@ def _take_sensor(
     file: _BinaryFile, label: str, camera_ids: set[int], *, is_reference: bool
 ) -> tuple[int, int]:
     """Read one sensor of a rig, and its pose unless it is the reference; return its type and id."""
-    sensor_type, sensor_id = map(int, file.take(SENSOR, label))
+    sensor_type, sensor_id = map(int, file.take(SENSOR_ID, label))
     if sensor_type == _CAMERA_SENSOR and sensor_id not in camera_ids:
         raise file.fault(
             f"{label} refers to camera {sensor_id}, which {file.beside('cameras')} does not have"

@@ -9,7 +9,7 @@ import pycolmap
 
 from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POINT2D
-from sfm_shapefit.files.colmap.check import ModelFiles, check_cameras, write_records
+from sfm_shapefit.files.colmap.check import ModelFiles, check_cameras, write_binary_file
 from sfm_shapefit.files.colmap.text_model import say_variants
 
 
@@ -50,8 +50,8 @@ def without_points(files: ModelFiles, reason: str) -> Iterator[ModelFiles]:
     """
     with private_folder() as own:
         _link(files, own, "cameras", "rigs", "frames")
-        write_records(own / "images.bin", _bare_images(files))
-        write_records(own / "points3D.bin", ())
+        write_binary_file(own / "images.bin", _bare_images(files))
+        write_binary_file(own / "points3D.bin", ())
         note = f"{reason}; points and observations are left aside, poses alone are read"
         yield files._replace(folder=own, notes=(*files.notes, note))
 

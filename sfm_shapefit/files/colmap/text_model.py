@@ -38,12 +38,12 @@ from sfm_shapefit.files.colmap.binary_records import (
     POINT2D,
     POSE,
     RIG,
-    SENSOR,
+    SENSOR_ID,
 )
 from sfm_shapefit.files.colmap.camera_variants import num_params_of_model, read_camera
 from sfm_shapefit.files.norms import may_be_rotations
 
-_EXACT = 2.0**53  # whole numbers from here on may be others as floating-point numbers
+_EXACT = 2.0**53  # whole numbers; from here on floating-point numbers are not all of them
 _TWO_LINES = "each image has two lines, its own and that of its points, which may be empty"
 
 
@@ -251,7 +251,7 @@ def _rigs(lines: Iterator[_Line]) -> Iterator[bytes]:
         rig_id, count = line.integers(_taken(line, words, 2), "the rig")
         record = line.pack(RIG, rig_id, count)
         for k in range(count):
-            record += line.pack(SENSOR, *_sensor(line, words))
+            record += line.pack(SENSOR_ID, *_sensor(line, words))
             if k > 0:
                 (has_pose,) = line.integers(_taken(line, words, 1), "the rig")
                 record += line.pack(HAS_POSE, has_pose)
