@@ -98,6 +98,7 @@ def map_opened(
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=(
+            *(run.known.priors.notes if run.known.priors is not None else ()),
             *map_warnings(run.read.rigs.incomplete, models, left_out),
             *told,
             *lost_distances(options.gauge.known_distance, models, joined),

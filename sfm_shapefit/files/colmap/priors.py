@@ -1,35 +1,41 @@
-"""Position priors of cameras: pose priors of a COLMAP database, a table of names and positions, or EXIF data.
+"""Position priors of cameras: pose priors of a COLMAP database or of its JSON, a table, or EXIF data.
 
 Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
 north and up of their median. Their covariances are taken as meters squared in those axes.
 
 Source: https://colmap.github.io/database.html; `colmap/geometry/pose_prior.h`: coordinate system -1 is
 undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP 3.12 a row names its image,
-from then on its sensor and datum, and an image is the datum of a camera.
+from then on its sensor and datum, and an image is the datum of a camera. Until COLMAP 3.8 images had a prior
+themselves, latitude, longitude and altitude where it is that of EXIF data, and no system.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.arrays import BoolArray, FloatArray
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.wording import counted, counted_are
+from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of, unwrapped
+from sfm_shapefit.files.colmap.pose_prior_json import read_pose_prior_json
+from sfm_shapefit.files.colmap.position_table import LARGEST, PositionTable, System, read_position_table
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
-from sfm_shapefit.files.lines import is_database, named_rows
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
 
-_WGS84, _CARTESIAN = 0, 1  # coordinate system of a prior; the numbers are COLMAP's
+_UNDEFINED, _WGS84, _CARTESIAN = -1, 0, 1  # coordinate system of a prior; the numbers are COLMAP's
+_SYSTEMS: dict[object, System] = {_WGS84: "geodetic", _CARTESIAN: "metric"}
 _SENSOR_IS_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
 """What joins pose priors to their images, of databases whose priors may be of other sensors too."""
-_TABLE_COLUMNS = (4, 5, 7)  # cells of a row; a name, a position, and no, one or three standard deviations
-_FORM = "a name, three coordinates, and none, one or three standard deviations"
-_GEODETIC = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude", "height"})
-"""Names of the columns of latitude, longitude and altitude, in this order."""
-_LARGEST = 1e30  # units; sums of squares of squares of larger coordinates or sigmas overflow
+_ORDERS = {"lat lon?": (0, 1), "lon lat?": (1, 0)}  # latitude and longitude, by columns
+_WIDEST_DEG = 0.1  # degrees, 11 km; positions that are spread farther are not taken for degrees unsaid
+_FAR_FROM_ZERO = 100.0  # spreads; lengths this far from their origin, and within _WIDEST_DEG, are rare
+_STEEP = 10.0  # horizontal spreads; altitudes in meters scatter by more of them, or not at all
 
 
 class MissingPriorsError(InputError):
@@ -40,116 +46,172 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     """Read the pose priors of the model's images, matched by name, from a database.
 
     Raises:
-        MissingPriorsError: if the database has no prior of these images.
+        MissingPriorsError: if the database has no prior of these images that can be used.
         InputError: if it mixes coordinate systems, or is damaged.
     """
-    path, found = file.path, dict[int, tuple[FloatArray, FloatArray]]()
-    systems: set[int] = set()
-    index_of_name = {name: index for index, name in enumerate(images.names)}
-    selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
-    by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
-    # One for each version of the schema, the newest first, by the columns that it has.
-    queries = {
-        ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, PRIORS_OF_IMAGES),
-        ("image_id", covariances): selected.format(covariances, by_image),
-        ("image_id", "position"): selected.format("NULL", by_image),
-    }
-    for name, position, covariance, system in file.rows("pose_priors", queries):
-        index = index_of_name.get(name)
-        xyz = _numbers(path, name, position, 3)
-        if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():
-            continue
-        found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3)
-        systems.add(system)
-    if not found:
-        raise MissingPriorsError(
-            f"{path} has no position prior of the model's images; give a table (priors=FILE)"
-        )
+    path, unused = file.path, dict[str, int]()
+    rows = list(_rows_of_images(file, unused))
+    if not rows and not unused:
+        rows = list(_rows_of_old_images(file))
+    positions = np.array([_numbers(path, row.name, row.position, 3) for row in rows]).reshape(-1, 3)
+    covariances = np.array([_numbers(path, row.name, row.covariance, 9) for row in rows]).reshape(-1, 3, 3)
+    known = (np.abs(positions[:, :2]) <= LARGEST).all(axis=1)
+    known &= np.isin([row.name for row in rows], images.names)
+    told = {row.system for row, is_known in zip(rows, known, strict=True) if is_known}
+    systems = {_SYSTEMS[system] for system in told if system in _SYSTEMS}
     if len(systems) > 1:
         raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind (priors=FILE)")
-    return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
+    is_degrees = degrees_order(positions[known], "lat lon?") == (0, 1)
+    system = systems.pop() if systems else "geodetic" if is_degrees else "metric"
+    notes = [f"{counted_are(count, 'pose prior')} of {path} not used: {why}" for why, count in unused.items()]
+    if undefined := sum(
+        row.system not in _SYSTEMS for row, is_known in zip(rows, known, strict=True) if is_known
+    ):
+        kind = "WGS84" if system == "geodetic" else "Cartesian"
+        notes.append(
+            f"{counted(undefined, 'pose prior')} of {path} whose coordinate_system is UNDEFINED: taken for "
+            f"{kind}; set it to WGS84 or CARTESIAN"
+        )
+    table = PositionTable(tuple(row.name for row in rows), positions, covariances, system, tuple(notes))
+    return _priors(table, images, f"pose priors of {path}")
 
 
-def table_priors(path: Path, images: Images) -> PositionPriors:
-    """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
-
-    A first line that names the columns is optional; where it calls the second one lat or latitude, rows
-    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments; names that
-    are not among the model's are passed over.
+def file_priors(path: Path, images: Images) -> PositionPriors:
+    """Read a table, see `position_table`, or COLMAP's pose-prior JSON; names that the model lacks are none.
 
     Raises:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
             is one of the model's.
     """
-    rows, geodetic = read_position_table(path)
-    index_of_name = {name: index for index, name in enumerate(images.names)}
-    found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
-    if not found:
-        raise InputError(f"{path} has no prior of the model's images, such as {images.names[0]}")
-    return _priors(found, f"{len(found)} positions of {path}", geodetic=geodetic)
+    return _priors(read_positions(path), images, str(path))
+
+
+def read_positions(path: Path) -> PositionTable:
+    """Read names and positions of a table or of COLMAP's pose-prior JSON."""
+    return read_pose_prior_json(path) if path.suffix.lower() == ".json" else read_position_table(path)
 
 
 def exif_priors(folder: Path, images: Images) -> PositionPriors:
     """Read the GPS positions that the EXIF data of the model's images have, by pycolmap's own reader.
 
-    A position without altitude has that of the median.
-
     Raises:
         InputError: if no image of the model in the folder has a position.
     """
-    found: dict[int, tuple[FloatArray, FloatArray]] = {}
-    for index, name in enumerate(images.names):
+    found: dict[str, list[float]] = {}
+    for name in images.names:
         bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
         if bitmap is not None:
             read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
-            position = np.array([np.nan if value is None else value for value in read])
-            if np.isfinite(position[:2]).all():
-                found[index] = position, np.full((3, 3), np.nan)
-    if not found:
-        raise InputError(f"{folder} has no image of the model with a GPS position in its EXIF data")
-    altitudes = np.array([position[2] for position, _ in found.values()])
-    level = float(np.median(altitudes[np.isfinite(altitudes)])) if np.isfinite(altitudes).any() else 0.0
-    for position, _ in found.values():
-        position[2] = level if np.isnan(position[2]) else position[2]
-    return _priors(found, f"EXIF data of {len(found)} images of {folder}", geodetic=True)
+            if None not in read[:2]:
+                found[name] = [np.nan if value is None else value for value in read]
+    positions = np.array(list(found.values())).reshape(-1, 3)
+    table = PositionTable(tuple(found), positions, np.full((len(found), 3, 3), np.nan), "geodetic")
+    return _priors(table, images, f"EXIF data of {folder}")
 
 
-def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatArray]], bool]:
-    """Read position (3,) and covariance (3, 3) of each name of a table, and whether it has latitudes.
+def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> PositionTable:
+    """Return the positions that are known, those on Earth in meters about a datum, their median if None.
 
-    Raises:
-        InputError: if the file cannot be read or a line is malformed.
+    Altitudes that are missing are the median of the others, or 0. InputError if latitudes or longitudes are
+    out of range.
     """
-    if is_database(path):
-        raise InputError(f"{path} is a database; its own pose priors are priors=database")
-    header, rows = named_rows(path, _TABLE_COLUMNS, _FORM)
-    geodetic = bool(header) and _is_geodetic(path, header)
-    return {name: _prior_of(where, values) for name, (where, values) in rows.items()}, geodetic
-
-
-def _is_geodetic(path: Path, header: list[str]) -> bool:
-    """Return whether the columns are latitude, longitude and altitude, by their names."""
-    named = [word.lower() for word in header[1:4]]
-    are_so = [name in names for name, names in zip(named, _GEODETIC, strict=False)]
-    if all(are_so) and len(are_so) == len(_GEODETIC):
-        return True
-    if any(name in names for name in named for names in _GEODETIC[:2]):
-        raise InputError(
-            f"{path}: the header {','.join(header)} is not known; give name,lat,lon,alt or name,x,y,z"
+    notes = list(table.notes)
+    if order := degrees_order(table.positions, table.system):
+        table = table._replace(positions=table.positions[:, [*order, 2]], system="geodetic")
+        names = " and ".join(("latitude", "longitude")[column] for column in order)
+        notes.append(
+            f"{source} does not say so, but its numbers are {names} in degrees, and are taken for that; name "
+            "the columns lat, lon, alt, or x_m, y_m, z_m if they are lengths"
         )
-    return False
+    is_geodetic = table.system == "geodetic"
+    there = np.abs(table.positions) <= LARGEST
+    known: BoolArray = np.asarray(there[:, : 2 if is_geodetic else 3].all(axis=1))
+    if not known.all():
+        notes.append(f"{np.sum(~known)} of {len(known)} positions of {source} are missing or not finite")
+    has_altitude, table = there[known, 2], table.part(known)
+    if (
+        bad := np.isfinite(table.covariances).all(axis=(1, 2))
+        & ~(np.linalg.eigvalsh(np.nan_to_num(table.covariances))[:, 0] > 0.0)
+    ).any():
+        notes.append(
+            f"{counted(int(bad.sum()), 'covariance')} of {source} not positive definite, so not known"
+        )
+    positions = table.positions.copy()
+    if not is_geodetic or not len(positions):
+        return table._replace(system="metric", notes=tuple(notes))
+    if not has_altitude.all():
+        level = float(np.median(positions[has_altitude, 2])) if has_altitude.any() else 0.0
+        positions[~has_altitude, 2] = level
+        notes.append(
+            f"{np.sum(~has_altitude)} positions of {source} have no altitude; theirs is set to {level:g} m"
+        )
+    datum = datum or datum_of(positions)
+    try:
+        positions = enu_of(positions, datum)
+    except ValueError as error:
+        raise InputError(f"{source}: {error}") from error
+    return table._replace(positions=positions, system="metric", notes=tuple(notes), datum=datum)
 
 
-def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
-    """Return positions (k, 3), latitude, longitude in degrees and altitude, in meters east, north and up.
+def degrees_order(positions: FloatArray, system: System) -> tuple[int, int] | None:
+    """Return the columns of latitude and longitude of positions (k, 3) whose system is not said, or None.
 
-    Raises:
-        ValueError: if a latitude or longitude is out of range.
+    They are degrees beyond doubt if both are in range, vary by thousandths of themselves, and altitudes vary
+    by meters or not at all: as lengths, cameras would stand within millimeters, and far from the origin.
     """
-    if (np.abs(geodetic[:, 0]) > 90.0).any() or (np.abs(geodetic[:, 1]) > 360.0).any():
-        raise ValueError("a latitude or longitude is out of range; give degrees")
-    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    return np.asarray(transform.ellipsoid_to_enu(geodetic, *datum))
+    if system not in _ORDERS or not len(positions):
+        return None
+    counted_on = np.column_stack([unwrapped(positions[:, 0]), unwrapped(positions[:, 1]), positions[:, 2]])
+    finite = counted_on[np.isfinite(counted_on[:, :2]).all(axis=1)]
+    if not len(finite):
+        return None
+    low, middle, high = np.nanpercentile(np.nan_to_num(finite), [10.0, 50.0, 90.0], axis=0)
+    spread, far = float(np.max(high[:2] - low[:2])), float(np.max(np.abs(middle[:2])))
+    is_steep = not 0.0 < high[2] - low[2] < _STEEP * spread
+    if not (0.0 < spread < _WIDEST_DEG and far > _FAR_FROM_ZERO * spread and is_steep):
+        return None
+    first = _ORDERS[system]
+    return next((o for o in (first, first[::-1]) if (np.abs(finite[:, o]) <= [90.0, 180.0]).all()), None)
+
+
+class _Row(NamedTuple):
+    """A pose prior of a database as it stands."""
+
+    name: str
+    position: object
+    covariance: object
+    system: object
+
+
+def _rows_of_images(file: DatabaseFile, unused: dict[str, int]) -> Iterator[_Row]:
+    """Yield the pose priors of images, and count why others are of no use."""
+    selected = (
+        "SELECT images.name, position, {}, coordinate_system, {} FROM pose_priors LEFT JOIN images ON {}"
+    )
+    by_image, covariance = "images.image_id = pose_priors.image_id", "position_covariance"
+    # One for each version of the schema, the newest first, by the columns that it has.
+    queries = {
+        ("corr_data_id", "corr_sensor_type", covariance): selected.format(
+            covariance, "corr_sensor_type", "images.image_id = corr_data_id"
+        ),
+        ("image_id", covariance): selected.format(covariance, _SENSOR_IS_CAMERA, by_image),
+        ("image_id", "position"): selected.format("NULL", _SENSOR_IS_CAMERA, by_image),
+    }
+    for *row, sensor in file.rows("pose_priors", queries):
+        if sensor != _SENSOR_IS_CAMERA or row[0] is None:
+            why = "they are of images that are not there" if row[0] is None else "they are of other sensors"
+            unused[why] = unused.get(why, 0) + 1
+        else:
+            yield _Row(*row)
+
+
+def _rows_of_old_images(file: DatabaseFile) -> Iterator[_Row]:
+    """Yield the priors that images have themselves; zeros are what scripts write where there is none."""
+    columns = ("prior_tx", "prior_ty", "prior_tz")
+    for name, *xyz in file.rows("images", {columns: f"SELECT name, {', '.join(columns)} FROM images"}):
+        values = [float(value) if isinstance(value, int | float) else np.nan for value in xyz]
+        if any(values):
+            yield _Row(name, np.array(values, dtype="<f8").tobytes(), None, _UNDEFINED)
 
 
 def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
@@ -161,33 +223,22 @@ def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
     return np.frombuffer(blob, dtype="<f8").astype(np.float64)
 
 
-def _prior_of(where: str, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return position and covariance by the numbers of a line."""
-    if not (np.abs(values) <= _LARGEST).all() or (values[3:] < 1.0 / _LARGEST).any():
-        raise InputError(
-            f"{where}coordinates must be finite and standard deviations positive, all below {_LARGEST:g}"
-        )
-    if len(values) == 3:
-        return values, np.full((3, 3), np.nan)
-    return values[:3], np.diag(np.broadcast_to(values[3:] ** 2, 3))
-
-
-def _priors(
-    found: dict[int, tuple[FloatArray, FloatArray]], source: str, *, geodetic: bool
-) -> PositionPriors:
-    """Return priors in Cartesian axes."""
-    cameras = sorted(found)
-    positions, covariances = (np.array([found[k][part] for k in cameras]) for part in (0, 1))
-    statement, datum = source, None
-    if geodetic:
-        datum = Datum(*np.median(positions, axis=0).tolist())
-        try:
-            positions = enu_of(positions, datum)
-        except ValueError as error:
-            raise InputError(f"{source}: {error}") from error
-        statement += f", in {datum.statement}"
-    return PositionPriors(
-        known=KnownPositions.measured(np.array(cameras, dtype=np.int64), positions, covariances),
-        statement=statement,
-        datum=datum,
+def _priors(table: PositionTable, images: Images, source: str) -> PositionPriors:
+    """Return the positions of the model's images, in Cartesian axes."""
+    index_of_name = {name: index for index, name in enumerate(images.names)}
+    table = in_meters(
+        table.part(np.array([name in index_of_name for name in table.names], dtype=np.bool_)), source
     )
+    if not table.names:
+        told = f" ({'; '.join(table.notes)})" if table.notes else ""
+        raise MissingPriorsError(
+            f"{source}: no position prior of the model's images, such as {images.names[0]}{told}; give a "
+            "table (priors=FILE)"
+        )
+    cameras = np.array([index_of_name[name] for name in table.names], dtype=np.int64)
+    order = np.argsort(cameras)
+    known = KnownPositions.measured(cameras[order], table.positions[order], table.covariances[order])
+    statement = f"{len(cameras)} positions of {source}"
+    if table.datum is not None:
+        statement += f", in {table.datum.statement}"
+    return PositionPriors(known=known, statement=statement, datum=table.datum, notes=table.notes)
