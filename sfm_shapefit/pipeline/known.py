@@ -13,7 +13,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.facts.control_points import ControlPoint, control_rows, control_warnings
 from sfm_shapefit.files.colmap.control_points import look_at_marks, read_control_points
 from sfm_shapefit.files.colmap.gravity import database_gravity, table_gravity
-from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, file_priors
+from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.gauge_choice import say_unused
 from sfm_shapefit.pipeline.seed import Seeded, turn_about_origin
@@ -72,7 +72,7 @@ def _read_priors(images: Images, file: DatabaseFile | None, asked: Path | str) -
         if file is None:
             raise InputError("there is no database whose priors could be taken; give one (database=FILE)")
         return database_priors(file, images)
-    return exif_priors(Path(asked), images) if Path(asked).is_dir() else file_priors(Path(asked), images)
+    return exif_priors(Path(asked), images) if Path(asked).is_dir() else table_priors(Path(asked), images)
 
 
 def _read_control(images: Images, file: str) -> ControlPoints:

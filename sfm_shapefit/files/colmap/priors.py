@@ -76,7 +76,7 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     return _priors(table, images, f"pose priors of {path}")
 
 
-def file_priors(path: Path, images: Images) -> PositionPriors:
+def table_priors(path: Path, images: Images) -> PositionPriors:
     """Read a table, see `position_table`, or COLMAP's pose-prior JSON; names that the model lacks are none.
 
     Raises:
@@ -145,6 +145,8 @@ def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> 
         notes.append(
             f"{np.sum(~has_altitude)} positions of {source} have no altitude; theirs is set to {level:g} m"
         )
+    elif len(positions) > 2 and np.ptp(positions[:, 2]) == 0.0:
+        notes.append(f"all altitudes of {source} are {positions[0, 2]:g} m, as where they are not measured")
     datum = datum or datum_of(positions)
     try:
         positions = enu_of(positions, datum)

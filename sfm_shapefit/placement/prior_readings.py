@@ -1,0 +1,60 @@
+"""Readings of position priors that fit far better, looked for where the priors fit the cameras roughly."""
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.scene.given import PositionPriors
+
+_FEWEST = 5  # priors; fewer fit almost any reading
+_BETTER = 3.0  # times; a reading that fits better by less may do so by chance
+_METERS_OF_DEGREE = 111_320.0  # of a great circle
+_POLE = 1e-9  # cosine of the latitude; a smaller one is that of a pole
+_FOOT = 0.3048  # meters
+
+
+def better_reading(source: FloatArray, priors: PositionPriors) -> str:
+    """Return how priors would fit the cameras `source` (k, 3) far better, a clause; empty if no way does.
+
+    Scenes are small beside Earth, so that each reading is a linear map of the priors about their median.
+    """
+    target = priors.known.positions - np.median(priors.known.positions, axis=0)
+    if len(target) < _FEWEST:
+        return ""
+    off = {said: _off(source, target @ reading.T) for said, reading in _readings(priors).items()}
+    best = min(off, key=off.__getitem__)
+    if _BETTER * off[best] >= _off(source, target):
+        return ""
+    return f"{best}, they are {100.0 * off[best]:.2g} % of it off: give them so"
+
+
+def _readings(priors: PositionPriors) -> dict[str, FloatArray]:
+    """Return what maps priors to what they are by other readings, (3, 3), by the words for these."""
+    mirror = np.diag([-1.0, 1.0, 1.0])
+    if priors.datum is None:
+        first, second = _METERS_OF_DEGREE * np.cos(
+            np.radians(np.median(priors.known.positions[:, :2], axis=0))
+        )
+        return {
+            "with two axes swapped, or the sign of one changed": mirror,
+            "as latitude and longitude in degrees": _horizontal([[0.0, first], [_METERS_OF_DEGREE, 0.0]]),
+            "as longitude and latitude in degrees": np.diag([second, _METERS_OF_DEGREE, 1.0]),
+        }
+    east, north = np.cos(np.radians([priors.datum.longitude_deg, priors.datum.latitude_deg]))
+    return {
+        "with latitude and longitude swapped": _horizontal([[0.0, east], [1.0 / max(north, _POLE), 0.0]]),
+        "with the sign of latitude or longitude changed (south and west are negative)": mirror,
+        "with altitudes in feet": np.diag([1.0, 1.0, _FOOT]),
+    }
+
+
+def _horizontal(rows: list[list[float]]) -> FloatArray:
+    """Return the map (3, 3) that keeps heights and maps the others by two rows."""
+    return np.block([[np.array(rows), np.zeros((2, 1))], [0.0, 0.0, 1.0]])
+
+
+def _off(source: FloatArray, target: FloatArray) -> float:
+    """Return how far targets are off a similarity of cameras, the median as a share of their spread."""
+    size = median_spread(target)
+    off = fit_similarity_l1(source, target, cap=0.5 * size).apply(source) - target
+    return float(np.median(np.linalg.norm(off, axis=1))) / size
