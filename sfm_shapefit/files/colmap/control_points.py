@@ -23,6 +23,7 @@ from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.lines import is_number, text_of
 from sfm_shapefit.scene.given import ControlPoints, MarkedViews
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 
 _LARGEST = 1e30  # units; squares of squares of larger coordinates overflow
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
@@ -65,10 +66,13 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
         raise InputError(f"{path}, line {lines[0][0]}: {error}") from error
     marks = [_parse(path, number, line) for number, line in lines[1:]]
     _refuse_contradictions(path, marks)
-    index_of_name = {name: index for index, name in enumerate(images.names)}
+    named = list(dict.fromkeys(mark.image for mark in marks))
+    found = same_images(named, images.names)
+    index_of_name = {name: k for name, k in zip(named, found.places.tolist(), strict=True) if k >= 0}
     used = [mark for mark in marks if mark.image in index_of_name]
     if not used:
-        raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}")
+        why = f" ({found.ambiguity})" if found.ambiguity else ""
+        raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}{why}")
     names = sorted({mark.point for mark in used})
     place = {name: k for k, name in enumerate(names)}
     used.sort(key=lambda mark: (place[mark.point], index_of_name[mark.image]))

@@ -79,8 +79,11 @@ def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
     Raises:
         ValueError: if a latitude or longitude is out of range.
     """
-    if (np.abs(geodetic[:, 0]) > 90.0).any() or (np.abs(geodetic[:, 1]) > 360.0).any():
-        raise ValueError("a latitude or longitude is out of range; give degrees")
+    latitudes, longitudes = np.abs(geodetic[:, :2]).T
+    if (latitudes > 90.0).any() or (longitudes > 360.0).any():
+        is_swapped = (latitudes <= 360.0).all() and (longitudes <= 90.0).all()
+        remedy = "are they swapped?" if is_swapped else "give degrees"
+        raise ValueError(f"a latitude or longitude is out of range; {remedy}")
     transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     return np.asarray(transform.ellipsoid_to_enu(np.ascontiguousarray(geodetic), *datum))
 

@@ -130,12 +130,22 @@ def read_position_table(path: Path) -> PositionTable:
         first = next(iter(lines), 0)
     if lines and sum(map(_is_value, lines[first])) < 2:
         return read_columns(path, lines.pop(first), lines, project)
-    comments = (line.strip() for line in text_of(path).splitlines() if line.lstrip().startswith("#"))
-    headers = (cells_of(comment.lstrip("# ")) for comment in comments)
-    if header := next((words for words in headers if _axes_of(list(map(_role_of, words)))), None):
+    if header := _commented_header(path, len(lines.get(first, ()))):
         return read_columns(path, header, lines, project)
-    columns = _Columns(_ODM if project else _PLAIN, _PLAIN[1:], "lat lon?")
-    return _read_rows(path, columns, {n: _with_whole_name(cells) for n, cells in lines.items()}, project)
+    if project is None:
+        lines = {number: _with_whole_name(cells) for number, cells in lines.items()}
+    return _read_rows(path, _Columns(_ODM if project else _PLAIN, _PLAIN[1:], "lat lon?"), lines, project)
+
+
+def _commented_header(path: Path, width: int) -> list[str]:
+    """Return the words of the comment that names the columns of a table, whose first line has so many."""
+    for line in text_of(path).splitlines():
+        if line.lstrip().startswith("#"):
+            words = cells_of(line.strip("# \t"))
+            roles = list(map(_role_of, words))
+            if _axes_of(roles) and (len(words) == width or ("name" in roles and "?" not in roles)):
+                return words
+    return []
 
 
 def read_columns(
@@ -159,7 +169,7 @@ def read_columns(
         )
     says_lengths = any(_LENGTHS & set(_words(header[roles.index(axis)])) for axis in axes[:2])
     system: System = "geodetic" if axes[0] == "lat" else "metric" if says_lengths else "lon lat?"
-    notes = (f"columns of {path} that are not known are not used: {first_of(unknown)}",) if unknown else ()
+    notes = (f"{path}: columns that are not known are not used: {first_of(unknown)}",) if unknown else ()
     return _read_rows(path, _Columns(roles, axes, system, notes), lines, project)
 
 
@@ -216,6 +226,7 @@ def _read_rows(
             roles += _SIGMAS.get(len(cells) - len(roles), ())
         cell_of = dict(reversed(list(zip(roles, cells, strict=False))))
         is_short = not {"name", *columns.axes[:2]} <= cell_of.keys()
+        is_short |= "?" in roles and len(cells) < len(roles)  # as of a header whose names have blanks
         if is_short or (columns.roles is _PLAIN and len(cells) != len(roles)):
             raise InputError(f"{where}expected {_FORM}")
         name = cell_of["name"]

@@ -26,6 +26,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.known_positions import KnownPositions
+from sfm_shapefit.scene.same_images import same_images
 
 _UNDEFINED, _WGS84, _CARTESIAN = -1, 0, 1  # coordinate system of a prior; the numbers are COLMAP's
 _SYSTEMS: dict[object, System] = {_WGS84: "geodetic", _CARTESIAN: "metric"}
@@ -56,24 +57,24 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     positions = np.array([_numbers(path, row.name, row.position, 3) for row in rows]).reshape(-1, 3)
     covariances = np.array([_numbers(path, row.name, row.covariance, 9) for row in rows]).reshape(-1, 3, 3)
     known = (np.abs(positions[:, :2]) <= LARGEST).all(axis=1)
-    known &= np.isin([row.name for row in rows], images.names)
+    known &= same_images([row.name for row in rows], images.names).places >= 0
     told = {row.system for row, is_known in zip(rows, known, strict=True) if is_known}
     systems = {_SYSTEMS[system] for system in told if system in _SYSTEMS}
     if len(systems) > 1:
         raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind (priors=FILE)")
     is_degrees = degrees_order(positions[known], "lat lon?") == (0, 1)
     system = systems.pop() if systems else "geodetic" if is_degrees else "metric"
-    notes = [f"{counted_are(count, 'pose prior')} of {path} not used: {why}" for why, count in unused.items()]
-    if undefined := sum(
-        row.system not in _SYSTEMS for row, is_known in zip(rows, known, strict=True) if is_known
-    ):
-        kind = "WGS84" if system == "geodetic" else "Cartesian"
+    notes = [
+        f"{path}: {counted_are(n, 'pose prior')} of {whose}, and not used" for whose, n in unused.items()
+    ]
+    undefined = sum(row.system not in _SYSTEMS for row, is_known in zip(rows, known, strict=True) if is_known)
+    if undefined:
         notes.append(
-            f"{counted(undefined, 'pose prior')} of {path} whose coordinate_system is UNDEFINED: taken for "
-            f"{kind}; set it to WGS84 or CARTESIAN"
+            f"{path}: {counted(undefined, 'pose prior')} with coordinate_system UNDEFINED taken for "
+            f"{'WGS84' if system == 'geodetic' else 'Cartesian'}; set it to WGS84 or CARTESIAN"
         )
     table = PositionTable(tuple(row.name for row in rows), positions, covariances, system, tuple(notes))
-    return _priors(table, images, f"pose priors of {path}")
+    return _priors(table, images, str(path), f"pose priors of {path}")
 
 
 def table_priors(path: Path, images: Images) -> PositionPriors:
@@ -106,7 +107,7 @@ def exif_priors(folder: Path, images: Images) -> PositionPriors:
                 found[name] = [np.nan if value is None else value for value in read]
     positions = np.array(list(found.values())).reshape(-1, 3)
     table = PositionTable(tuple(found), positions, np.full((len(found), 3, 3), np.nan), "geodetic")
-    return _priors(table, images, f"EXIF data of {folder}")
+    return _priors(table, images, str(folder), f"EXIF data of {len(found)} images of {folder}")
 
 
 def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> PositionTable:
@@ -120,39 +121,38 @@ def in_meters(table: PositionTable, source: str, datum: Datum | None = None) -> 
         table = table._replace(positions=table.positions[:, [*order, 2]], system="geodetic")
         names = " and ".join(("latitude", "longitude")[column] for column in order)
         notes.append(
-            f"{source} does not say so, but its numbers are {names} in degrees, and are taken for that; name "
+            f"{source}: by their values, and by no header, numbers are taken for {names} in degrees; name "
             "the columns lat, lon, alt, or x_m, y_m, z_m if they are lengths"
         )
     is_geodetic = table.system == "geodetic"
     there = np.abs(table.positions) <= LARGEST
     known: BoolArray = np.asarray(there[:, : 2 if is_geodetic else 3].all(axis=1))
-    if not known.all():
-        notes.append(f"{np.sum(~known)} of {len(known)} positions of {source} are missing or not finite")
-    has_altitude, table = there[known, 2], table.part(known)
-    if (
-        bad := np.isfinite(table.covariances).all(axis=(1, 2))
-        & ~(np.linalg.eigvalsh(np.nan_to_num(table.covariances))[:, 0] > 0.0)
-    ).any():
-        notes.append(
-            f"{counted(int(bad.sum()), 'covariance')} of {source} not positive definite, so not known"
-        )
-    positions = table.positions.copy()
-    if not is_geodetic or not len(positions):
-        return table._replace(system="metric", notes=tuple(notes))
-    if not has_altitude.all():
-        level = float(np.median(positions[has_altitude, 2])) if has_altitude.any() else 0.0
-        positions[~has_altitude, 2] = level
-        notes.append(
-            f"{np.sum(~has_altitude)} positions of {source} have no altitude; theirs is set to {level:g} m"
-        )
-    elif len(positions) > 2 and np.ptp(positions[:, 2]) == 0.0:
-        notes.append(f"all altitudes of {source} are {positions[0, 2]:g} m, as where they are not measured")
-    datum = datum or datum_of(positions)
-    try:
-        positions = enu_of(positions, datum)
-    except ValueError as error:
-        raise InputError(f"{source}: {error}") from error
-    return table._replace(positions=positions, system="metric", notes=tuple(notes), datum=datum)
+    if lost := int(np.sum(~known)):
+        notes.append(f"{source}: {counted_are(lost, 'position')} missing or not finite, of {len(known)}")
+    table = table.part(known)
+    stated = table.covariances[np.isfinite(table.covariances).all(axis=(1, 2))]
+    if bad := int(np.sum(np.linalg.eigvalsh(stated)[:, 0] <= 0.0)):
+        notes.append(f"{source}: {counted_are(bad, 'covariance')} not positive definite, and not used")
+    if is_geodetic and len(table.names):
+        table = table._replace(positions=_with_altitudes(table.positions, there[known, 2], source, notes))
+        datum = datum or datum_of(table.positions)
+        try:
+            table = table._replace(positions=enu_of(table.positions, datum), datum=datum)
+        except ValueError as error:
+            raise InputError(f"{source}: {error}") from error
+    return table._replace(system="metric", notes=tuple(notes))
+
+
+def _with_altitudes(geodetic: FloatArray, known: BoolArray, source: str, notes: list[str]) -> FloatArray:
+    """Return positions (k, 3) with all altitudes; which are known (k,), and notes for what is odd."""
+    filled = geodetic.copy()
+    if missing := int(np.sum(~known)):
+        level = float(np.median(geodetic[known, 2])) if known.any() else 0.0
+        filled[~known, 2] = level
+        notes.append(f"{source}: {counted_are(missing, 'position')} without altitude, taken for {level:g} m")
+    elif len(filled) > 2 and np.ptp(filled[:, 2]) == 0.0:
+        notes.append(f"{source}: all altitudes are {filled[0, 2]:g} m, as where they are not measured")
+    return filled
 
 
 def degrees_order(positions: FloatArray, system: System) -> tuple[int, int] | None:
@@ -161,19 +161,17 @@ def degrees_order(positions: FloatArray, system: System) -> tuple[int, int] | No
     They are degrees beyond doubt if both are in range, vary by thousandths of themselves, and altitudes vary
     by meters or not at all: as lengths, cameras would stand within millimeters, and far from the origin.
     """
-    if system not in _ORDERS or not len(positions):
+    known = positions[np.isfinite(positions[:, :2]).all(axis=1)]
+    if system not in _ORDERS or not len(known):
         return None
-    counted_on = np.column_stack([unwrapped(positions[:, 0]), unwrapped(positions[:, 1]), positions[:, 2]])
-    finite = counted_on[np.isfinite(counted_on[:, :2]).all(axis=1)]
-    if not len(finite):
-        return None
-    low, middle, high = np.nanpercentile(np.nan_to_num(finite), [10.0, 50.0, 90.0], axis=0)
+    turns = np.column_stack([unwrapped(known[:, 0]), unwrapped(known[:, 1]), np.nan_to_num(known[:, 2])])
+    low, middle, high = np.percentile(turns, [10.0, 50.0, 90.0], axis=0)
     spread, far = float(np.max(high[:2] - low[:2])), float(np.max(np.abs(middle[:2])))
     is_steep = not 0.0 < high[2] - low[2] < _STEEP * spread
     if not (0.0 < spread < _WIDEST_DEG and far > _FAR_FROM_ZERO * spread and is_steep):
         return None
     first = _ORDERS[system]
-    return next((o for o in (first, first[::-1]) if (np.abs(finite[:, o]) <= [90.0, 180.0]).all()), None)
+    return next((o for o in (first, first[::-1]) if (np.abs(known[:, o]) <= [90.0, 180.0]).all()), None)
 
 
 class _Row(NamedTuple):
@@ -201,8 +199,8 @@ def _rows_of_images(file: DatabaseFile, unused: dict[str, int]) -> Iterator[_Row
     }
     for *row, sensor in file.rows("pose_priors", queries):
         if sensor != _SENSOR_IS_CAMERA or row[0] is None:
-            why = "they are of images that are not there" if row[0] is None else "they are of other sensors"
-            unused[why] = unused.get(why, 0) + 1
+            whose = "images that are not there" if row[0] is None else "sensors that are no cameras"
+            unused[whose] = unused.get(whose, 0) + 1
         else:
             yield _Row(*row)
 
@@ -212,7 +210,7 @@ def _rows_of_old_images(file: DatabaseFile) -> Iterator[_Row]:
     columns = ("prior_tx", "prior_ty", "prior_tz")
     for name, *xyz in file.rows("images", {columns: f"SELECT name, {', '.join(columns)} FROM images"}):
         values = [float(value) if isinstance(value, int | float) else np.nan for value in xyz]
-        if any(values):
+        if np.nan_to_num(values).any():
             yield _Row(name, np.array(values, dtype="<f8").tobytes(), None, _UNDEFINED)
 
 
@@ -225,22 +223,30 @@ def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
     return np.frombuffer(blob, dtype="<f8").astype(np.float64)
 
 
-def _priors(table: PositionTable, images: Images, source: str) -> PositionPriors:
+def _priors(table: PositionTable, images: Images, source: str, statement: str = "") -> PositionPriors:
     """Return the positions of the model's images, in Cartesian axes."""
-    index_of_name = {name: index for index, name in enumerate(images.names)}
-    table = in_meters(
-        table.part(np.array([name in index_of_name for name in table.names], dtype=np.bool_)), source
-    )
+    places, ambiguity = same_images(table.names, images.names)
+    place_of = dict(zip(table.names, places.tolist(), strict=True))
+    table = in_meters(table.part(places >= 0), source)
     if not table.names:
-        told = f" ({'; '.join(table.notes)})" if table.notes else ""
+        why = "; ".join(filter(None, (ambiguity, *table.notes)))
         raise MissingPriorsError(
-            f"{source}: no position prior of the model's images, such as {images.names[0]}{told}; give a "
-            "table (priors=FILE)"
+            f"{source}: no position prior of the model's images, such as {images.names[0]}"
+            f"{f' ({why})' if why else ''}; give a table (priors=FILE)"
         )
-    cameras = np.array([index_of_name[name] for name in table.names], dtype=np.int64)
-    order = np.argsort(cameras)
-    known = KnownPositions.measured(cameras[order], table.positions[order], table.covariances[order])
-    statement = f"{len(cameras)} positions of {source}"
+    row_of = {place_of[name]: row for row, name in enumerate(table.names)}  # the last of an image counts
+    rows = [row_of[camera] for camera in sorted(row_of)]
+    cameras = np.array(sorted(row_of), dtype=np.int64)
+    statement = statement or f"{len(rows)} positions of {source}"
     if table.datum is not None:
         statement += f", in {table.datum.statement}"
-    return PositionPriors(known=known, statement=statement, datum=table.datum, notes=table.notes)
+    notes = [*table.notes, *([f"{source}: {ambiguity}"] if ambiguity else [])]
+    if len(rows) < len(table.names):
+        count = len(table.names) - len(rows)
+        notes.append(f"{source}: {counted_are(count, 'position')} not used, for their images have later ones")
+    return PositionPriors(
+        known=KnownPositions.measured(cameras, table.positions[rows], table.covariances[rows]),
+        statement=statement,
+        datum=table.datum,
+        notes=tuple(notes),
+    )
