@@ -8,9 +8,8 @@ from sfm_shapefit.scene.given import PositionPriors
 
 _FEWEST = 5  # priors; fewer fit almost any reading
 _BETTER = 3.0  # times; a reading that fits better by less may do so by chance
-_METERS_OF_DEGREE = 111_320.0  # of a great circle
+_FOOT = 0.3048  # meters; the foot since 1959
 _POLE = 1e-9  # cosine of the latitude; a smaller one is that of a pole
-_FOOT = 0.3048  # meters
 
 
 def better_reading(source: FloatArray, priors: PositionPriors) -> str:
@@ -32,25 +31,14 @@ def _readings(priors: PositionPriors) -> dict[str, FloatArray]:
     """Return what maps priors to what they are by other readings, (3, 3), by the words for these."""
     mirror = np.diag([-1.0, 1.0, 1.0])
     if priors.datum is None:
-        first, second = _METERS_OF_DEGREE * np.cos(
-            np.radians(np.median(priors.known.positions[:, :2], axis=0))
-        )
-        return {
-            "with two axes swapped, or the sign of one changed": mirror,
-            "as latitude and longitude in degrees": _horizontal([[0.0, first], [_METERS_OF_DEGREE, 0.0]]),
-            "as longitude and latitude in degrees": np.diag([second, _METERS_OF_DEGREE, 1.0]),
-        }
+        return {"with two axes swapped, or the sign of one changed": mirror}
     east, north = np.cos(np.radians([priors.datum.longitude_deg, priors.datum.latitude_deg]))
+    swapped = np.diag([east, 1.0 / max(north, _POLE), 1.0])[:, [1, 0, 2]]
     return {
-        "with latitude and longitude swapped": _horizontal([[0.0, east], [1.0 / max(north, _POLE), 0.0]]),
+        "with latitude and longitude swapped": swapped,
         "with the sign of latitude or longitude changed (south and west are negative)": mirror,
         "with altitudes in feet": np.diag([1.0, 1.0, _FOOT]),
     }
-
-
-def _horizontal(rows: list[list[float]]) -> FloatArray:
-    """Return the map (3, 3) that keeps heights and maps the others by two rows."""
-    return np.block([[np.array(rows), np.zeros((2, 1))], [0.0, 0.0, 1.0]])
 
 
 def _off(source: FloatArray, target: FloatArray) -> float:

@@ -4,20 +4,20 @@
      "schema": ["NAME", "LAT", "LON", "ALT", "STD_TX", "STD_TY", "STD_TZ"],
      "data": [["a.jpg", 47.3769, 8.5417, 500.0, 2.0, 2.0, 4.0]]}
 
-Source: https://github.com/colmap/colmap/pull/4537 (`PosePriorArchive`, July 2026). Of a Cartesian system
-"cartesian_frame": "ENU" says that `enu_origin` is its latitude, longitude and altitude.
+Source: https://github.com/colmap/colmap/pull/4537 (`PosePriorArchive`, July 2026). The origin of a Cartesian
+system is `enu_origin`, its latitude, longitude and altitude.
 """
 
 from pathlib import Path
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.files.colmap.position_table import PositionTable, System, read_columns
+from sfm_shapefit.files.colmap.position_table import PositionSystem, PositionTable, read_columns
 from sfm_shapefit.files.json_node import JsonNode, read_json
 from sfm_shapefit.scene.given import Datum
 
 _ONLY = {"sensor_type": "CAMERA", "translation_convention": "WORLD_FROM_CAM", "ellipsoid": "WGS84"}
 """What is read, by key; it is so where the file does not say."""
-_SYSTEMS: dict[str, System] = {"WGS84": "geodetic", "CARTESIAN": "metric"}
+_SYSTEMS: dict[str, PositionSystem] = {"WGS84": "geodetic", "CARTESIAN": "metric"}
 
 
 def read_pose_prior_json(path: Path) -> PositionTable:

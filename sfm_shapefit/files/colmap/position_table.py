@@ -11,6 +11,7 @@ Without a header a line is a name, three coordinates and none, one or three stan
 that names a projection it is that of geo.txt, https://docs.opendronemap.org/geo/.
 """
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -65,18 +66,10 @@ _DEGREES = re.compile(
     r"(?:([\d.]+) *(?:[\"″]|'') *)?)?([NSEW]?)",
     re.IGNORECASE,
 )
-_HEIGHT = re.compile(
-    r"([+-]?[\d.]+) *m(?:et(?:er|re)s?)?\.?(?: (above|below)(?: sea level)?)?", re.IGNORECASE
-)
-_NEGATIVE = {
-    "s",
-    "w",
-    "b",
-    "1",
-    "-",
-}  # first letters of south, west, below sea level, and EXIF's number of it
+_HEIGHT = re.compile(r"([+-]?[\d.]+) *m(?:et(?:er|re)s?)?\.?(?: (above|below)(?: sea level)?)?", re.I)
+_NEGATIVE = ("s", "w", "b", "1")  # begins of south, west, below sea level, and EXIF's number for that
 
-System = Literal["geodetic", "metric", "lat lon?", "lon lat?"]
+PositionSystem = Literal["geodetic", "metric", "lat lon?", "lon lat?"]
 """What positions are; where neither is said, the order in which they stand should they be degrees."""
 
 
@@ -88,7 +81,7 @@ class PositionTable(NamedTuple):
     """(k, 3) latitude, longitude in degrees and altitude, or x, y, z; NaN where there is none."""
     covariances: FloatArray
     """(k, 3, 3) in axes x, y, z, or east, north, up; NaN where they are not known."""
-    system: System
+    system: PositionSystem
     notes: tuple[str, ...] = ()
     """What was read otherwise than it stands, or not at all, a sentence each."""
     datum: Datum | None = None
@@ -107,7 +100,7 @@ class _Columns(NamedTuple):
     """By column: name, an axis as in `_AXES`, or the axes of a sigma, cov or ref; ? or empty for others."""
     axes: Sequence[str]
     """Roles of the coordinates, in the order of a position; that of altitudes may be missing."""
-    system: System
+    system: PositionSystem
     notes: tuple[str, ...] = ()
 
 
@@ -168,7 +161,7 @@ def read_columns(
             "name,x,y,z, with accuracies as sigma or sigma_x"
         )
     says_lengths = any(_LENGTHS & set(_words(header[roles.index(axis)])) for axis in axes[:2])
-    system: System = "geodetic" if axes[0] == "lat" else "metric" if says_lengths else "lon lat?"
+    system: PositionSystem = "geodetic" if axes[0] == "lat" else "metric" if says_lengths else "lon lat?"
     notes = (f"{path}: columns that are not known are not used: {first_of(unknown)}",) if unknown else ()
     return _read_rows(path, _Columns(roles, axes, system, notes), lines, project)
 
@@ -250,10 +243,11 @@ def _numbers(where: str, cell_of: Mapping[str, str], axes: Sequence[str]) -> tup
     except ValueError as error:
         raise InputError(f"{where}expected {_FORM}, but {error} is not a number") from error
     for axis in axes:
-        if cell_of.get(f"ref {axis}", "").strip().lower()[:1] in _NEGATIVE and cell_of.get(f"ref {axis}"):
+        if cell_of.get(f"ref {axis}", "").lower().startswith(_NEGATIVE):
             value_of[axis] = -abs(value_of[axis])
     sigmas = [value for role, value in value_of.items() if role.startswith("sigma")]
-    if max(map(abs, value_of.values())) > LARGEST or any(0.0 != s < 1.0 / LARGEST for s in sigmas):
+    is_large = any(abs(value) > LARGEST for value in value_of.values())
+    if is_large or any(sigma != 0.0 and sigma < 1.0 / LARGEST for sigma in sigmas):
         raise InputError(
             f"{where}coordinates must be finite and standard deviations positive, all below {LARGEST:g}"
         )
@@ -262,17 +256,15 @@ def _numbers(where: str, cell_of: Mapping[str, str], axes: Sequence[str]) -> tup
 
 
 def _covariance(value_of: Mapping[str, float]) -> FloatArray:
-    """Return the covariance (3, 3) by the roles of numbers; a sigma of 0 is not known."""
+    """Return the covariance (3, 3) by the roles of numbers."""
     covariance = np.full((3, 3), np.nan)
-    sigma_of = {
-        axis: value for role, value in value_of.items() if role.startswith("sigma ") for axis in role[6:]
-    }
-    if {"x", "y", "z"} <= sigma_of.keys() and 0.0 not in sigma_of.values():
+    sigmas = {role[6:]: value for role, value in value_of.items() if role.startswith("sigma ")}
+    sigma_of = {axis: value for axes, value in sigmas.items() for axis in axes}
+    if {"x", "y", "z"} <= sigma_of.keys():
         covariance = np.diag([sigma_of[axis] ** 2 for axis in "xyz"])
-    for role, value in value_of.items():
-        if role.startswith("cov "):
-            i, j = ("xyz".index(axis) for axis in role[4:])
-            covariance[[i, j], [j, i]] = value
+    for i, j in itertools.combinations_with_replacement(range(3), 2):
+        stated = value_of.get(f"cov {'xyz'[i]}{'xyz'[j]}", covariance[i, j])
+        covariance[[i, j], [j, i]] = stated
     return covariance
 
 

@@ -21,7 +21,12 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.wording import counted, counted_are
 from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of, unwrapped
 from sfm_shapefit.files.colmap.pose_prior_json import read_pose_prior_json
-from sfm_shapefit.files.colmap.position_table import LARGEST, PositionTable, System, read_position_table
+from sfm_shapefit.files.colmap.position_table import (
+    LARGEST,
+    PositionSystem,
+    PositionTable,
+    read_position_table,
+)
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.given import Datum, PositionPriors
 from sfm_shapefit.scene.images import Images
@@ -29,7 +34,7 @@ from sfm_shapefit.scene.known_positions import KnownPositions
 from sfm_shapefit.scene.same_images import same_images
 
 _UNDEFINED, _WGS84, _CARTESIAN = -1, 0, 1  # coordinate system of a prior; the numbers are COLMAP's
-_SYSTEMS: dict[object, System] = {_WGS84: "geodetic", _CARTESIAN: "metric"}
+_SYSTEMS: dict[object, PositionSystem] = {_WGS84: "geodetic", _CARTESIAN: "metric"}
 _SENSOR_IS_CAMERA = 0  # type of a sensor; COLMAP's number for cameras
 PRIORS_OF_IMAGES = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
 """What joins pose priors to their images, of databases whose priors may be of other sensors too."""
@@ -155,7 +160,7 @@ def _with_altitudes(geodetic: FloatArray, known: BoolArray, source: str, notes: 
     return filled
 
 
-def degrees_order(positions: FloatArray, system: System) -> tuple[int, int] | None:
+def degrees_order(positions: FloatArray, system: PositionSystem) -> tuple[int, int] | None:
     """Return the columns of latitude and longitude of positions (k, 3) whose system is not said, or None.
 
     They are degrees beyond doubt if both are in range, vary by thousandths of themselves, and altitudes vary
