@@ -139,6 +139,14 @@ def test_a_header_without_a_position_is_refused_by_its_words(ring, tmp_path, hea
         table_priors(write(tmp_path / "t.csv", ring, ring.centers, header), ring)
 
 
+def test_longitudes_that_are_no_latitudes_come_first_without_a_header(ring, tmp_path):
+    """As `exiftool -T -n -filename -gpslongitude -gpslatitude -gpsaltitude` prints them."""
+    table = write(tmp_path / "t.txt", ring, on_earth(ring, -33.8, 151.2)[:, LON_LAT], separator="\t")
+    priors = table_priors(table, ring)
+    assert_placed(priors, ring)
+    assert "taken for longitude and latitude" in priors.notes[0]
+
+
 def test_latitudes_out_of_range_may_be_longitudes(ring, tmp_path):
     swapped = on_earth(ring, -33.8, 151.2)[:, LON_LAT]
     with pytest.raises(InputError, match="out of range; are they swapped"):
@@ -159,7 +167,9 @@ def test_columns_that_are_not_known_and_rows_without_a_position_are_said(ring, t
 
 def test_lengths_stay_lengths(ring, tmp_path):
     """Neither small scenes far from the origin nor a header that says meters are taken for degrees."""
-    scenes = (10.0 * ring.centers, 0.01 * ring.centers + [47.0, 8.0, 400.0])
+    flat = 0.05 * ring.centers * [1.0, 1.0, 0.0]  # spread by .3; as degrees, by 30 km
+    away = np.array([47.0, 8.0, 400.0])
+    scenes = (10.0 * ring.centers, 0.01 * ring.centers + away, flat + away)
     for positions in scenes:
         priors = table_priors(write(tmp_path / "t.txt", ring, positions, separator=" "), ring)
         np.testing.assert_array_equal(priors.known.positions, positions)
@@ -290,7 +300,7 @@ def test_priors_of_no_system_are_taken_as_colmap_does_and_said(ring, tmp_path):
 def test_pose_priors_that_are_not_used_are_counted_with_their_reason(ring, tmp_path):
     geodetic = on_earth(ring)
     geodetic[:3, 2], geodetic[3, 0] = np.nan, np.inf
-    more = [(1, 1, [0, 0, 0], 0), (77, 0, [0, 0, 0], 0)]
+    more = [(1, 1, [0, 0, 0], 0), (77, 0, [0, 0, 0], 0)]  # of an IMU, and of no image
     priors = read_database(database(tmp_path / "a.db", ring, geodetic, 0, more), ring)
     told = " | ".join(priors.notes)
     assert priors.known.indices.tolist() == [0, 1, 2, 4, 5, 6, 7]

@@ -203,8 +203,10 @@ def _rows_of_images(file: DatabaseFile, unused: dict[str, int]) -> Iterator[_Row
         ("image_id", "position"): selected.format("NULL", _SENSOR_IS_CAMERA, by_image),
     }
     for *row, sensor in file.rows("pose_priors", queries):
-        if sensor != _SENSOR_IS_CAMERA or row[0] is None:
-            whose = "images that are not there" if row[0] is None else "sensors that are no cameras"
+        if sensor != _SENSOR_IS_CAMERA or not isinstance(row[0], str):
+            whose = (
+                "images that are not there" if sensor == _SENSOR_IS_CAMERA else "sensors that are no cameras"
+            )
             unused[whose] = unused.get(whose, 0) + 1
         else:
             yield _Row(*row)
@@ -215,7 +217,7 @@ def _rows_of_old_images(file: DatabaseFile) -> Iterator[_Row]:
     columns = ("prior_tx", "prior_ty", "prior_tz")
     for name, *xyz in file.rows("images", {columns: f"SELECT name, {', '.join(columns)} FROM images"}):
         values = [float(value) if isinstance(value, int | float) else np.nan for value in xyz]
-        if np.nan_to_num(values).any():
+        if isinstance(name, str) and np.nan_to_num(values).any():
             yield _Row(name, np.array(values, dtype="<f8").tobytes(), None, _UNDEFINED)
 
 
