@@ -7,6 +7,7 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.scene.given import PositionPriors
 
 _FEWEST = 5  # priors; fewer fit almost any reading
+_MOST = 500  # priors, about; more would not tell more
 _BETTER = 3.0  # times; a reading that fits better by less may do so by chance
 _FOOT = 0.3048  # meters; the foot since 1959
 _POLE = 1e-9  # cosine of the latitude; a smaller one is that of a pole
@@ -17,9 +18,11 @@ def better_reading(source: FloatArray, priors: PositionPriors) -> str:
 
     Scenes are small beside Earth, so that each reading is a linear map of the priors about their median.
     """
-    target = priors.known.positions - np.median(priors.known.positions, axis=0)
-    if len(target) < _FEWEST:
+    some = slice(None, None, max(1, len(source) // _MOST))
+    source, target = source[some], priors.known.positions[some]
+    if len(source) < _FEWEST:
         return ""
+    target = target - np.median(target, axis=0)
     off = {said: _off(source, target @ reading.T) for said, reading in _readings(priors).items()}
     best = min(off, key=off.__getitem__)
     if _BETTER * off[best] >= _off(source, target):
@@ -35,7 +38,7 @@ def _readings(priors: PositionPriors) -> dict[str, FloatArray]:
     east, north = np.cos(np.radians([priors.datum.longitude_deg, priors.datum.latitude_deg]))
     swapped = np.diag([east, 1.0 / max(north, _POLE), 1.0])[:, [1, 0, 2]]
     return {
-        "with latitude and longitude swapped": swapped,
+        **({"with latitude and longitude swapped": swapped} if east > 0.0 else {}),
         "with the sign of latitude or longitude changed (south and west are negative)": mirror,
         "with altitudes in feet": np.diag([1.0, 1.0, _FOOT]),
     }
