@@ -34,13 +34,13 @@ _SIGMAS: dict[int, Sequence[str]] = {1: ("sigma xyz",), 3: ("sigma x", "sigma y"
 _ODM = (*_PLAIN, "", "", "", "sigma xy", "sigma z")  # angles stand between
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_FUSED = re.compile(r"(?:std|sigma|acc|s)(t?[xyz]|[hv])|(t?[xyz])(?:std|sigma|acc)")
+_FUSED = re.compile(r"(?:std|sigma|acc|sd)(t?[xyz]|[hvneu])|s([xyz])|(t?[xyz])(?:std|sigma|acc)")
 _COVARIANCE = re.compile(r"cov_t?([xyz])([xyz])")
 _WORDS = {
-    "name": "name image imagename img file filename photo picture label source sourcefile camera",
+    "name": "name image imagename img file filename photo picture label source sourcefile path camera",
     "lat": "lat latitude",
     "lon": "lon lng long longitude",
-    "alt": "alt altitude height elevation elev hgt h v vert vertical",
+    "alt": "alt altitude height elevation elev ele hgt hae h v vert vertical",
     "x": "x tx easting east e",
     "y": "y ty northing north n",
     "z": "z tz up u",
@@ -51,7 +51,7 @@ _WORDS = {
     "abs absolute ellipsoid ellipsoidal deg degree degrees decimal m meter meters metre metres",
     "unused": "yaw pitch roll omega phi kappa heading bearing gimbal speed velocity track direction date "
     "time utc timestamp est error relative rlt rel agl takeoff salt dop hdop vdop pdop fix satellites q "
-    "quality make model serial iso exposure focal f width id index size status gx gy gz qw qx qy qz",
+    "quality make model serial iso exposure focal f width id index size status t k gx gy gz qw qx qy qz",
 }
 """Words of a column's name by what they say; `unused` ones are of what is no position of an image."""
 _KIND_OF = {word: kind for kind, words in _WORDS.items() for word in words.split()}
@@ -191,7 +191,7 @@ def _words(word: str) -> list[str]:
     found: list[str] = []
     for one in map(str.lower, _WORD.findall(word)):
         fused = _FUSED.fullmatch(one)
-        found += ["std", fused[1] or fused[2]] if fused else [one]
+        found += ["std", fused[fused.lastindex or 0]] if fused else [one.removeprefix("gps") or one]
     return found
 
 

@@ -63,23 +63,28 @@ def database_priors(file: DatabaseFile, images: Images) -> PositionPriors:
     covariances = np.array([_numbers(path, row.name, row.covariance, 9) for row in rows]).reshape(-1, 3, 3)
     known = (np.abs(positions[:, :2]) <= LARGEST).all(axis=1)
     known &= same_images([row.name for row in rows], images.names).places >= 0
-    told = {row.system for row, is_known in zip(rows, known, strict=True) if is_known}
+    told = [row.system for row, is_known in zip(rows, known, strict=True) if is_known]
+    system, notes = _system_of(path, told, positions[known])
+    notes += [
+        f"{path}: {counted_are(n, 'pose prior')} of {whose}, and not used" for whose, n in unused.items()
+    ]
+    table = PositionTable(tuple(row.name for row in rows), positions, covariances, system, tuple(notes))
+    return _priors(table, images, str(path), f"pose priors of {path}")
+
+
+def _system_of(path: Path, told: list[object], positions: FloatArray) -> tuple[PositionSystem, list[str]]:
+    """Return the system of positions (k, 3), by the numbers that are told of each, and what to note of it."""
     systems = {_SYSTEMS[system] for system in told if system in _SYSTEMS}
     if len(systems) > 1:
         raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind (priors=FILE)")
-    is_degrees = degrees_order(positions[known], "lat lon?") == (0, 1)
+    is_degrees = degrees_order(positions, "lat lon?") == (0, 1)
     system = systems.pop() if systems else "geodetic" if is_degrees else "metric"
-    notes = [
-        f"{path}: {counted_are(n, 'pose prior')} of {whose}, and not used" for whose, n in unused.items()
+    if not (undefined := sum(one not in _SYSTEMS for one in told)):
+        return system, []
+    return system, [
+        f"{path}: {counted(undefined, 'pose prior')} with coordinate_system UNDEFINED taken for "
+        f"{'WGS84' if system == 'geodetic' else 'Cartesian'}; set it to WGS84 or CARTESIAN"
     ]
-    undefined = sum(row.system not in _SYSTEMS for row, is_known in zip(rows, known, strict=True) if is_known)
-    if undefined:
-        notes.append(
-            f"{path}: {counted(undefined, 'pose prior')} with coordinate_system UNDEFINED taken for "
-            f"{'WGS84' if system == 'geodetic' else 'Cartesian'}; set it to WGS84 or CARTESIAN"
-        )
-    table = PositionTable(tuple(row.name for row in rows), positions, covariances, system, tuple(notes))
-    return _priors(table, images, str(path), f"pose priors of {path}")
 
 
 def table_priors(path: Path, images: Images) -> PositionPriors:
