@@ -306,11 +306,11 @@ def _prior_statement(
 def _prior_warning(level: float, reading: str, *, turns: bool, axes_known: bool) -> str:
     """Return why priors, which are off by `level` of their spread, may not be right; empty if they may."""
     off = f"the position priors are {level:.0%} of their spread off the answer"
+    if reading:
+        return f"{off}, and scale and axes taken from them no better; {reading}"
     if level > _ROUGH:
         rough = "are rough; check them" if level < _MEANINGLESS else "mean nothing: are they of this scene?"
-        return f"{off}, so scale and axes taken from them {rough}" + (f"; {reading}" if reading else "")
-    if reading:
-        return f"{off}; {reading}"
+        return f"{off}, so scale and axes taken from them {rough}"
     if not turns and not axes_known:
         return (
             "the position priors lie on a line or are fewer than three, so the model is turned onto that "
