@@ -36,7 +36,7 @@ PriorsFile = Annotated[
     typer.Option(
         "--priors",
         metavar="FILE|FOLDER|database",
-        help="Position priors of a file (name x y z [sigma], or name,lat,lon,alt with that header), of the "
+        help="Position priors of a file (name x y z [sigma], a table with a header, COLMAP's JSON), of the "
         "EXIF data of a folder of images, or of the database; standard deviations make them pull.",
     ),
 ]

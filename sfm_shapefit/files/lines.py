@@ -16,6 +16,7 @@ from sfm_shapefit.base.paths import refuse_irregular_file
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
 _MOST_BYTES = 8_000_000_000  # bytes of a text; the graph of a million cameras has one
+_SEPARATORS, _FEWEST_SEPARATORS = ";\t", 3  # a table of positions has three or more in a line
 UNIT_TOLERANCE = 1e-3
 """Largest error of the length of a quaternion or direction, or of R R^T; a few printed digits pass."""
 
@@ -75,15 +76,33 @@ def text_of(file: Path) -> str:
 
 
 def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells, between commas or white space, of each line that is no comment.
+    """Yield the number and the cells, as of `cells_of`, of each line that is no comment.
 
     Raises:
         InputError: as `text_of`.
     """
     for number, line in enumerate(text_of(file).splitlines(), start=1):
         if line.strip() and not line.lstrip().startswith("#"):
-            cells = next(csv.reader([line])) if "," in line else line.split()
-            yield number, [cell.strip() for cell in cells]
+            yield number, cells_of(line)
+
+
+def cells_of(line: str) -> list[str]:
+    """Return the cells of a line, perhaps quoted, between semicolons, tabs, commas or white space.
+
+    Three semicolons or tabs separate, for commas may be those of decimals then.
+    """
+    for separator in _SEPARATORS:
+        if line.count(separator) >= _FEWEST_SEPARATORS and f",{separator}" not in line:
+            return _split(line, separator)
+    return _split(line, ",") if "," in line else _split(" ".join(line.split()), " ")
+
+
+def _split(line: str, separator: str) -> list[str]:
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    except csv.Error:  # a cell longer than csv takes
+        cells = line.split(separator)
+    return [cell.strip() for cell in cells]
 
 
 def named_rows(

@@ -131,8 +131,9 @@ def _given(run: MapRun, images: Images, inputs: Inputs) -> Given:
 def _with_told(run: MapRun, given: Given, members: IntArray) -> Given:
     """Return what is known of a component's images with what the user told of them."""
     names, known = set(given.images.names), run.known.of(members)
-    if known.priors is not None and len(known.priors) < FEWEST_PRIORS:
-        known = replace(known, priors=None)
+    if known.priors is not None:  # without notes: the run says them once
+        priors = replace(known.priors, notes=()) if len(known.priors) >= FEWEST_PRIORS else None
+        known = replace(known, priors=priors)
     distances = tuple(one for one in run.options.gauge.known_distance if {*one[:2]} <= names)
     return given._replace(distances=distances, known=known)
 

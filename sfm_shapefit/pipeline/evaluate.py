@@ -6,13 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sfm_shapefit.base.atomic_folder import MARKER
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
 from sfm_shapefit.files.colmap.model import ModelSource
-from sfm_shapefit.files.colmap.priors import enu_of, read_position_table
+from sfm_shapefit.files.colmap.priors import in_meters, read_positions
 from sfm_shapefit.files.listed_names import named_as
 from sfm_shapefit.scene.evaluation import (
     Evaluation,
@@ -63,34 +61,30 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     Args:
         model: a model folder. Where its locate.json has a datum, latitudes and longitudes of the table become
             meters east, north and up of that, and are compared as they stand too.
-        table: `name x y z` or, with a line that names the columns, name, latitude, longitude, altitude; see
-            `files.colmap.priors.table_priors`.
+        table: `name x y z`, or columns of names and positions under a line that names them, see
+            `files.colmap.position_table`.
 
     Raises:
         InputError: if either cannot be read, or they have fewer than three cameras in common.
     """
-    posed, (rows, geodetic) = read_by_itself(Path(model)), read_position_table(Path(table))
-    positions = np.array([position for position, _ in rows.values()]).reshape(-1, 3)
-    datum, statement = None, "positions as they stand, as if both had the same axes and units"
-    if geodetic:
-        datum = datum_of(Path(model))
+    posed, read = read_by_itself(Path(model)), read_positions(Path(table))
+    datum = model_datum(Path(model))
+    known = in_meters(read, str(table), datum)
+    is_geodetic = known.datum is not None and read.datum is None
+    statement = "positions as they stand, as if both had the same axes and units"
+    if is_geodetic:
         statement = "meters east, north and up of the model's datum"
         if datum is None:
             statement = "meters; the model has no datum, so that only its shape is compared"
-        try:
-            positions = enu_of(positions, datum or Datum(*np.median(positions, axis=0).tolist()))
-        except ValueError as error:
-            raise InputError(f"{table}: {error}") from error
-    known = (list(rows), positions)
     return evaluate_positions(
         (posed.images.names, posed.images.centers),
-        known,
-        statement,
-        as_they_stand=datum is not None or not geodetic,
+        (known.names, known.positions),
+        "; ".join([statement, *known.notes]),
+        as_they_stand=datum is not None or not is_geodetic,
     )
 
 
-def datum_of(model: Any) -> Datum | None:
+def model_datum(model: Any) -> Datum | None:
     """Return the datum of a result, or that in locate.json beside a model; None without."""
     if not isinstance(model, Path | str):
         known = getattr(getattr(model, "facts", None), "datum", None)

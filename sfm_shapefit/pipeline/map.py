@@ -99,6 +99,7 @@ def map_opened(
         timings_s=clock.seconds,
         warnings=(
             *file.notes,
+            *(run.known.priors.notes if run.known.priors is not None else ()),
             *map_warnings(run.read.rigs.incomplete, models, left_out),
             *told,
             *lost_distances(run.options.gauge.known_distance, models, joined),

@@ -321,6 +321,8 @@ def _warnings(found: LocateResult, stand: Stand) -> Iterator[str]:
     yield from trust_warnings(found.placement, found.kept)
     yield from ambiguity_warnings(found.placement)
     yield from stand.failures
+    if rule.priors is not None:
+        yield from rule.priors.notes
     if stand.gauge.warning:
         yield stand.gauge.warning
     if stand.source.economy.statement:

@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity, nearest_rotations
 from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
 from sfm_shapefit.files.lines import is_number
-from sfm_shapefit.pipeline.evaluate import datum_of
+from sfm_shapefit.pipeline.evaluate import model_datum
 from sfm_shapefit.scene.given import Datum
 from sfm_shapefit.scene.images import Images
 
@@ -106,7 +106,7 @@ def world_of(source: Any, centers: FloatArray, crs: str, offset: str) -> World:
     """
     world = World()
     if crs:
-        datum = datum_of(source)
+        datum = model_datum(source)
         if datum is None:
             label = source if isinstance(source, Path | str) else "the model"
             raise InputError(

@@ -23,10 +23,12 @@ from sfm_shapefit.base.geometry import (
     median_spread,
     rotation_angles_deg,
 )
+from sfm_shapefit.placement.prior_readings import better_reading
 from sfm_shapefit.scene.given import Datum, PositionPriors
 
 _CAP_OF_SIZE = 0.5  # spreads of all input centers; one that is farther off is lost and must not set the scale
 _ROUGH = 0.1  # spreads; the scale is rough if the input's centers are off by more, in the median
+_DOUBTFUL = 0.01  # spreads; priors that are off by more are tried in other readings
 _MEANINGLESS = 0.5  # spreads; random positions are .6 off
 _COINCIDENT = 1e-9  # share of the distance from the origin; a smaller spread of centers is rounding
 ScaleKind = Literal["fixed", "rig", "control points", "distance", "prior", "input", "unit"]
@@ -228,12 +230,13 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bo
         raise UselessPriorsError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
+    reading = better_reading(source, priors) if level > _DOUBTFUL * size else ""
     return Gauge(
         similarity=_keep_axes(similarity.scale, similarity.rotation.T @ similarity.translation),
         scale="prior",
         axes=similarity.rotation if turns or not axes_known else None,
         statement=_prior_statement(priors, similarity, weights, level, turns=turns or not axes_known),
-        warning=_prior_warning(level, size, turns=turns, axes_known=axes_known),
+        warning=_prior_warning(level / size, reading, turns=turns, axes_known=axes_known),
         datum=priors.datum if turns else None,
     )
 
@@ -307,14 +310,13 @@ def _prior_statement(
     )
 
 
-def _prior_warning(level: float, size: float, *, turns: bool, axes_known: bool) -> str:
-    if level > _ROUGH * size:
-        rough = (
-            "are rough; check them"
-            if level < _MEANINGLESS * size
-            else "mean nothing: are they of this scene?"
-        )
-        off = f"the position priors are {level / size:.0%} of their spread off the answer"
+def _prior_warning(level: float, reading: str, *, turns: bool, axes_known: bool) -> str:
+    """Return why priors, which are off by `level` of their spread, may not be right; empty if they may."""
+    off = f"the position priors are {level:.0%} of their spread off the answer"
+    if reading:
+        return f"{off}, and scale and axes taken from them no better; {reading}"
+    if level > _ROUGH:
+        rough = "are rough; check them" if level < _MEANINGLESS else "mean nothing: are they of this scene?"
         return f"{off}, so scale and axes taken from them {rough}"
     if not turns and not axes_known:
         return (

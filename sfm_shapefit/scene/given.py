@@ -34,6 +34,8 @@ class PositionPriors:
     """Where they come from, and what their axes are."""
     datum: Datum | None = None
     """Where their origin is on Earth, if that is known."""
+    notes: tuple[str, ...] = ()
+    """What was read otherwise than it stands, or not at all, a sentence each."""
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""

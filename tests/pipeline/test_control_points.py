@@ -141,6 +141,16 @@ def test_coordinates_on_earth_become_east_north_and_up_of_their_median(ring, tmp
     np.testing.assert_allclose(apart, CORNERS - CORNERS[0], atol=1e-6)  # a nanometer of UTM's series
 
 
+def test_points_on_both_sides_of_longitude_180_are_near_their_datum(ring, tmp_path):
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    geodetic = np.asarray(transform.enu_to_ellipsoid(CORNERS, -16.8, 180.0, 5.0))
+    assert set(np.sign(geodetic[:, 1])) == {-1.0, 1.0}
+    lines = marks_of(ring, CORNERS, lambda _: geodetic[:, [1, 0, 2]])
+    known = read_control_points(tmp_path / written(tmp_path, lines, "EPSG:4326"), read_model(ring).images)
+    apart = known.positions - known.positions[0]
+    np.testing.assert_allclose(apart, CORNERS - CORNERS[0], atol=1e-6)
+
+
 def line(k, image="0001.jpg", name=None):
     x, y, z = CORNERS[k].tolist()
     return f"{x} {y} {z} 100 100 {image} {f'P{k}' if name is None else name}"

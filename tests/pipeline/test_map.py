@@ -7,6 +7,7 @@ from functools import partial
 from unittest.mock import Mock
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -101,6 +102,22 @@ def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_pat
             assert len(off) == 4
             assert np.abs(off).max() < 0.05
     assert scales == {True: "unit", False: "prior"}
+
+
+def test_what_is_noteworthy_of_priors_is_told_once_for_all_components(tmp_path):
+    truth = read_model(RING / "sparse" / "0").images
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    geodetic = np.asarray(transform.enu_to_ellipsoid(10.0 * truth.centers, 47.3, 8.5, 400.0))
+    table = write_priors(tmp_path / "priors.txt", by_name(truth, geodetic))  # no header says what it has
+    path = changed(RING, tmp_path, f"{PAIRS} {ACROSS}")
+    found = sfm_shapefit.map_database(path, priors=table, join="never", **FAST)
+    assert len(found.models) == 2
+    told = [*found.warnings, *(warning for model in found.models for warning in model.located.warnings)]
+    assert sum("taken for latitude and longitude in degrees" in warning for warning in told) == 1
+    for model in found.models:
+        assert model.located.gauge.datum is not None
+        errors = sfm_shapefit.evaluate(model.located.reconstruction, RING / "sparse" / "0")
+        assert errors.ref_from_model.scale == pytest.approx(0.1, rel=0.01)
 
 
 def test_priors_that_set_no_scale_of_one_component_do_not_refuse_the_others(tmp_path, monkeypatch):

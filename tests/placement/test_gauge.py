@@ -4,6 +4,7 @@ import json
 import re
 import sqlite3
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,7 @@ from sfm_shapefit import InputError, locate
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import Similarity, compose, invert, median_spread, normalized
 from sfm_shapefit.facts.warnings import prior_warnings
+from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.graph.measured import MeasuredGraph
@@ -236,6 +238,32 @@ def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_wa
     assert "mean nothing: are they of this scene?" in prior_gauge(cameras(7), made_priors(cameras(8))).warning
 
 
+TAKEN = np.random.default_rng(11).standard_normal((10, 3)) * [50.0, 40.0, 15.0]
+READINGS = {
+    "with latitude and longitude swapped": lambda lla: lla[:, [1, 0, 2]],
+    "with the sign of latitude or longitude changed": lambda lla: lla * [1, -1, 1],
+    "with altitudes in feet": lambda lla: lla / [1.0, 1.0, 0.3048],
+    "with two axes swapped, or the sign of one changed": None,
+    "": lambda lla: lla,
+}
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_a_reading_of_the_priors_that_fits_far_better_is_named(reading):
+    """Noise of 1 m in a scene of 50 m is no reason to name another one."""
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    noisy = TAKEN + np.random.default_rng(12).standard_normal(TAKEN.shape)
+    lla = np.asarray(transform.enu_to_ellipsoid(noisy, 40.0, -75.0, 100.0))
+    priors = made_priors(noisy[:, [1, 0, 2]])
+    if READINGS[reading] is not None:
+        read = READINGS[reading](lla)
+        datum = datum_of(read)
+        priors = replace(made_priors(enu_of(read, datum)), datum=datum)
+    warning = prior_gauge(TAKEN @ TURN.T, priors).warning
+    assert reading in warning
+    assert bool(reading) == ("give them so" in warning)
+
+
 @pytest.fixture(scope="module")
 def ring():
     return read_model(RING_MODEL).images
@@ -247,14 +275,6 @@ def write_table(path, model, positions, lines=(), sep=" "):
     ]
     path.write_text("\n".join([*lines, *rows]) + "\n")
     return path
-
-
-@pytest.mark.parametrize("header", ["name,lon,lat,alt", "name,lat,lon", "name,latitude,y,z"])
-def test_a_header_that_names_latitudes_elsewhere_is_refused(ring, tmp_path, header):
-    table = tmp_path / "gps.csv"
-    table.write_text(f"{header}\n{ring.names[0]},48.0,11.0,500\n")
-    with pytest.raises(InputError, match=f"the header {header} is not known; give name,lat,lon,alt"):
-        table_priors(table, ring)
 
 
 def test_a_database_given_for_a_table_of_priors_is_told_how_its_own_are_read(ring):
@@ -289,7 +309,7 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
     [
         ("0003.jpg 1 2", "line 2: expected a name"),
         ("0003.jpg 1 2 x", "line 2: expected a name"),
-        ("0003.jpg 1 2 nan", "line 2: coordinates must be finite"),
+        ("0003.jpg 1 2 inf", "line 2: coordinates must be finite"),
         ("0003.jpg 1 2 1e308", "line 2: coordinates must be finite .* below 1e"),
         ("0003.jpg 1 2 3 1e-200", "line 2: coordinates must be finite and standard deviations positive"),
         ("0003.jpg 1 2 3 -1", "line 2: coordinates must be finite and standard deviations positive"),
@@ -306,7 +326,7 @@ def test_a_malformed_line_of_a_table_is_named(ring, tmp_path, line, message):
 def test_priors_of_other_images_and_those_that_there_are_not_are_refused(ring, tmp_path):
     path = tmp_path / "priors.txt"
     path.write_text("other.jpg 1 2 3\n")
-    with pytest.raises(InputError, match="no prior of the model's images"):
+    with pytest.raises(InputError, match="no position prior of the model's images"):
         table_priors(path, ring)
     of_database = ("--priors", "database")
     assert "no position prior" in run_refused("locate", RING_MODEL, tmp_path / "out", *of_database)
@@ -548,7 +568,7 @@ def exif_segment(latitude, longitude, altitude):
 
 
 def test_positions_of_exif_data_are_priors(ring, tmp_path):
-    assert "no image of the model with a GPS position" in run_refused(
+    assert "no position prior of the model's images" in run_refused(
         "locate", RING_MODEL, tmp_path / "none", "--priors", tmp_path
     )
     pycolmap.Bitmap.from_array(np.zeros((8, 8, 3), np.uint8)).write(tmp_path / "black.jpg")

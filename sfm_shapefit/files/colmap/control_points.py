@@ -12,32 +12,22 @@ median. Nothing else is converted.
 Source: https://docs.opendronemap.org/gcp/ (the format; geographic coordinates are longitude, then latitude).
 """
 
-import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pycolmap
 
-from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import tangent_bases
+from sfm_shapefit.files.colmap.geodesy import datum_of, enu_of, projection_named
 from sfm_shapefit.files.colmap.lenses import rays_of
-from sfm_shapefit.files.colmap.priors import enu_of
 from sfm_shapefit.files.lines import is_number, text_of
-from sfm_shapefit.scene.given import ControlPoints, Datum, MarkedViews
+from sfm_shapefit.scene.given import ControlPoints, MarkedViews
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 
 _LARGEST = 1e30  # units; squares of squares of larger coordinates overflow
 _CHECK_PREFIX, _CHECK_WORD = "chk-", "check"
-_LOCAL = {"local", "enu"}
-_GEODETIC = re.compile(r"(epsg:4326|epsg:4979|wgs84|.*\+proj=(latlong|longlat)\b.*)")
-_UTM_WORDS = re.compile(r"wgs84 utm (?:zone )?(\d{1,2}) ?([ns])")
-_UTM_CODE = re.compile(r"epsg:32([67])(\d\d)")
-_UTM_STRING = re.compile(r".*\+proj=utm\b.*\+zone=(\d{1,2})\b.*")
-_EARTH_SHAPE, _UNITS = re.compile(r"\+(?:ellps|datum)=(\S+)"), re.compile(r"\+units=(\S+)")
-_ZONES = range(1, 61)
 _LINE = "x y z, two pixel coordinates, the name of an image, and perhaps that of the point"
 
 
@@ -71,19 +61,27 @@ def read_control_points(path: Path, images: Images) -> ControlPoints:
     ]
     if not lines:
         raise InputError(f"{path} is empty; its first line is the projection, then a line is {_LINE}")
-    convert = _projection(path, *lines[0])
+    try:
+        project = projection_named(lines[0][1])
+    except ValueError as error:
+        raise InputError(f"{path}, line {lines[0][0]}: {error}") from error
     marks = [_parse(path, number, line) for number, line in lines[1:]]
     _refuse_contradictions(path, marks)
-    index_of_name = {name: index for index, name in enumerate(images.names)}
+    named = list(dict.fromkeys(mark.image for mark in marks))
+    found = same_images(named, images.names)
+    index_of_name = {name: k for name, k in zip(named, found.places.tolist(), strict=True) if k >= 0}
     used = [mark for mark in marks if mark.image in index_of_name]
     if not used:
-        raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}")
+        why = f" ({found.ambiguity})" if found.ambiguity else ""
+        raise InputError(f"{path} has no mark in an image of the model, such as {images.names[0]}{why}")
     names = sorted({mark.point for mark in used})
     place = {name: k for k, name in enumerate(names)}
     used.sort(key=lambda mark: (place[mark.point], index_of_name[mark.image]))
     first = {mark.point: mark for mark in reversed(used)}
     try:
-        positions, datum = convert(np.array([first[name].position for name in names]))
+        positions, is_geodetic = project(np.array([first[name].position for name in names]))
+        datum = datum_of(positions) if is_geodetic else None
+        positions = positions if datum is None else enu_of(positions, datum)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     statement = f"{len(names)} points of {path}"
@@ -125,47 +123,6 @@ def look_at_marks(images: Images, known: ControlPoints) -> MarkedViews:
         images=of,
         on_plane=on_plane,
     )
-
-
-Converter = Callable[[FloatArray], tuple[FloatArray, Datum | None]]
-
-
-def _projection(path: Path, number: int, line: str) -> Converter:
-    """Return what turns coordinates of the projection that a line names into metric ones."""
-    named = " ".join(line.lower().replace("wgs 84", "wgs84").split())
-    if named in _LOCAL:
-        return lambda xyz: (xyz, None)
-    if _GEODETIC.fullmatch(named):
-        return lambda xyz: _from_geodetic(xyz[:, [1, 0, 2]])
-    zone, is_north = _zone(named)
-    if zone in _ZONES:
-        return lambda xyz: _from_geodetic(_from_utm(xyz, zone, is_north))
-    raise InputError(
-        f"{path}, line {number}: the projection {line.strip()!r} is not one that is converted; give "
-        "coordinates in EPSG:4326 (longitude, latitude, altitude), in a zone as WGS84 UTM 32N, or metric "
-        "ones after the line local"
-    )
-
-
-def _zone(named: str) -> tuple[int, bool]:
-    """Return the zone of UTM on WGS84 that a projection names, 0 if it is none, and whether it is north."""
-    if words := _UTM_WORDS.fullmatch(named):
-        return int(words[1]), words[2] == "n"
-    if code := _UTM_CODE.fullmatch(named):
-        return int(code[2]), code[1] == "6"
-    string = _UTM_STRING.fullmatch(named)
-    shapes = set(_EARTH_SHAPE.findall(named)) | set(_UNITS.findall(named))
-    return (int(string[1]), "+south" not in named) if string and shapes <= {"wgs84", "m"} else (0, True)
-
-
-def _from_geodetic(geodetic: FloatArray) -> tuple[FloatArray, Datum]:
-    datum = Datum(*np.median(geodetic, axis=0).tolist())
-    return enu_of(geodetic, datum), datum
-
-
-def _from_utm(xyz: FloatArray, zone: int, is_north: bool) -> FloatArray:
-    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    return np.asarray(transform.utm_to_ellipsoid(np.ascontiguousarray(xyz), zone, is_north))
 
 
 def _parse(path: Path, number: int, line: str) -> _Mark:
