@@ -15,8 +15,10 @@ import errno
 import fcntl
 import hashlib
 import os
+import secrets
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
@@ -161,6 +163,22 @@ def _remove(folder: Path) -> None:
     except KeyboardInterrupt:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+@contextmanager
+def private_folder() -> Iterator[Path]:
+    """Make a temporary folder as `locked_folder`; first, remove those that killed runs have left.
+
+    Raises InputError if there is no place for it.
+    """
+    with ExitStack() as stack:
+        try:
+            parent = Path(tempfile.gettempdir())
+            remove_abandoned(parent, ".shapefit-*.copy")
+            folder = stack.enter_context(locked_folder(parent / f".shapefit-{secrets.token_hex(8)}.copy"))
+        except OSError as error:
+            raise InputError(f"no temporary folder can be made ({error.strerror}); set TMPDIR") from None
+        yield folder
 
 
 def remove_abandoned(parent: Path, pattern: str) -> None:

@@ -11,6 +11,16 @@ def first_of(names: Sequence[str]) -> str:
     return f"{', '.join(names[:_NAMED])}{more}"
 
 
+def make_printable(text: str) -> str:
+    """Return text without control characters: names come from strangers, and may move the cursor.
+
+    Bytes of names that are no UTF-8, read as lone surrogates, are shown as \\xXX.
+    """
+    hidden = {c for c in text if not c.isprintable()}
+    shown = {c: f"\\x{ord(c) - 0xDC00:02x}" for c in hidden if "\udc80" <= c <= "\udcff"}
+    return text.translate({ord(c): shown.get(c, "\N{REPLACEMENT CHARACTER}") for c in hidden})
+
+
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, in the singular for one."""
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

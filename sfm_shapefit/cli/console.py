@@ -19,6 +19,7 @@ import typer
 
 from sfm_shapefit.base.display import Row, Telling
 from sfm_shapefit.base.errors import MissingExtraError, ShapeFitError, UnsolvableError
+from sfm_shapefit.base.wording import make_printable
 
 if TYPE_CHECKING:
     from sfm_shapefit.pipeline.clock import Progress
@@ -177,11 +178,6 @@ def in_flags(text: str) -> str:
         return flag if value == "True" else f"{flag} {value}"
 
     return re.sub(r"\b([a-z_]+)=([\w.]*\w)", typed, text)
-
-
-def make_printable(text: str) -> str:
-    """Return text without control characters: names come from strangers, and may move the cursor."""
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import typer
 from sfm_shapefit.cli.console import print_lines, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, OutputPath, Quiet, one_path
 from sfm_shapefit.cli.root import app
-from sfm_shapefit.pipeline.convert import FORMATS, convert
+from sfm_shapefit.pipeline.convert import FORMATS, write_converted
 
 _DESCRIBED = "; ".join(f"{name}: {one.help}" for name, one in FORMATS.items())
 
@@ -38,6 +38,22 @@ def convert_command(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing file; folders are never replaced.")
     ] = False,
+    crs: Annotated[
+        str,
+        typer.Option(
+            "--crs",
+            help="Coordinates on Earth, of a model that knows its latitude and longitude: utm, EPSG:326ZZ or "
+            "EPSG:327ZZ (zone ZZ of UTM), or EPSG:4978.",
+        ),
+    ] = "",
+    offset: Annotated[
+        str,
+        typer.Option(
+            "--offset",
+            metavar="X,Y,Z|auto",
+            help="Subtract this from all coordinates, and write it to *_offset.xyz.",
+        ),
+    ] = "",
     quiet: Quiet = False,
 ) -> None:
     """Write MODEL, COLMAP's or OpenSfM's, in another format."""
@@ -46,6 +62,8 @@ def convert_command(
     if target_format is not None and target_format not in FORMATS:
         raise typer.BadParameter(f"--format must be one of {', '.join(FORMATS)}, got {target_format!r}")
     with report_errors(target):
-        written = convert(source, target, target_format=target_format, overwrite=overwrite)
+        written = write_converted(source, target, target_format, overwrite, (crs, offset))
         if not quiet:
-            print_lines([f"written to {target} ({written})"])
+            beside = f", {', '.join(map(str, written.files[1:]))}" if written.files[1:] else ""
+            told = "; ".join(filter(None, [written.format, written.statement]))
+            print_lines([f"written to {target}{beside} ({told})"])

@@ -28,7 +28,7 @@ Database = Annotated[
     typer.Option(
         "--database",
         "--database_path",
-        help="COLMAP database; by default database.db in the model folder, its parent or grandparent.",
+        help="COLMAP database; by default database.db or colmap.db in the model folder or up to two above.",
     ),
 ]
 PriorsFile = Annotated[

@@ -214,6 +214,8 @@ class LocateResult(_Placed):
     suspicions: tuple[str, ...] = ()
     """What speaks against the model beside its own evidence: steps that failed, and what those who gave the
     rotations saw."""
+    recognized: str = ""
+    """What the input seems to be instead of what it was read as, if it is that."""
     join: JoinFacts | None = None
     """What came of joining it to a larger model of `map`."""
     elsewhere: BoolArray | None = None
@@ -303,7 +305,7 @@ class LocateResult(_Placed):
         names = [self.images.names[camera] for camera in outside]
         against = weigh_evidence(self.evidence, self.placed)
         suspicions = (*repeats, *self._off_priors(), *self.suspicions)
-        return judge_model(self.placement, shares, names, suspicions, against)
+        return judge_model(self.placement, shares, names, suspicions, against).led_by(self.recognized)
 
     def _off_priors(self) -> Iterator[str]:
         """Yield that many position priors contradict the cameras: a few are wrong, many may be right."""

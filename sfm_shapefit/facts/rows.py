@@ -1,14 +1,19 @@
 """One row per camera and one per pair of a placed graph."""
 
+import csv
+import io
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.paths import refuse_irregular_file
 from sfm_shapefit.facts.placed import folder_of
 from sfm_shapefit.facts.tables import CameraRow, PairRow
 from sfm_shapefit.graph.rigidity import left_out_reasons
@@ -122,6 +127,30 @@ def covariance_of(row: CameraRow) -> FloatArray:
     found = np.zeros((max(d, 3), max(d, 3)))
     found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
     return found[:3, :3]
+
+
+def covariances_text(covariances: Mapping[str, FloatArray]) -> str:
+    """Return covariances (3, 3) of centers, by the names of cameras, as a CSV; numbers round-trip."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["name", *(first + second for first in "xyz" for second in "xyz")])
+    writer.writerows([name, *covariance.ravel().tolist()] for name, covariance in covariances.items())
+    return stream.getvalue()
+
+
+def read_covariances(path: Path) -> dict[str, FloatArray]:
+    """Return the covariances (3, 3) in a covariances.csv, by the names of cameras.
+
+    Raises:
+        InputError: if the file cannot be read.
+    """
+    refuse_irregular_file(path)
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = [*csv.reader(stream)][1:]
+        return {name: np.array(cells, dtype=np.float64).reshape(3, 3) for name, *cells in rows}
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"{path} is missing or damaged ({error}); run locate or map again") from error
 
 
 def correlations_of(covariances: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 import csv
 import re
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,19 +52,26 @@ def refuse_database(path: Path) -> None:
 def text_of(file: Path) -> str:
     """Return what an ordinary text file holds, without the byte order mark that editors of Windows put first.
 
+    Bytes that are no UTF-8, of names in other encodings, become lone surrogates as Python's own do.
+
     Raises:
-        InputError: if it is none, is missing, cannot be read, or is no UTF-8.
+        InputError: if it is none, is missing, cannot be read, or is binary.
     """
     refuse_irregular_file(file)
     refuse_database(file)
     if _is_huge(file):
         raise InputError(f"{file} has more than {_MOST_BYTES / 1e9:g} GB; is it the right file?")
     try:
-        return file.read_text(encoding="utf-8-sig")
+        with suppress(UnicodeDecodeError):
+            return file.read_text(encoding="utf-8-sig")
+        text = file.read_text(encoding="utf-8-sig", errors="surrogateescape")
     except FileNotFoundError:
         raise InputError(f"{file} does not exist") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a readable text file ({error})") from error
+    if "\0" in text:
+        raise InputError(f"{file} is not a readable text file (it holds bytes that no text has)")
+    return text
 
 
 def lines_of_cells(file: Path) -> Iterator[tuple[int, list[str]]]:

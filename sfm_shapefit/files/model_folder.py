@@ -6,7 +6,8 @@ from pathlib import Path
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import refuse_database
 
-REQUIRED_FILES = ("cameras", "images", "points3D")
+REQUIRED_FILES = ("cameras", "images")
+"""Files without which there are no poses; one of points3D is part of a model all the same."""
 
 
 def refuse_no_model(path: Path | None) -> None:
@@ -38,9 +39,10 @@ def model_suffix(folder: Path) -> str:
     except OSError as error:
         raise InputError(f"the model folder {folder} cannot be read: {error.strerror}") from None
 
-    for suffix in (".bin", ".txt"):
-        if all(name + suffix in present for name in REQUIRED_FILES):
-            return suffix
+    for names in ((*REQUIRED_FILES, "points3D"), REQUIRED_FILES):
+        for suffix in (".bin", ".txt"):
+            if all(name + suffix in present for name in names):
+                return suffix
     raise InputError(_missing_files_message(folder, present))
 
 

@@ -166,8 +166,8 @@ def _model_that_has(kind: str, family: str, distortion: dict[str, float], *, are
     return ""
 
 
-def nerf_text(images: Images) -> str:
-    """Return posed images as the text of a transforms.json.
+def nerf_text(images: Images, points_file: str = "") -> str:
+    """Return posed images as the text of a transforms.json, with the name of the file of their points.
 
     Raises:
         InputError: if a camera model has no equivalent there.
@@ -183,7 +183,11 @@ def nerf_text(images: Images) -> str:
     for name, lens, matrix in zip(images.names, images.lens_of.tolist(), matrices, strict=True):
         own = {} if shared and not images.lenses[0].is_panorama else intrinsics[lens]
         frames.append({"file_path": f"images/{name}", **own, "transform_matrix": (matrix + 0.0).tolist()})
-    return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    points = {"ply_file_path": points_file} if points_file else {}
+    return (
+        json.dumps({**shared, **points, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False)
+        + "\n"
+    )
 
 
 def _intrinsics(lens: Lens) -> dict[str, Any]:

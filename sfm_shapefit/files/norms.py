@@ -9,16 +9,14 @@ from sfm_shapefit.files.lines import UNIT_TOLERANCE
 _MOST_NORM = 1.5  # largest norm of a rotation, and the inverse of the smallest; what is beyond is none
 
 
-def may_be_rotation(norm: float) -> bool:
-    """Return whether a quaternion of this norm may be a rotation."""
-    return 1.0 / _MOST_NORM <= norm <= _MOST_NORM
+def may_be_rotations(norms: FloatArray) -> BoolArray:
+    """Return which quaternions of these norms may be rotations, (n,)."""
+    return np.asarray((norms >= 1.0 / _MOST_NORM) & (norms <= _MOST_NORM))
 
 
 def are_off(norms: FloatArray) -> BoolArray:
     """Return which quaternions are rotations, but not of length 1 to rounding, (n,)."""
-    return np.asarray(
-        (np.abs(norms - 1.0) > UNIT_TOLERANCE) & [may_be_rotation(norm) for norm in norms.tolist()]
-    )
+    return np.asarray(may_be_rotations(norms) & (np.abs(norms - 1.0) > UNIT_TOLERANCE))
 
 
 def say_normalized(norms: FloatArray) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import lines_of_cells
 from sfm_shapefit.scene.matches import PairNames
+from sfm_shapefit.scene.same_images import names_among
 
 _HEADER = ["name1", "name2"]
 
@@ -25,16 +26,18 @@ def read_pair_list(path: Path, known: Collection[str]) -> PairNames:
         InputError: if the file cannot be read, lists no pair, or a line is malformed or names no image; it
             is named by its number.
     """
-    names, pairs = frozenset(known), set()
-    for number, cells in lines_of_cells(path):
+    lines, pairs = list(lines_of_cells(path)), set()
+    named, ambiguity = names_among({name for _, cells in lines for name in cells[:2]}, sorted(known))
+    for number, cells in lines:
         if cells[:2] == _HEADER:
             continue
         if len(cells) < 2:
             raise InputError(f"{path}, line {number}: expected the names of two images")
-        unknown = [name for name in cells[:2] if name not in names]
+        unknown = [name for name in cells[:2] if name not in named]
         if unknown:
-            raise InputError(f"{path}, line {number}: there is no image {unknown[0]!r}")
-        first, second = sorted(cells[:2])
+            why = f"; {ambiguity}" if ambiguity else ""
+            raise InputError(f"{path}, line {number}: there is no image {unknown[0]!r}{why}")
+        first, second = sorted(named[name] for name in cells[:2])
         if first == second:
             raise InputError(f"{path}, line {number}: {first} makes no pair with itself")
         pairs.add((first, second))

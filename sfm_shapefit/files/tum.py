@@ -23,7 +23,7 @@ from sfm_shapefit.base.arrays import FloatArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.quaternions import matrices_of
 from sfm_shapefit.files.lines import is_number, text_of
-from sfm_shapefit.files.norms import may_be_rotation, say_normalized
+from sfm_shapefit.files.norms import may_be_rotations, say_normalized
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.listed_poses import ListedPoses
 
@@ -43,7 +43,7 @@ def read_tum(file: Path) -> ListedPoses:
     Raises:
         InputError: if a line is none of a trajectory.
     """
-    columns, names, numbers, norms = _COLUMNS, list[str](), list[FloatArray](), list[float]()
+    columns, names, poses = _COLUMNS, list[str](), list[FloatArray]()
     for number, line in enumerate(text_of(file).splitlines(), start=1):
         if not names and (header := _columns_of(line.strip().lstrip("#"))):
             columns = header
@@ -51,21 +51,16 @@ def read_tum(file: Path) -> ListedPoses:
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
             continue
-        wanted = [words[k] for k in (0, *columns) if k < len(words) and is_number(words[k])]
-        values = np.array([float(word) for word in wanted[1:]])
-        is_pose = len(wanted) == 1 + len(columns) and len(words) != _KITTI
-        if not (
-            is_pose
-            and np.isfinite([float(wanted[0]), *values]).all()
-            and may_be_rotation(float(np.linalg.norm(values[3:])))
-        ):
+        cells = [words[k] if k < len(words) else "" for k in (0, *columns)]
+        values = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+        norm = np.linalg.norm(values[None, 4:], axis=1)
+        if len(words) == _KITTI or not (np.isfinite(values).all() and may_be_rotations(norm).all()):
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
         names.append(f"{Decimal(words[0]):f}")
-        numbers.append(values)
-        norms.append(float(np.linalg.norm(values[3:])))
-    rows = np.array(numbers).reshape(-1, 7)
+        poses.append(values[1:])
+    rows = np.array(poses).reshape(-1, 7)
     turns = matrices_of(rows[:, 3:])
-    note = say_normalized(np.array(norms))
+    note = say_normalized(np.linalg.norm(rows[:, 3:], axis=1))
     return ListedPoses(
         names=tuple(names),
         rotations=turns.swapaxes(1, 2),

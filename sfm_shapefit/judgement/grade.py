@@ -34,6 +34,7 @@ do not make a model bad.
 
 import enum
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -83,6 +84,13 @@ class ModelVerdict(Record):
     def doubts_database(self) -> bool:
         """Whether the matches are those of other images, as it seems."""
         return any(reason.endswith(IS_ITS_DATABASE) for reason in self.reasons)
+
+    def led_by(self, reason: str) -> "ModelVerdict":
+        """Return the verdict with a first reason, which explains others, if it is not empty."""
+        if not reason:
+            return self
+        grade = Grade.LOOK if self.grade is Grade.GOOD else self.grade
+        return replace(self, grade=grade, reasons=(reason, *self.reasons))
 
     def _sentence(self) -> str:
         if self.grade is Grade.GOOD:

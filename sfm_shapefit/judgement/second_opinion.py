@@ -21,6 +21,7 @@ from sfm_shapefit.base.geometry import fit_similarity_l1, mean_rotation_l1, medi
 from sfm_shapefit.judgement.evidence import PairFits, SecondOpinion
 from sfm_shapefit.judgement.limits import FEWEST_ALIKE, NEAR_DEG, OUTNUMBERED, SMALLEST_SHAPE, SURE_SIGMAS
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 
 _FAR = np.radians(NEAR_DEG)  # spreads; what is nearer needs no judge, and six times as far a camera is lost
 _ROUNDING = 1e-7  # spreads and radians; usual differences of the same model are smaller
@@ -35,11 +36,11 @@ def compare_models(
     Fits are those of the pairs of matches in either model. `doubted` (k,) are the others that may stand
     elsewhere by their own matches.
     """
-    row_of = {name: k for k, name in enumerate(others.names) if others.is_posed[k]}
-    mine = np.array([k for k, name in enumerate(images.names) if name in row_of], dtype=np.int64)
+    places = same_images(images.names, others.names).places
+    mine = np.flatnonzero((places >= 0) & others.is_posed[places])
     if len(mine) <= SMALLEST_SHAPE:
         return None  # one of three that is off takes the similarity along
-    theirs = np.array([row_of[images.names[k]] for k in mine.tolist()])
+    theirs = places[mine]
     spread = median_spread(images.centers[mine])
     if not spread > 0.0:
         return None

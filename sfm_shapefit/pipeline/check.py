@@ -17,6 +17,8 @@ from sfm_shapefit.pipeline.checked import CheckResult, OtherModel, check_source
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source
 from sfm_shapefit.pipeline.map import map_opened
+from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 from sfm_shapefit.solver.options import SolverOptions
 
 
@@ -61,10 +63,13 @@ def _map_anew(
             found = map_opened(file, MapOptions(), clock)
         except UnsolvableError:
             return None
-    names = set(posed.images.names)
     models = [model.located for model in found.models]
-    best = max(models, key=lambda one: len(names.intersection(one.placed.names)))
+    best = max(models, key=lambda one: _num_common(posed.images, one.placed))
     doubted = np.zeros(best.placed.num_images, dtype=np.bool_)
     doubted[best.placement.cameras] = best.placement.assessment.ambiguous
     doubted[[place.camera for place in best.evidence.places]] = True
     return best.placed, fit_pairs(best.placed.centers, best.directions), doubted
+
+
+def _num_common(images: Images, others: Images) -> int:
+    return int(np.sum(same_images(images.names, others.names).places >= 0))

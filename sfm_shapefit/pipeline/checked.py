@@ -36,10 +36,12 @@ from sfm_shapefit.files.colmap.points import ModelPictures, points2d_of, points_
 from sfm_shapefit.judgement.evidence import ModelEvidence, PairFits, SecondOpinion, fit_pairs
 from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade, ModelVerdict, weigh_evidence
 from sfm_shapefit.judgement.image_quality import ImageQuality, image_quality
+from sfm_shapefit.judgement.resolutions import recognize_resolution
 from sfm_shapefit.judgement.second_opinion import compare_models
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.pairs.options import DirectionOptions
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.conventions import ask_convention
 from sfm_shapefit.pipeline.evidence import Structure, ask_pixels, gather_evidence
 from sfm_shapefit.pipeline.inputs import MatchSource
 from sfm_shapefit.pipeline.measure import measure
@@ -118,6 +120,10 @@ def check_source(
         if fits is not None and second is not None:
             evidence = evidence.beside(second, fits.sides[1])
     verdict = _grade(model, cameras, fits, evidence, len(matches.matches.missing_names))
+    recognized = recognize_resolution(*structure[:3])
+    if verdict.is_bad and recognized is None:
+        recognized = ask_convention(matches, clock.threads)
+    verdict = verdict.led_by(recognized.sentence if recognized else "")
     told = tell_evidence(evidence, model.images)
     facts = _tell(model, matches, cameras, pairs, quality)
     facts |= {"verdict": verdict, "residual_level_deg": level_deg, "timings_s": clock.seconds}

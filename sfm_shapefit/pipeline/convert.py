@@ -1,21 +1,25 @@
 """`convert`: a model of any format that is read, written in any format that is written.
 
-Only COLMAP's formats hold all points; a mesh shows as many as `report.html` does, and an output's cameras in
-the colors of their trust. A new format is a line of `FORMATS`, and the file of the function that it names.
+COLMAP's formats and .ply hold all points, .glb as many as `report.html` shows; meshes have an output's
+cameras in the colors of their trust. A new format is a line of `FORMATS`, and the file of the function that
+it names.
 """
 
 import os
 import secrets
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sfm_shapefit.base.atomic_folder import MARKER, atomic_folder
 from sfm_shapefit.base.errors import InputError
 
 if TYPE_CHECKING:
-    from sfm_shapefit.files.colmap.model import ModelSource
-    from sfm_shapefit.report.drawing import Drawing
+    from sfm_shapefit.files.colmap.model import ColmapModel, ModelSource
+    from sfm_shapefit.pipeline.world import World
+
+_POINTS = "_points.ply"  # behind the stem of a transforms.json
 
 
 class ExportFormat(NamedTuple):
@@ -27,16 +31,23 @@ class ExportFormat(NamedTuple):
     """Suffixes of files that have this format where none is named."""
     text_of: str = ""
     """Function that makes the text of a file from the posed images, as module:function of `files`."""
+    is_exact: bool = False
+    """Whether places go to another system of coordinates each for itself, not as one model; see `World`."""
 
 
 FORMATS = {
     "colmap": ExportFormat("a folder", ("",)),
     "colmap-txt": ExportFormat("a folder of text files"),
     "nerf": ExportFormat("transforms.json of nerfstudio and instant-ngp", (".json",), "nerf:nerf_text"),
-    "tum": ExportFormat("a trajectory for evo and SLAM tools", (".tum", ".txt"), "tum:tum_text"),
-    "csv": ExportFormat("name, center and rotation of each camera", (".csv",), "tum:poses_csv"),
+    "tum": ExportFormat(
+        "a trajectory for evo and SLAM tools", (".tum", ".txt"), "tum:tum_text", is_exact=True
+    ),
+    "csv": ExportFormat(
+        "name, center and rotation of each camera", (".csv",), "tum:poses_csv", is_exact=True
+    ),
     "glb": ExportFormat("a mesh of cameras and points for 3D viewers", (".glb",)),
-    "ply": ExportFormat("the same in the model's own axes", (".ply",)),
+    "ply": ExportFormat("all points, and cameras in a second file", (".ply",), is_exact=True),
+    "covariances": ExportFormat("CSV of the centers' 3 x 3 covariances in an output", is_exact=True),
 }
 
 
@@ -46,51 +57,171 @@ def convert(
     *,
     target_format: str | None = None,
     overwrite: bool = False,
+    crs: str = "",
+    offset: str = "",
 ) -> str:
     """Write the posed images of a model in another format.
 
     Args:
         source: a COLMAP folder, which may be an output, a reconstruction, a result, OpenSfM's
             reconstruction.json, or a list of poses: transforms.json, a trajectory.
-        target: the file, or for COLMAP's formats the folder, to be made.
+        target: the file, or for COLMAP's formats the folder, to be made. Beside a .ply with the points stands
+            one with the cameras, *_cameras.ply; beside a transforms.json one with the points, *_points.ply.
         target_format: one of `FORMATS`; by the suffix of `target` if None.
         overwrite: replace an existing file; folders are never replaced.
+        crs: system of coordinates on Earth, "utm" or a code of `files.colmap.earth`; empty: the model's own.
+        offset: three numbers with commas that are subtracted from all coordinates, or "auto"; they stand in
+            *_offset.xyz beside the file, in offset.xyz in a folder.
 
     Returns:
         The format that was written.
 
     Raises:
-        InputError: if the source cannot be read, the format cannot hold it, or the target exists already.
+        InputError: if the source cannot be read, the format cannot hold it, the target exists already, or
+            the model cannot be brought to the system.
     """
-    # Here, so that the command line knows the formats without loading pycolmap.
-    from sfm_shapefit.files.colmap.listed_poses import is_list, read_by_itself
-    from sfm_shapefit.files.colmap.model import model_of, read_model
-    from sfm_shapefit.files.colmap.seed import write_model
+    return write_converted(source, Path(target), target_format, overwrite, (crs, offset)).format
 
-    path = Path(target)
+
+class Converted(NamedTuple):
+    """What was written."""
+
+    format: str
+    files: tuple[Path, ...]
+    """The file or folder, and files beside it."""
+    statement: str
+    """System and offset of the coordinates, and what they lack; empty for the model's own."""
+
+
+def write_converted(
+    source: "ModelSource",
+    path: Path,
+    target_format: str | None,
+    overwrite: bool,
+    coordinates: tuple[str, str],
+) -> Converted:
+    """Write a model in another format, in a system and with an offset; `convert` raises the same."""
+    # Here, so that the command line knows the formats without loading pycolmap.
+    from sfm_shapefit.files.colmap.listed_poses import read_by_itself
+    from sfm_shapefit.files.colmap.model import model_of, read_model
+    from sfm_shapefit.files.colmap.seed import transform_model
+    from sfm_shapefit.pipeline.world import world_of
+    from sfm_shapefit.pipeline.write import refuse_file
+
     name = target_format or _format_of(path)
     if name not in FORMATS:
         raise InputError(f"{name!r} is no format to write; give one of {', '.join(FORMATS)}")
-    source = model_of(source)
-    protect = [source] if isinstance(source, Path | str) else []
-    if is_list(source):
-        source = read_by_itself(source, with_lenses=name not in {"tum", "csv"}).reconstruction
-    if name in {"glb", "ply"}:
-        from sfm_shapefit.report.mesh import mesh_bytes
+    given, source = source, model_of(source)
+    trust = _trust_of(source) if name in {"glb", "ply"} else {}
+    model = read_by_itself(source, with_lenses=name not in {"tum", "csv"})
+    notes = model.notes
+    centers = model.images.centers
+    world = world_of(given, centers, *coordinates)
+    told = world.statement
+    if not (world.is_own or FORMATS[name].is_exact):
+        model = read_model(transform_model(model.reconstruction, world.similarity(centers)))
+        told += world.bend_statement(centers)
+    told = "; ".join(filter(None, [told, *notes]))
+    if name in {"colmap", "colmap-txt"}:
+        _write_folder(model, path, name, world, [given] if isinstance(given, Path | str) else [])
+        return Converted(name, (path,), told)
+    contents = _contents(name, _Scene(source, model, world, trust, path.stem))
+    files = {
+        path.with_name(path.stem + (tail if "." in tail else tail + path.suffix)): one
+        for tail, one in contents.items()
+    }
+    if world.offset_line:
+        files[path.with_name(f"{path.stem}_offset.xyz")] = world.offset_line
+    for file in files:  # before the first is written
+        refuse_file(file, overwrite=overwrite)
+    for file, content in files.items():
+        _write_file(content, file, overwrite=overwrite)
+    return Converted(name, tuple(files), told)
 
-        _write_file(mesh_bytes(_drawing_of(source), name), path, overwrite=overwrite)
-        return name
-    model = read_model(source)
-    if FORMATS[name].text_of:
-        module, _, function = FORMATS[name].text_of.partition(":")
-        text: str = getattr(import_module(f"sfm_shapefit.files.{module}"), function)(model.images)
-        _write_file(text.encode(errors="surrogateescape"), path, overwrite=overwrite)
-        return name
+
+class _Scene(NamedTuple):
+    """What is written of a model."""
+
+    source: "ModelSource"
+    model: "ColmapModel"
+    world: "World"
+    trust: Mapping[str, float]
+    """By the names of images."""
+    stem: str
+    """Name of the target without its suffix."""
+
+
+def _contents(name: str, scene: _Scene) -> dict[str, bytes]:
+    """Return the content of each file, by what its name has behind the target's stem: also another suffix."""
+    images, world = scene.model.images, scene.world
+    if name == "nerf" and scene.model.reconstruction.num_points3D():
+        return _with_points(scene)
+    if name == "ply":
+        return _points_and_cameras(scene)
+    if name == "glb":
+        from sfm_shapefit.report.mesh import glb_bytes
+        from sfm_shapefit.report.results import draw_model
+
+        return {"": glb_bytes(draw_model(scene.model, scene.trust))}
+    if name == "covariances":
+        return {"": _covariances(scene).encode()}
+    module, _, function = FORMATS[name].text_of.partition(":")
+    text_of = getattr(import_module(f"sfm_shapefit.files.{module}"), function)
+    text: str = text_of(world.poses(images) if FORMATS[name].is_exact else images)
+    return {"": text.encode(errors="backslashreplace")}
+
+
+def _points_and_cameras(scene: _Scene) -> dict[str, bytes]:
+    """Return all points of a model as a PLY, as COLMAP writes them, and its cameras as pyramids."""
+    from sfm_shapefit.files.colmap.seed import pick_points
+    from sfm_shapefit.report.mesh import camera_mesh, ply_bytes
+    from sfm_shapefit.report.results import draw_model
+
+    reconstruction, world = scene.model.reconstruction, scene.world
+    points = pick_points(reconstruction, reconstruction.num_points3D())
+    vertices, faces, colors = camera_mesh(draw_model(scene.model, scene.trust))
+    how: Any = {"comment": world.statement, "fine": not world.is_own}
+    return {
+        "": ply_bytes(world.places(points.xyz), points.colors, **how),
+        "_cameras": ply_bytes(world.places(vertices), colors, faces, **how),
+    }
+
+
+def _with_points(scene: _Scene) -> dict[str, bytes]:
+    """Return a transforms.json and the points that it names."""
+    from sfm_shapefit.files.colmap.seed import pick_points
+    from sfm_shapefit.files.nerf import nerf_text
+    from sfm_shapefit.report.mesh import ply_bytes
+
+    points = pick_points(scene.model.reconstruction, scene.model.reconstruction.num_points3D())
+    text = nerf_text(scene.model.images, f"{scene.stem}{_POINTS}")
+    return {"": text.encode(errors="backslashreplace"), _POINTS: ply_bytes(points.xyz, points.colors)}
+
+
+def _covariances(scene: _Scene) -> str:
+    """Return the covariances of an output as a table."""
+    from sfm_shapefit.facts.rows import covariances_text, read_covariances
+
+    if not isinstance(scene.source, Path | str):
+        raise InputError("covariances are those of the folder that locate or map wrote; give that")
+    images = scene.model.images
+    found = read_covariances(Path(scene.source) / "covariances.csv")
+    slopes = dict(zip(images.names, scene.world.slopes(images.centers), strict=True))
+    return covariances_text({k: slopes[k] @ one @ slopes[k].T for k, one in found.items() if k in slopes})
+
+
+def _write_folder(
+    model: "ColmapModel", path: Path, name: str, world: "World", protect: Sequence[Path | str]
+) -> None:
+    """Write a model as COLMAP has it, and the offset of its coordinates beside it."""
+    from sfm_shapefit.files.colmap.seed import write_model
+
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path} is a folder with files, which is never replaced; choose another name")
     with atomic_folder(path, protect=protect) as folder:
         write_model(model.reconstruction, folder, text=name == "colmap-txt")
-    return name
+        if world.offset_line:
+            (folder / "offset.xyz").write_bytes(world.offset_line)
 
 
 def _format_of(path: Path) -> str:
@@ -100,17 +231,15 @@ def _format_of(path: Path) -> str:
     raise InputError(f"{path} has no known suffix; give the format: {', '.join(FORMATS)}")
 
 
-def _drawing_of(source: "ModelSource") -> "Drawing":
-    """Return what a mesh shows of a model: of an output with the trust of its cameras."""
+def _trust_of(source: "ModelSource") -> dict[str, float]:
+    """Return the trust of an output's cameras, by name; nothing of other models."""
     from sfm_shapefit.facts.tables import read_trust
-    from sfm_shapefit.files.colmap.model import read_model
-    from sfm_shapefit.report.results import draw_model
 
     if not isinstance(source, Path | str) or not (Path(source) / MARKER).is_file():
-        return draw_model(read_model(source), {})
+        return {}
     if not any((Path(source) / f"images{suffix}").exists() for suffix in (".bin", ".txt")):
         raise InputError(f"{source} is of a bare graph and has no model; its report.html has the scene")
-    return draw_model(read_model(source), read_trust(Path(source) / "cameras.csv"))
+    return read_trust(Path(source) / "cameras.csv")
 
 
 def _write_file(content: bytes, path: Path, *, overwrite: bool) -> None:

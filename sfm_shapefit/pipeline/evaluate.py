@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     positions = np.array([position for position, _ in rows.values()]).reshape(-1, 3)
     datum, statement = None, "positions as they stand, as if both had the same axes and units"
     if geodetic:
-        datum = _datum_of(Path(model))
+        datum = datum_of(Path(model))
         statement = "meters east, north and up of the model's datum"
         if datum is None:
             statement = "meters; the model has no datum, so that only its shape is compared"
@@ -88,13 +89,16 @@ def evaluate_against_table(model: Path | str, table: Path | str) -> PositionEval
     )
 
 
-def _datum_of(model: Path) -> Datum | None:
-    """Return the datum that stands in locate.json beside a model, if any."""
-    if not (model / MARKER).is_file():
+def datum_of(model: Any) -> Datum | None:
+    """Return the datum of a result, or that in locate.json beside a model; None without."""
+    if not isinstance(model, Path | str):
+        known = getattr(getattr(model, "facts", None), "datum", None)
+        return known and Datum(known.latitude_deg, known.longitude_deg, known.altitude_m)
+    file = Path(model) / MARKER
+    if not file.is_file():
         return None
     try:
-        facts = json.loads((model / MARKER).read_text(encoding="utf-8"))
-        found = facts.get("datum")
+        found = json.loads(file.read_text(encoding="utf-8")).get("datum")
         return None if found is None else Datum(**found)
     except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{model / MARKER} cannot be read; run locate again, or remove it") from error
+        raise InputError(f"{file} cannot be read; run locate again, or remove it") from error

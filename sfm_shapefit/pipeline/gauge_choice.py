@@ -1,6 +1,7 @@
 """Which scale, origin and axes the output gets: as asked, or by what is known."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -20,9 +21,10 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
-from sfm_shapefit.placement.options import KnownDistance, Scale
+from sfm_shapefit.placement.options import GaugeOptions, KnownDistance, Scale
 from sfm_shapefit.scene.given import PositionPriors
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import names_among
 
 SETS_SCALE: dict[ScaleKind, str] = {
     "fixed": "the fixed cameras",
@@ -36,11 +38,18 @@ SETS_SCALE: dict[ScaleKind, str] = {
 """What a scale is that of, in words."""
 
 
-def refuse_unknown_names(known: Sequence[KnownDistance], names: Collection[str], missing: str) -> None:
-    """Refuse known distances of images that there are not; `missing` says so, but for the name."""
-    for name in (name for one in known for name in one[:2]):
-        if name not in names:
-            raise InputError(f"known distances: {missing} {name}")
+def between_images(gauge: GaugeOptions, names: Sequence[str], missing: str) -> GaugeOptions:
+    """Return options whose known distances are between images of some names.
+
+    Raises:
+        InputError: if one is of an image that there is not; `missing` says so, but for its name.
+    """
+    named, ambiguity = names_among((name for one in gauge.known_distance for name in one[:2]), names)
+    for name in (name for one in gauge.known_distance for name in one[:2]):
+        if name not in named:
+            raise InputError(f"known distances: {missing} {name}{ambiguity and f'; {ambiguity}'}")
+    known = tuple((named[first], named[second], length) for first, second, length in gauge.known_distance)
+    return replace(gauge, known_distance=known)
 
 
 class GaugeRule(NamedTuple):

@@ -12,6 +12,7 @@ from sfm_shapefit.files.colmap.model import ModelSource
 from sfm_shapefit.files.graph_text import read_graph
 from sfm_shapefit.pairs.pair_directions import DirectionStatus
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.conventions import naming_convention
 from sfm_shapefit.pipeline.doubts import confirm_rotations
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.pipeline.measure import Wanted, add_evidence, build_graph, count_work, measure, wants_points
@@ -68,7 +69,7 @@ def inspect(
             wanted = Wanted(tracks=wants_points(matches, options.nodes))
             measured = measure(matches, options.directions, clock, wanted)
             directions = measured.directions
-        with clock("diagnosis"):
+        with clock("diagnosis"), naming_convention(matches, clock.threads):
             with_points = add_evidence(build_graph(images, measured, options.nodes), measured)
             grouped = find_rigid_parts(images).apply(with_points)
             work = describe_work(grouped, count_work(matches, directions, options), options.placement)

@@ -21,9 +21,10 @@ from sfm_shapefit.base.settings import flat_values, merge_options
 from sfm_shapefit.facts.joins import Joined
 from sfm_shapefit.facts.map_result import JoinedModel
 from sfm_shapefit.facts.options import JoinOptions
+from sfm_shapefit.facts.result import Inputs
 from sfm_shapefit.files.colmap.database import open_database
 from sfm_shapefit.files.colmap.merge import merge_models
-from sfm_shapefit.files.colmap.model import read_model
+from sfm_shapefit.files.colmap.model import read_model, renamed_as
 from sfm_shapefit.pipeline.adjust import bundle_adjust
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_source, read_left_out
@@ -55,8 +56,8 @@ def join(
         models: two or more model folders or reconstructions, of any program in COLMAP's form; none is
             changed. The world is that of the first.
         database: the COLMAP database with the matches between their images. Without it, `database.db` is
-            looked for beside the first model, as for `locate`; failing that, images that two models share
-            tie them.
+            looked for beside the first model, as for `locate`; failing that, or if it lacks images of the
+            others, images that two models share tie them.
         options: settings, see `help(JoinOptions)`; defaults if None.
         progress: called as stages advance.
         **overrides: single options by name.
@@ -72,17 +73,18 @@ def join(
     clock = Clock.of(progress, SolverOptions())
     with clock("read"):
         pieces = _read(models)
-        inputs = choose_inputs(models[0], database)
-        if inputs.database is None:
-            inputs = replace(inputs, statement="images that the models share")
         names = sorted({name for piece in pieces for name in piece.model.images.names})
+        shares = len(names) < sum(piece.model.images.num_images for piece in pieces)
+        inputs = choose_inputs(models[0], database)
+        if inputs.database is None or (shares and database is None):
+            inputs = _without_foreign(inputs, names)
         inputs = read_left_out(inputs, names, options.directions.without)
     with ExitStack() as stack:
         with clock("ties"):
             matches = None
             if inputs.database is not None:
                 matches = stack.enter_context(_opened(pieces, inputs.database, names))
-            elif len(names) == sum(piece.model.images.num_images for piece in pieces):
+            elif not shares:
                 raise InputError(
                     "the models share no image, and there is no database with matches between them; give "
                     "one with --database"
@@ -110,7 +112,8 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
     pieces: list[ModelPiece] = []
     for number, source in enumerate(models):
         label = str(source) if isinstance(source, Path | str) else f"model {number}"
-        piece = ModelPiece(label=label, model=read_model(source))
+        names = dict.fromkeys(name for piece in pieces for name in piece.model.images.names)
+        piece = ModelPiece(label=label, model=renamed_as(read_model(source), list(names)))
         for earlier in pieces:
             if {*piece.model.images.names} <= {*earlier.model.images.names}:
                 raise InputError(
@@ -125,6 +128,19 @@ def _read(models: "Sequence[pycolmap.Reconstruction | Path | str]") -> list[Mode
             f"{pieces[rigs.index(False)].label} has none; give both the same rigs"
         )
     return [replace(piece, scale_sigma=0.0) for piece in pieces] if any(rigs) else pieces
+
+
+def _without_foreign(inputs: Inputs, names: Sequence[str]) -> Inputs:
+    """Return the inputs without a database that was only found, and is that of the first model alone."""
+    shared, path = "images that the models share", inputs.database
+    if path is None:
+        return replace(inputs, statement=shared)
+    with closing(open_database(path, names)) as matches:
+        missing = len(matches.missing_names)
+    if not missing:
+        return inputs
+    told = f"{shared}; {path}, found beside the first, lacks {missing} of {len(names)} images"
+    return replace(inputs, database=None, statement=told)
 
 
 def _opened(pieces: Sequence[ModelPiece], database: Path, names: Sequence[str]) -> Any:

@@ -27,6 +27,7 @@ from sfm_shapefit.facts.result import Inputs, LocateResult
 from sfm_shapefit.facts.rows import correlations_of, covariance_of
 from sfm_shapefit.facts.scene import told_distances
 from sfm_shapefit.facts.tables import CameraRow
+from sfm_shapefit.files.colmap.images import name_of
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.seed import transform_model
 from sfm_shapefit.judgement.grade import Grade, ModelVerdict
@@ -132,7 +133,7 @@ def _choose_scale(
     one of the models or between two.
     """
     number = next(iter(group.world_from))
-    placed = {image.name: image for image in group.reconstruction.images.values() if image.has_pose}
+    placed = {name_of(image): image for image in group.reconstruction.images.values() if image.has_pose}
     there = [one for one in known if {*one[:2]} <= placed.keys()]
     warning = ""
     if first.scale in _ARBITRARY and there:

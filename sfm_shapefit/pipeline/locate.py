@@ -23,7 +23,8 @@ from sfm_shapefit.files.colmap.template import template_of
 from sfm_shapefit.pipeline.acting import act
 from sfm_shapefit.pipeline.adjustment import pull_of_rotations
 from sfm_shapefit.pipeline.clock import Clock, Progress
-from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
+from sfm_shapefit.pipeline.conventions import naming_convention, tell_convention
+from sfm_shapefit.pipeline.gauge_choice import between_images
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import choose_inputs, open_matches, read_left_out, see_matches
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
@@ -58,8 +59,9 @@ def locate(
         reconstruction: a pycolmap.Reconstruction, a result or a model folder; or the file of a list of poses,
             transforms.json or a trajectory, of images of the database. Nothing of it is changed, and its
             camera centers never place a camera.
-        database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
-            the model's folder, its parent and its grandparent; failing that the model's tracks serve.
+        database: the COLMAP database with the inlier matches. Without it, `database.db` or `colmap.db` is
+            looked for in the model's folder, its parent and its grandparent; failing that the model's tracks
+            serve.
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
@@ -88,7 +90,8 @@ def locate(
             given = model.images
             inputs = choose_inputs(reconstruction, database, options.source.directions)
             inputs = read_left_out(inputs, given.names, options.directions.without)
-            refuse_unknown_names(options.gauge.known_distance, given.names, "the model has no posed image")
+            gauge = between_images(options.gauge, given.names, "the model has no posed image")
+            options = replace(options, gauge=gauge)
             if options.freedom.rigs == "free" and not given.has_rigs:
                 raise InputError("the model has no rig of several cameras to refine; leave out rigs=free")
             matches = stack.enter_context(closing(open_matches(model, inputs)))
@@ -122,5 +125,6 @@ def locate(
                 notes = (*notes, _NOT_CORRECTED)
             else:
                 place = partial(settle_rough, options=options, clock=clock, sigma_rad=sigma_rad)
-        found = act(place, told, source, options)
+        with naming_convention(source, clock.threads):
+            found = tell_convention(act(place, told, source, options), source, clock.threads)
         return replace(found, warnings=(*notes, *source.matches.notes, *found.warnings))

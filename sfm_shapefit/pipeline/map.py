@@ -101,7 +101,7 @@ def map_opened(
             *file.notes,
             *map_warnings(run.read.rigs.incomplete, models, left_out),
             *told,
-            *lost_distances(options.gauge.known_distance, models, joined),
+            *lost_distances(run.options.gauge.known_distance, models, joined),
         ),
     )
     return tell_joins(result)

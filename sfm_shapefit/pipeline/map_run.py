@@ -21,7 +21,7 @@ from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pairs.triplets import score_triplets
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.components import ComponentAveraging, PairScores
-from sfm_shapefit.pipeline.gauge_choice import refuse_unknown_names
+from sfm_shapefit.pipeline.gauge_choice import between_images
 from sfm_shapefit.pipeline.inputs import inputs_from, read_left_out
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
 from sfm_shapefit.pipeline.known import read_known
@@ -46,11 +46,11 @@ def start_run(file: DatabaseFile, options: MapOptions, clock: Clock, priors: Pat
             raise InputError(f"{path} has no rig of several cameras to refine; leave out rigs=free")
         inputs = read_left_out(inputs_from(path), images.names, options.directions.without)
         images, intrinsics = settle_intrinsics(images, file, options.freedom.intrinsics, inputs.left_out)
-        refuse_unknown_names(options.gauge.known_distance, images.names, "the database has no image")
+        gauge = between_images(options.gauge, images.names, "the database has no image")
         known = read_known(images, file, priors, options.gauge.control_points, options.averaging.gravity)
         matches = DatabaseMatches(file, images.names)
     return MapRun(
-        options=options,
+        options=replace(options, gauge=gauge),
         clock=clock,
         matches=matches,
         read=read,

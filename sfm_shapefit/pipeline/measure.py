@@ -111,6 +111,7 @@ def measure(
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
+            f"{source.matches.lacking and f' ({source.matches.lacking})'}"
         )
     directions, asked = concatenate(parts), beside.joiner is None and wanted.tracks == "auto"
     if asked and not _is_held_by_pairs(view_graph(source.images, directions)):

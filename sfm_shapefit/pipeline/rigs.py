@@ -28,6 +28,7 @@ from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement.place import Near, Placement, place_pieces
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 from sfm_shapefit.solver.tied import largest_tied
 from sfm_shapefit.tracks.options import NodeOptions
 
@@ -207,17 +208,15 @@ def _solved_images(model: ColmapModel) -> BoolArray:
 
 def _named_images(model: ColmapModel, path: Path) -> BoolArray:
     """Return which images (n,) a file names, one a line."""
-    index = {name: k for k, name in enumerate(model.images.names)}
     fixed = np.zeros(model.images.num_images, dtype=np.bool_)
-    for number, line in enumerate(text_of(path).splitlines(), start=1):
-        name = line.strip()
-        if not name or name.startswith("#"):
-            continue
-        if name not in index:
-            raise InputError(
-                f"{path}, line {number}: the model has no posed image {name!r}; give one name per line"
-            )
-        fixed[index[name]] = True
+    lines = [(n, line.strip()) for n, line in enumerate(text_of(path).splitlines(), start=1)]
+    listed = [(number, name) for number, name in lines if name and not name.startswith("#")]
+    places, ambiguity = same_images([name for _, name in listed], model.images.names)
+    for (number, name), place in zip(listed, places.tolist(), strict=True):
+        if place < 0:
+            why = ambiguity or "give one name per line"
+            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}; {why}")
+        fixed[place] = True
     if not fixed.any():
         raise InputError(f"{path} names no image; give the name of one image per line")
     return fixed

@@ -5,9 +5,12 @@ bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `
 that were joined stand in `joined_0` in one world too.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sfm_shapefit.base.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.base.display import Reported, Writers, write_by
@@ -17,7 +20,7 @@ from sfm_shapefit.base.settings import Settings, explained, merge_options, optio
 from sfm_shapefit.facts.map_result import JoinedModel, MapResult
 from sfm_shapefit.facts.placed import IN_MEMORY, folder_of
 from sfm_shapefit.facts.result import GraphResult, LocateResult
-from sfm_shapefit.facts.rows import own_camera_rows
+from sfm_shapefit.facts.rows import covariance_of, covariances_text, own_camera_rows
 from sfm_shapefit.facts.tables import CameraRow, PairRow, write_rows
 from sfm_shapefit.files.colmap.seed import write_model
 
@@ -95,14 +98,24 @@ def _write_files(
             rows = piece.own_cameras
         else:
             rows = own_camera_rows(piece, piece.locations, 1.0)
-        write_rows(rows, CameraRow, found.dimension, subfolder / "cameras.csv")
-    write_rows(found.cameras, CameraRow, found.dimension, folder / "cameras.csv")
+        _write_cameras(rows, found.dimension, subfolder)
+    _write_cameras(found.cameras, found.dimension, folder)
     write_rows(found.pairs, PairRow, found.dimension, folder / "pairs.csv")
     if isinstance(found, LocateResult) and found.doubtful_pairs:
         write_rows(found.doubtful_pairs, PairRow, found.dimension, folder / "doubtful_pairs.csv")
     write_json(found.facts.summary(), folder / MARKER)
     if options.report:
         _write_report(found, folder / "report.html", options.images)
+
+
+def _write_cameras(rows: Sequence[CameraRow], dimension: int, folder: Path) -> None:
+    """Write cameras.csv and, in space and where any is known, the covariances of centers."""
+    write_rows(rows, CameraRow, dimension, folder / "cameras.csv")
+    known = {row.name: covariance_of(row) for row in rows if dimension == len(row.sigma) == 3}
+    known = {name: one for name, one in known.items() if np.isfinite(one).all()}
+    if known:
+        text = covariances_text(known)
+        (folder / "covariances.csv").write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_page(

@@ -1,9 +1,10 @@
-"""A model as a mesh, for any 3D viewer: cameras as pyramids colored by trust, points. The door to trimesh.
+"""A model as meshes for 3D viewers: cameras as pyramids colored by trust, points. The door to trimesh.
 
-    .glb    turned so that y is up, as viewers of glTF expect, the cameras' median at the origin
+    .glb    turned so that y is up, as viewers of glTF expect, the cameras' median at the origin; `offset` in
+            the extras of the file says where that is, and its axes where x, y and z point
     .ply    the model's own axes and units, so that it overlays other exports of the model
 
-Both formats hold float32.
+A .glb holds float32. A .ply does, as COLMAP's own, if that is fine enough for the scene; else double.
 """
 
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
+from sfm_shapefit.base.geometry import median_spread
 from sfm_shapefit.report.drawing import Drawing, frustum_corners
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 
 Colors = npt.NDArray[np.uint8]
 
+_FLOAT32 = 2.0**-24  # share of a coordinate; what rounding to 32 bits moves it by at most
+_FINE_ENOUGH = 1e-6  # of the spread of vertices; hundredths of a pixel in a picture of the scene
 _TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])  # trusts that have a color; others lie between
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
 """Red, green and blue from 0 to 255 at each of these; the page has the same."""
@@ -26,10 +30,38 @@ _PYRAMID = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 
 """Faces of a camera as rows of its vertices: 0 is the apex, 1 to 4 are the corners of the picture."""
 
 
-def mesh_bytes(drawing: Drawing, file_type: str) -> bytes:
-    """Return the cameras and the points of a drawing as a file of type glb or ply."""
-    mesh = _scene(drawing) if file_type == "glb" else _one_mesh(drawing)
-    exported: bytes = mesh.export(file_type=file_type)
+def ply_bytes(
+    vertices: FloatArray,
+    colors: Colors,
+    faces: IntArray | None = None,
+    comment: str = "",
+    *,
+    fine: bool = False,
+) -> bytes:
+    """Return vertices (n, 3), colors (n, 3) and faces (f, 3) as a binary PLY, in double if need be or `fine`.
+
+    Need is where float32 would move vertices by a millionth of their spread.
+    """
+    step = np.abs(vertices).max(initial=0.0) * _FLOAT32
+    fine = fine or bool(len(vertices) and step > _FINE_ENOUGH * median_spread(vertices))
+    kind, name = ("<f8", "double") if fine else ("<f4", "float")
+    rows = np.empty(len(vertices), [("xyz", kind, 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = vertices, colors
+    lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
+    lines += [f"element vertex {len(rows)}", *(f"property {name} {axis}" for axis in "xyz")]
+    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
+    parts = [rows.tobytes()]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+        listed = np.empty(len(faces), [("count", "u1"), ("vertices", "<i4", 3)])
+        listed["count"], listed["vertices"] = 3, faces
+        parts.append(listed.tobytes())
+    return "\n".join([*lines, "end_header", ""]).encode() + b"".join(parts)
+
+
+def glb_bytes(drawing: Drawing) -> bytes:
+    """Return the cameras and the points of a drawing as a glTF file."""
+    exported: bytes = _scene(drawing).export(file_type="glb")
     return exported
 
 
@@ -40,25 +72,14 @@ def _scene(drawing: Drawing) -> "trimesh.Scene":
     middle = np.median(cameras.centers[cameras.placed], axis=0) if cameras.placed.any() else np.zeros(3)
     right, forward, up = drawing.axes
     turn = np.stack([right, up, -forward]).T
-    vertices, faces, colors = _camera_mesh(drawing)
-    scene = trimesh.Scene()
+    vertices, faces, colors = camera_mesh(drawing)
+    scene = trimesh.Scene(metadata={"offset": middle.tolist(), "axes": turn.T.tolist()})
     if len(faces):
         scene.add_geometry(_mesh((vertices - middle) @ turn, faces, colors), geom_name="cameras")
     if len(points.xyz):
         cloud = trimesh.PointCloud((points.xyz - middle) @ turn, colors=_opaque(points.colors))
         scene.add_geometry(cloud, geom_name="points")
     return scene
-
-
-def _one_mesh(drawing: Drawing) -> "trimesh.Trimesh":
-    """Return the cameras, and the points as vertices without faces."""
-    vertices, faces, colors = _camera_mesh(drawing)
-    points = drawing.points
-    return _mesh(
-        np.concatenate([vertices, points.xyz]),
-        faces,
-        np.concatenate([colors, points.colors]),
-    )
 
 
 def trust_colors(trust: FloatArray) -> Colors:
@@ -69,7 +90,7 @@ def trust_colors(trust: FloatArray) -> Colors:
     return colors.round().astype(np.uint8)
 
 
-def _camera_mesh(drawing: Drawing) -> tuple[FloatArray, IntArray, Colors]:
+def camera_mesh(drawing: Drawing) -> tuple[FloatArray, IntArray, Colors]:
     """Return vertices, faces and vertex colors of the pyramids of all placed cameras."""
     rows = np.flatnonzero(drawing.cameras.placed)
     apexes = drawing.cameras.centers[rows]

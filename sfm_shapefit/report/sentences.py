@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.base.arrays import IntArray
+from sfm_shapefit.base.wording import make_printable
 from sfm_shapefit.facts.model import FactsOfModel
 from sfm_shapefit.facts.placed import Facts
 from sfm_shapefit.judgement.trust import LOW_TRUST
@@ -40,7 +41,7 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
     head, tail = limit * 2 // 3, limit // 3
     if len(text) > limit:
         text = f"{text[:head]} ... {text[-tail:]}"
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    return make_printable(text)
 
 
 def summary_sentences(drawing: Drawing, facts: Facts) -> list[str]:

@@ -38,6 +38,7 @@ from sfm_shapefit.scene.pose_errors import (
     summarize_errors,
     trajectory_errors,
 )
+from sfm_shapefit.scene.same_images import same_images
 
 _ON_A_LINE = (
     "the camera centers lie on a line, so the alignment's rotation about it is arbitrary; position errors "
@@ -245,7 +246,7 @@ def evaluate_poses(
     for threshold in thresholds:
         if not (np.isfinite(threshold) and threshold > 0.0):
             raise InputError(f"a recall threshold must be a positive number, got {threshold}")
-    in_model, in_ref = _common_cameras(model.names, reference.names)
+    in_model, in_ref, ambiguity = _common_cameras(model.names, reference.names)
     ours, theirs = model.taken(in_model), reference.taken(in_ref)
     x, y = ours.centers, theirs.centers
     _refuse_coincident("the model", x)
@@ -266,8 +267,8 @@ def evaluate_poses(
     in_time = np.argsort(np.array(theirs.names), kind="stable")
     return Evaluation(
         names=theirs.names,
-        missing=_only_in(reference.names, model.names),
-        extra=_only_in(model.names, reference.names),
+        missing=_without(reference.names, in_ref),
+        extra=_without(model.names, in_model),
         position_errors=frozen(errors),
         rotation_errors_deg=frozen(turned_deg),
         aligned_centers=frozen(aligned),
@@ -277,30 +278,29 @@ def evaluate_poses(
         recalls=_recalls(errors, len(reference.names), extent, thresholds),
         relative_pose_aucs=_relative_pose_aucs(pair_errors, len(in_ref), len(reference.names)),
         trajectory=trajectory_errors(ours.taken(in_time), theirs.taken(in_time)) if trajectory else None,
-        warnings=_warnings(degenerate, close, cap, turned_deg),
+        warnings=(*_warnings(degenerate, close, cap, turned_deg), *filter(None, [ambiguity])),
     )
 
 
-def _only_in(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
-    """Return the names that are not among others."""
-    known = set(others)
-    return tuple(name for name in names if name not in known)
+def _without(names: Sequence[str], places: IntArray) -> tuple[str, ...]:
+    """Return the names but for those at some places."""
+    known = set(places.tolist())
+    return tuple(name for place, name in enumerate(names) if place not in known)
 
 
-def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[IntArray, IntArray]:
-    """Return the indices of the common cameras in both lists, in the reference's order."""
-    position = {name: k for k, name in enumerate(names)}
-    in_ref = [k for k, name in enumerate(ref_names) if name in position]
+def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[IntArray, IntArray, str]:
+    """Return the indices of the common cameras in both lists, in the reference's order, and `ambiguity`."""
+    places, ambiguity = same_images(ref_names, names)
+    in_ref = np.flatnonzero(places >= 0)
     if len(in_ref) < _MIN_COMMON:
-        only = {"model": _only_in(names, ref_names), "reference": _only_in(ref_names, names)}
+        only = {"model": _without(names, places[in_ref]), "reference": _without(ref_names, in_ref)}
         examples = [f"only the {owner} has '{missed[0]}'" for owner, missed in only.items() if missed]
-        shown = f": {', '.join(examples)}" if examples else ""
+        shown = f": {'; '.join(filter(None, [', '.join(examples), ambiguity]))}" if examples else ""
         raise InputError(
             f"the model ({len(names)} cameras) and the reference ({len(ref_names)}) share {len(in_ref)} image"
             f" names{shown}; at least {_MIN_COMMON} must be equal"
         )
-    in_model = [position[ref_names[k]] for k in in_ref]
-    return np.array(in_model, dtype=np.int64), np.array(in_ref, dtype=np.int64)
+    return places[in_ref], in_ref, ambiguity
 
 
 def _refuse_coincident(owner: str, centers: FloatArray) -> None:
@@ -442,14 +442,14 @@ def evaluate_positions(
     Raises:
         InputError: if fewer than 3 cameras are common, or those of either side coincide.
     """
-    in_model, in_ref = _common_cameras(model[0], reference[0])
+    in_model, in_ref, _ = _common_cameras(model[0], reference[0])
     x, y = model[1][in_model], reference[1][in_ref]
     _refuse_coincident("the model", x)
     _refuse_coincident("the reference", y)
     ref_from_model = fit_similarity_l1(x, y, cap=_CAP_OF_SPREAD * median_spread(y))
     return PositionEvaluation(
         names=tuple(reference[0][k] for k in in_ref),
-        missing=_only_in(reference[0], model[0]),
+        missing=_without(reference[0], in_ref),
         offsets=frozen(x - y) if as_they_stand else None,
         aligned_errors=frozen(np.linalg.norm(ref_from_model.apply(x) - y, axis=1)),
         ref_from_model=ref_from_model,

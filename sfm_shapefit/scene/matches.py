@@ -136,6 +136,9 @@ class Matches(ABC):
     total_keypoints: int
     """Number of keypoints of all images of the file."""
 
+    lacking: str = ""
+    """What was left aside of the input where no images share matches; empty if nothing was."""
+
     def __init__(self) -> None:
         self._views: WeakSet[View] = WeakSet()
 

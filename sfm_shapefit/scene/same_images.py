@@ -16,7 +16,7 @@ from sfm_shapefit.base.arrays import IntArray
 _SLASH = re.compile(r"[/\\]")
 _ABSOLUTE = re.compile(r"[/\\]|[A-Za-z]:[/\\]")
 _MOST_FOLDERS = 64  # leading folders that are passed over; each costs a copy of the name
-_MOST_SAID = 3  # names in a clause
+_MOST_SAID = 3  # names; a sentence with more is not read
 
 
 class SameImages(NamedTuple):
@@ -47,6 +47,14 @@ def same_images(names: Sequence[str], others: Sequence[str]) -> SameImages:
         if is_open and (rule is not _last_part or (places < 0).all()):
             ambiguity = _match(places, names, others, rule) or ambiguity
     return SameImages(places, ambiguity)
+
+
+def names_among(names: Iterable[str], others: Sequence[str]) -> tuple[dict[str, str], str]:
+    """Return what each of some names is called among others, as far as it is there; and `ambiguity`."""
+    listed = list(names)
+    found = same_images(listed, others)
+    places = zip(listed, found.places.tolist(), strict=True)
+    return {name: others[place] for name, place in places if place >= 0}, found.ambiguity
 
 
 def _match(places: IntArray, names: Sequence[str], others: Sequence[str], rule: Callable[[str], str]) -> str:

@@ -292,7 +292,7 @@ def broken_scenes(folder: Path):
 
     no_pairs = sql("DELETE FROM two_view_geometries")
     unusable_pairs = sql("UPDATE two_view_geometries SET config = 7")
-    other_scene = sql("UPDATE images SET name = 'other/' || name")
+    other_scene = sql("UPDATE images SET name = 'other_' || name")
 
     def no_database(_model, database):
         database.write_bytes(b"not a database" * 100)

@@ -19,7 +19,6 @@ DAMAGED = [
     (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
     (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
     (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
-    ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
     (ENDLESS, "its cameras is a view"),
     ("UPDATE images SET camera_id = 7 WHERE image_id = 2", "id 2 has no valid name and camera"),
     ("DELETE FROM images", "has 0 images, but two or more"),

@@ -1,6 +1,7 @@
 """`join`: models of one scene in one world, and one sentence for each that cannot be."""
 
 import json
+import shutil
 from contextlib import closing
 
 import numpy as np
@@ -15,10 +16,10 @@ from sfm_shapefit.files.colmap.seed import write_model
 from sfm_shapefit.pipeline.pieces import ModelPiece, tie_pieces
 from tests.facts.test_schema import problems
 from tests.models import only
-from tests.pipeline.made import DATABASE, FOLDER
+from tests.pipeline.made import DATABASE, FOLDER, PAIR
 from tests.problems import turn
 from tests.program import run, run_refused
-from tests.scenes import COURTYARD, RING, fingerprint
+from tests.scenes import COURTYARD, RING, edit_database, fingerprint
 
 WHOLE = pycolmap.Reconstruction(FOLDER)
 IDS = sorted(WHOLE.reg_image_ids())
@@ -109,6 +110,105 @@ def test_models_that_share_images_are_joined_without_a_database_and_whatever_the
     names = [image.name for image in found.reconstruction.images.values()]
     assert sorted(names) == sorted(image.name for image in WHOLE.images.values())
     assert found.reconstruction.num_points3D() <= 1.02 * WHOLE.num_points3D()
+
+
+def assert_tracks_hold(model):
+    """Each observation of a point is that of its keypoint, and no keypoint observes what does not see it."""
+    seen = {
+        (e.image_id, e.point2D_idx): i for i, point in model.points3D.items() for e in point.track.elements
+    }
+    told = {
+        (i, k): point.point3D_id
+        for i, image in model.images.items()
+        for k, point in enumerate(image.points2D)
+        if point.has_point3D()
+    }
+    assert seen == told
+
+
+def other_keypoints(model, *, noise_px, seed=0):
+    """The model with keypoints of another program, so many pixels away and in another order."""
+    rng = np.random.default_rng(seed)
+    ids = sorted(model.reg_image_ids())
+    place = {i: rng.permutation(model.image(i).num_points2D()) for i in ids}
+    other = pycolmap.Reconstruction()
+    (camera,) = model.cameras.values()
+    other.add_camera_with_trivial_rig(camera)
+    for i in ids:
+        xy = np.array([point.xy for point in model.image(i).points2D])
+        xy = (xy + rng.normal(0.0, noise_px, xy.shape))[np.argsort(place[i])]
+        image = pycolmap.Image(name=model.image(i).name, keypoints=xy, camera_id=camera.camera_id, image_id=i)
+        other.add_image_with_trivial_frame(image, model.image(i).cam_from_world())
+    for point in model.points3D.values():
+        elements = [(e.image_id, int(place[e.image_id][e.point2D_idx])) for e in point.track.elements]
+        track = pycolmap.Track([pycolmap.TrackElement(*element) for element in elements])
+        other.add_point3D(point.xyz, track, point.color)
+    return other
+
+
+@pytest.mark.parametrize(("last", "noise_px"), [(4, 1.0), (5, 0.0), (6, 0.3)])
+def test_images_of_both_keep_the_keypoints_of_both(tmp_path, last, noise_px):
+    second = other_keypoints(piece(IDS[2:], moved=True), noise_px=noise_px)
+    models = written(tmp_path, piece(IDS[:last]), second)
+    out = tmp_path / "out"
+    run("join", *models, out, code=0)
+    facts = json.loads((out / "locate.json").read_text())
+    assert (facts["verdict"]["grade"], facts["verdict"]["reasons"]) == ("good", [])
+    assert errors_of(out) == (8, pytest.approx(0.0, abs=1e-3))
+    joined, first = pycolmap.Reconstruction(out), pycolmap.Reconstruction(models[0])
+    assert_tracks_hold(joined)
+    for i in IDS[2:last]:
+        name = WHOLE.image(i).name
+        found = [model.find_image_with_name(name).points2D for model in (first, second, joined)]
+        ours, theirs, both = ([tuple(point.xy) for point in points] for points in found)
+        assert both[: len(ours)] == ours
+        if noise_px == 0.0:
+            assert both == ours
+        else:
+            assert len(ours) < len(both) <= len(ours) + len(theirs)
+            assert {*both[len(ours) :]} <= {*theirs}
+    alone = sum(model.compute_num_observations() for model in (first, second))
+    if noise_px == 1.0:  # few of them lie within half a pixel of one another by chance
+        assert joined.compute_num_observations() >= 0.95 * alone
+    elif noise_px == 0.0:
+        same = sfm_shapefit.join([first, piece(IDS[2:], moved=True)]).reconstruction
+        assert joined.compute_num_observations() == same.compute_num_observations()
+
+
+def test_three_models_with_keypoints_of_their_own_stay_whole():
+    ids = [IDS[:4], IDS[1:6], IDS[3:]]
+    models = [other_keypoints(piece(some), noise_px=1.0, seed=k) for k, some in enumerate(ids)]
+    found = sfm_shapefit.join(models)
+    assert found.verdict.grade == "good"
+    assert errors_of(found.reconstruction) == (8, pytest.approx(0.0, abs=1e-3))
+    assert_tracks_hold(found.reconstruction)
+    alone = sum(model.compute_num_observations() for model in models)
+    assert found.reconstruction.compute_num_observations() >= 0.95 * alone
+
+
+def test_a_database_of_the_first_model_alone_is_said_and_does_not_judge_the_others(tmp_path):
+    (tmp_path / "a").mkdir()
+    database = tmp_path / "a" / "database.db"
+    shutil.copy(DATABASE, database)
+    pairs = f"DELETE FROM two_view_geometries WHERE pair_id % {PAIR} > 5"
+    edit_database(database, "DELETE FROM images WHERE image_id > 5", pairs)
+    first, second = written(tmp_path / "a", piece(IDS[:5]), other_keypoints(piece(IDS[2:]), noise_px=1.0))
+    shown = " ".join(run("join", first, second, tmp_path / "out", code=0).output.split())
+    assert "matches: images that the models share;" in shown
+    assert "database.db, found beside the first, lacks 3 of 8 images" in shown
+    assert "verdict: good" in shown
+    told = run("join", first, second, tmp_path / "asked", "--database", database, code=0).output
+    assert "the database lacks 3 images" in " ".join(told.split())
+
+
+def test_a_second_model_that_is_bent_is_not_called_good(tmp_path):
+    second = other_keypoints(piece(IDS[2:], moved=True), noise_px=1.0)
+    for i in IDS[5:]:
+        frame = second.frame(second.image(i).frame_id)
+        pose = frame.rig_from_world
+        frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([1.0, 0.0, 0.0]))
+    found = sfm_shapefit.join([piece(IDS[:5]), second])
+    assert found.verdict.grade != "good"
 
 
 def test_models_without_points_are_joined_by_the_images_that_they_share():

@@ -209,8 +209,8 @@ def test_an_alignment_that_holds_for_a_minority_only_is_warned_about():
 
 def test_two_common_cameras_are_too_few_which_is_explained_with_an_example_and_three_are_enough():
     reference = scene(11)
-    model = replace(reference, names=tuple(f"images/{name}" for name in reference.names))
-    sides = r"only the model has 'images/img000\.jpg'.*only the reference has 'img000\.jpg'"
+    model = replace(reference, names=tuple(f"other_{name}" for name in reference.names))
+    sides = r"only the model has 'other_img000\.jpg'.*only the reference has 'img000\.jpg'"
     with pytest.raises(InputError, match=rf"(?s)share 0 image names.*{sides}"):
         evaluate_poses(model, reference)
     with pytest.raises(InputError, match=r"share 2 image names: only the reference has 'img002\.jpg'"):

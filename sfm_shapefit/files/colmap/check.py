@@ -3,28 +3,17 @@
 pycolmap trusts its input: on a file that was cut short it can loop for ever, or read a camera that is
 not there, and it passes NaN through without a word. So the files are walked here first, record by
 record, with every length checked against the end of the file and every reference against the file it
-refers to. Binary layouts, all little-endian, counts uint64 unless noted:
+refers to. Layouts stand in `binary_records`; text models become binary ones by `text_model`.
 
-    cameras   count, then  id u32, model i32, width u64, height u64, params f64 each
-    images    count, then  id u32, qw qx qy qz tx ty tz f64, camera u32, name to NUL,
-                           count, then  x y f64, point3D id u64 (all ones: none)
-    points3D  count, then  id u64, x y z f64, r g b u8, error f64, count, then  image u32, point2D u32
-    rigs      count, then  id u32, count u32, reference sensor (type i32, id u32), and for each further
-                           sensor  type i32, id u32, has_pose u8, and then qw .. tz f64 if it has
-    frames    count, then  id u32, rig u32, qw .. tz f64, count u32, then  type i32, sensor u32, data u64
-
-Text models are checked line by line for what pycolmap overlooks (NaN, lines cut short, names it would cut);
-it refuses the rest itself.
-
-Source: https://colmap.github.io/format.html, "Sparse reconstruction".
+A model whose points and observations contradict one another has poses all the same, so that this is an error
+of its own.
 """
 
 import math
 import os
 import struct
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,9 +22,24 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.arrays import Int32Array, IntArray, UInt64Array
+from sfm_shapefit.base.atomic_folder import private_folder
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.jit import inner_kernel, kernel
 from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.files.colmap.binary_records import (
+    CAMERA,
+    COUNT,
+    FRAME,
+    FRAME_DATA,
+    HAS_POSE,
+    IMAGE,
+    NO_POINT,
+    POINT2D,
+    POINT3D,
+    POSE,
+    RIG,
+    SENSOR_ID,
+)
 from sfm_shapefit.files.colmap.camera_variants import (
     OTHER_COUNTS,
     CameraVariant,
@@ -43,82 +47,125 @@ from sfm_shapefit.files.colmap.camera_variants import (
     read_camera,
 )
 from sfm_shapefit.files.colmap.points import Observed
+from sfm_shapefit.files.colmap.text_model import binary_records
 from sfm_shapefit.files.model_folder import REQUIRED_FILES, model_suffix
-from sfm_shapefit.files.norms import may_be_rotation
+from sfm_shapefit.files.norms import may_be_rotations
 
 UNIT_QUATERNION_TOLERANCE = 1e-3
 """A quaternion printed with 4 digits still passes; one farther off is normalized, and said."""
 
-NO_POINT = np.uint64(2**64 - 1)  # id of a point; COLMAP writes it where a keypoint observes none
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
-
-_U64 = struct.Struct("<Q")
-_CAMERA = struct.Struct("<IiQQ")
-IMAGE = struct.Struct("<I7dI")
-_RIG = struct.Struct("<II")
-_SENSOR = struct.Struct("<iI")
-_HAS_POSE = struct.Struct("<B")
-_POSE = struct.Struct("<7d")
-_FRAME = struct.Struct("<II7dI")
-_FRAME_DATA = struct.Struct("<iIQ")
-POINT2D = np.dtype([("xy", "<f8", 2), ("point3d_id", "<u8")])
-POINT3D = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 _PIECE_BYTES = 2**22  # bytes of points3D.bin read at once; checking them takes ten times as much memory
 _IMAGES_AT_ONCE = 256  # images whose points are looked up at once; all 10,000 would take 200 MB
 
 
-def check_model_files(folder: Path) -> Observed:
-    """Refuse a model folder that pycolmap must not be given; return what the images of a binary one observe.
+class ContradictionError(InputError):
+    """Points of a model and observations of its images contradict one another; its poses may serve."""
 
-    Where a folder holds both formats, the binary one is checked, since pycolmap reads that. It
-    must have cameras, images and points3D, and either both or none of rigs and frames.
+
+class ModelFiles(NamedTuple):
+    """The binary files of a model, and what they are called in messages."""
+
+    folder: Path
+    """Where they lie: the user's folder, or a private copy."""
+    told: Path
+    """The user's folder."""
+    suffix: str
+    """Suffix of the user's files."""
+    notes: tuple[str, ...] = ()
+    """What was read otherwise than it stands there, a sentence each."""
+
+    def open(self, name: str) -> "_BinaryFile":
+        """Open a file to be walked."""
+        return _BinaryFile(self.folder / f"{name}.bin", self.told / f"{name}{self.suffix}")
+
+    def has(self, name: str) -> bool:
+        """Whether there is a file of this name."""
+        return (self.folder / f"{name}.bin").exists()
+
+
+def check_model_files(folder: Path) -> Observed:
+    """Refuse a model folder that pycolmap must not be given; return what its images observe."""
+    with binary_files(folder) as files:
+        return walk_files(files)
+
+
+@contextmanager
+def binary_files(folder: Path) -> Iterator[ModelFiles]:
+    """Yield the model in a folder as binary files: of a text model, a private copy.
+
+    Where a folder holds both formats, the binary one counts, as for pycolmap.
 
     Raises:
-        InputError: naming the file, and the record or the line, that is missing, truncated, not finite,
-            repeated, or refers to something that is not there.
+        InputError: if a file is missing, cannot be read, or has a malformed line, which is named.
     """
     suffix = model_suffix(folder)
-    for name in (*REQUIRED_FILES, "rigs", "frames"):
+    for name in (*REQUIRED_FILES, "points3D", "rigs", "frames"):
         refuse_irregular_file(folder / f"{name}{suffix}")
-    has_rigs = (folder / f"rigs{suffix}").exists()
-    has_frames = (folder / f"frames{suffix}").exists()
-    if has_rigs != has_frames:
-        there, missing = ("rigs", "frames") if has_rigs else ("frames", "rigs")
+    there = [name for name in ("rigs", "frames") if (folder / f"{name}{suffix}").exists()]
+    if len(there) == 1:
+        missing = "frames" if there == ["rigs"] else "rigs"
         raise InputError(
-            f"{folder} has {there}{suffix} but no {missing}{suffix}; add it, or remove {there}{suffix}"
+            f"{folder} has {there[0]}{suffix} but no {missing}{suffix}; add it, or remove {there[0]}{suffix}"
         )
     if suffix == ".bin":
-        return _check_binary_model(folder, with_rigs=has_rigs)
-    check_camera_lines(folder / "cameras.txt")
-    _check_image_lines(folder / "images.txt")
-    _check_point_lines(folder / "points3D.txt")
-    return {}
+        yield ModelFiles(folder, folder, suffix)
+        return
+    records, notes = binary_records(folder)
+    with private_folder() as own:
+        for name, of_file in records.items():
+            write_binary_file(own / f"{name}.bin", of_file)
+        yield ModelFiles(own, folder, suffix, tuple(notes))
 
 
-def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float]) -> None:
+def write_binary_file(path: Path, records: Iterable[bytes]) -> None:
+    """Write a binary file of a private copy.
+
+    Raises:
+        InputError: if there is no room for it.
+    """
+    try:
+        with path.open("wb") as stream:
+            count = 0
+            stream.write(COUNT.pack(count))
+            for count, record in enumerate(records, start=1):  # noqa: B007
+                stream.write(record)
+            stream.seek(0)
+            stream.write(COUNT.pack(count))
+    except OSError as error:
+        raise InputError(
+            f"the model cannot be copied to {path.parent} ({error.strerror}); make room"
+        ) from None
+
+
+def _refuse_pose(file: "_BinaryFile", label: str, pose: Sequence[float]) -> None:
     """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names; NaN is an unknown position."""
     if not all(map(math.isfinite, pose[:4])) or any(map(math.isinf, pose[4:])):
-        raise source.fault(f"{label} has a pose that is not finite")
+        raise file.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if not may_be_rotation(norm):
-        raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
+    if not may_be_rotations(np.array([norm])).all():
+        raise file.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 
 class _BinaryFile:
     """A model file that is read once, from its begin to its end; every read is checked against the end."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, told: Path | None = None) -> None:
+        self.told = told or path
         try:
             self._stream = path.open("rb")  # until its end or its first fault
             self.left = os.fstat(self._stream.fileno()).st_size
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}") from None
+            raise InputError(f"{self.told} cannot be read: {error.strerror}") from None
 
-    def fault(self, reason: str) -> InputError:
+    def fault(self, reason: str, kind: type[InputError] = InputError) -> InputError:
         """Return the error that names this file, which is read no further."""
         self._stream.close()
-        return InputError(f"{self.path}: {reason}")
+        return kind(f"{self.told}: {reason}")
+
+    def beside(self, name: str) -> str:
+        """Return what another file of the model is called."""
+        return f"{name}{self.told.suffix}"
 
     def truncated(self, what: str) -> InputError:
         """Return the error that the file ends inside `what`."""
@@ -146,7 +193,7 @@ class _BinaryFile:
 
     def take_count(self, smallest: int, what: str) -> int:
         """Read a uint64 count and refuse it if so many records cannot fit."""
-        count = int(self.take(_U64, f"the number of {what}")[0])
+        count = int(self.take(COUNT, f"the number of {what}")[0])
         self.require_room(count, smallest, what)
         return count
 
@@ -174,27 +221,59 @@ class _Images(NamedTuple):
     observed: Observed
 
 
-def _check_binary_model(folder: Path, *, with_rigs: bool) -> Observed:
-    """Walk the binary files in the order in which they refer to each other."""
-    camera_ids = set(check_cameras(folder / "cameras.bin"))
-    image_file = _BinaryFile(folder / "images.bin")
+def walk_files(files: ModelFiles) -> Observed:
+    """Refuse what pycolmap must not be given; return what the images observe.
+
+    The files are walked in the order in which they refer to each other.
+
+    Raises:
+        InputError: naming the file and the record that is truncated, not finite, repeated, or refers to
+            something that is not there.
+        ContradictionError: if this is a point or an observation, or there are no points at all.
+    """
+    camera_ids = set(check_cameras(files))
+    image_file = files.open("images")
     images = _check_images(image_file, camera_ids)
-    point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
+    if files.has("rigs"):
+        rigs = _check_rigs(files.open("rigs"), camera_ids)
+        frame_file = files.open("frames")
+        camera_of_image = _check_frames(frame_file, rigs)
+        if rigs or camera_of_image:  # two empty files are read like a model without rigs and frames
+            _check_frames_match_images(frame_file, camera_of_image, images)
+    if not files.has("points3D"):
+        raise ContradictionError(f"{files.told} has no points3D{files.suffix}")
+    point_ids = _check_points(files.open("points3D"), images)
     seen = [points for _, points in images.observed.values()]
     for first in range(0, len(seen), _IMAGES_AT_ONCE):
         some = np.concatenate(seen[first : first + _IMAGES_AT_ONCE])
         unknown = some[~np.isin(some, point_ids)]
         if len(unknown):
+            image_id = next(i for i, (_, points) in images.observed.items() if unknown[0] in points)
             raise image_file.fault(
-                f"an image observes 3D point {unknown[0]}, which points3D.bin does not have"
+                f"image {image_id} observes 3D point {unknown[0]}, which {image_file.beside('points3D')} "
+                "does not have",
+                ContradictionError,
             )
-    if with_rigs:
-        rigs = _check_rigs(_BinaryFile(folder / "rigs.bin"), camera_ids)
-        frame_file = _BinaryFile(folder / "frames.bin")
-        camera_of_image = _check_frames(frame_file, rigs)
-        if rigs or camera_of_image:  # two empty files are read like a model without rigs and frames
-            _check_frames_match_images(frame_file, camera_of_image, images)
     return images.observed
+
+
+def name_contradiction(files: ModelFiles) -> str:
+    """Return which track and image contradict one another in files that were walked; empty if none do."""
+    images = _check_images(files.open("images"), set(check_cameras(files)))
+    owners = {
+        (image_id, keypoint): point
+        for image_id, (keypoints, points) in images.observed.items()
+        for keypoint, point in zip(keypoints.tolist(), points.tolist(), strict=True)
+    }
+    file = files.open("points3D")
+    for heads, elements in _points_of(file):
+        tracked = np.repeat(heads["id"], heads["length"].astype(np.int64)).tolist()
+        for point, (image_id, keypoint) in zip(tracked, elements.tolist(), strict=True):
+            owner = owners.get((image_id, keypoint), point)  # pycolmap takes those of none for the track's
+            if owner != point:
+                said = f"the track of 3D point {point} has keypoint {keypoint} of image {image_id}"
+                return str(file.fault(f"{said}, to which {file.beside('images')} gives 3D point {owner}"))
+    return ""
 
 
 class FoundCamera(NamedTuple):
@@ -204,14 +283,14 @@ class FoundCamera(NamedTuple):
     read: CameraVariant
 
 
-def check_cameras(path: Path) -> dict[int, FoundCamera]:
+def check_cameras(files: ModelFiles) -> dict[int, FoundCamera]:
     """Walk cameras.bin and return its cameras by their ids; lists of other lengths are tried at last."""
     try:
-        return _walk_cameras(_BinaryFile(path), {})
+        return _walk_cameras(files.open("cameras"), {})
     except InputError:
         for model_id, count in OTHER_COUNTS:
             with suppress(InputError):
-                return _walk_cameras(_BinaryFile(path), {model_id: count})
+                return _walk_cameras(files.open("cameras"), {model_id: count})
         raise
 
 
@@ -219,8 +298,8 @@ def _walk_cameras(file: _BinaryFile, counts: dict[int, int]) -> dict[int, FoundC
     """Walk cameras.bin, where models may have other `counts` of parameters."""
     num_params = num_params_of_model()
     found: dict[int, FoundCamera] = {}
-    for _ in range(file.take_count(_CAMERA.size, "cameras")):
-        camera_id, model_id, *size = map(int, file.take(_CAMERA, "a camera"))
+    for _ in range(file.take_count(CAMERA.size, "cameras")):
+        camera_id, model_id, *size = map(int, file.take(CAMERA, "a camera"))
         if model_id not in num_params:
             raise file.fault(f"camera {camera_id} has the unknown camera model {model_id}")
         if camera_id in found:
@@ -242,13 +321,15 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
     header_of: dict[int, tuple[int, int]] = {}  # camera id, number of points
     names: set[bytes] = set()
     observed: dict[int, tuple[Int32Array, UInt64Array]] = {}
-    for _ in range(file.take_count(IMAGE.size + 1 + _U64.size, "images")):
+    for _ in range(file.take_count(IMAGE.size + 1 + COUNT.size, "images")):
         image_id, *pose, camera_id = file.take(IMAGE, "an image")
         label = f"image {image_id}"
         name = file.take_name(f"the name of {label}")
         _refuse_pose(file, label, pose)
         if camera_id not in camera_ids:
-            raise file.fault(f"{label} refers to camera {camera_id}, which cameras.bin does not have")
+            raise file.fault(
+                f"{label} refers to camera {camera_id}, which {file.beside('cameras')} does not have"
+            )
         if not name:
             raise file.fault(f"{label} has no name")
         if image_id in header_of or name in names:
@@ -267,9 +348,35 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
 
 
 def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
-    """Walk points3D.bin, a piece at a time, and return the point ids, ascending."""
+    """Walk points3D.bin and return the point ids, ascending."""
+    ids: list[UInt64Array] = []
+    for heads, elements in _points_of(file):
+        is_finite = np.isfinite(heads["xyz"]).all(axis=1)
+        if not is_finite.all():
+            raise file.fault(f"3D point {heads['id'][~is_finite][0]} has coordinates that are not finite")
+        ids.append(heads["id"].copy())
+        # Each element of a track refers to an image, and to a point of it.
+        position = np.searchsorted(images.ids, elements[:, 0])
+        is_known = np.append(images.ids, -1)[position] == elements[:, 0]
+        bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
+        if len(bad):
+            image_id, point = bad[0]
+            raise file.fault(
+                f"a track refers to point {point} of image {image_id}, which {file.beside('images')} does "
+                "not have",
+                ContradictionError,
+            )
+    every = np.sort(np.concatenate([np.zeros(0, dtype=np.uint64), *ids]))
+    repeated = every[1:][every[1:] == every[:-1]]
+    if len(repeated):
+        raise file.fault(f"3D point {repeated[0]} stands twice")
+    return every
+
+
+def _points_of(file: _BinaryFile) -> Iterator[tuple[npt.NDArray[np.void], npt.NDArray[np.uint32]]]:
+    """Yield the heads of 3D points and the elements (k, 2) of their tracks, a piece of the file at a time."""
     count = file.take_count(POINT3D.itemsize, "3D points")
-    ids, done, data = np.empty(count, dtype=np.uint64), 0, b""
+    done, data = 0, b""
     while done < count:
         data += file.read(min(file.left, _PIECE_BYTES), "3D points")
         piece = np.frombuffer(data, dtype=np.uint8)
@@ -280,28 +387,10 @@ def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
         begins, end, is_head = starts[:complete, None], starts[complete], np.zeros(len(piece), dtype=np.bool_)
         is_head[begins + np.arange(POINT3D.itemsize)] = True
         heads = piece[begins + np.arange(POINT3D.itemsize)].view(POINT3D)[:, 0]
-        elements = piece[:end][~is_head[:end]].view("<u4").reshape(-1, 2)
-        is_finite = np.isfinite(heads["xyz"]).all(axis=1)
-        if not is_finite.all():
-            raise file.fault(f"3D point {heads['id'][~is_finite][0]} has coordinates that are not finite")
-        ids[done : done + complete] = heads["id"]
-        # Each element of a track refers to an image, and to a point of it.
-        position = np.searchsorted(images.ids, elements[:, 0])
-        is_known = np.append(images.ids, -1)[position] == elements[:, 0]
-        bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
-        if len(bad):
-            image_id, point = bad[0]
-            raise file.fault(
-                f"a track refers to point {point} of image {image_id}, which images.bin does not have"
-            )
+        yield heads, piece[:end][~is_head[:end]].view("<u4").reshape(-1, 2)
         data, done = data[end:], done + complete
     file.left += len(data)
     file.finish()
-    ids.sort()
-    repeated = ids[1:][ids[1:] == ids[:-1]]
-    if len(repeated):
-        raise file.fault(f"3D point {repeated[0]} stands twice")
-    return ids
 
 
 @inner_kernel
@@ -334,12 +423,12 @@ def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> 
 def _check_rigs(file: _BinaryFile, camera_ids: set[int]) -> dict[int, set[tuple[int, int]]]:
     """Walk rigs.bin and return the sensors (type, id) of each rig."""
     rigs: dict[int, set[tuple[int, int]]] = {}
-    for _ in range(file.take_count(_RIG.size, "rigs")):
-        rig_id, num_sensors = map(int, file.take(_RIG, "a rig"))
+    for _ in range(file.take_count(RIG.size, "rigs")):
+        rig_id, num_sensors = map(int, file.take(RIG, "a rig"))
         label = f"rig {rig_id}"
         if rig_id in rigs:
             raise file.fault(f"{label} stands twice")
-        file.require_room(num_sensors, _SENSOR.size, f"sensors of {label}")
+        file.require_room(num_sensors, SENSOR_ID.size, f"sensors of {label}")
         rigs[rig_id] = {
             _take_sensor(file, label, camera_ids, is_reference=k == 0) for k in range(num_sensors)
         }
@@ -353,11 +442,13 @@ def _take_sensor(
     file: _BinaryFile, label: str, camera_ids: set[int], *, is_reference: bool
 ) -> tuple[int, int]:
     """Read one sensor of a rig, and its pose unless it is the reference; return its type and id."""
-    sensor_type, sensor_id = map(int, file.take(_SENSOR, label))
+    sensor_type, sensor_id = map(int, file.take(SENSOR_ID, label))
     if sensor_type == _CAMERA_SENSOR and sensor_id not in camera_ids:
-        raise file.fault(f"{label} refers to camera {sensor_id}, which cameras.bin does not have")
-    if not is_reference and file.take(_HAS_POSE, label)[0]:
-        _refuse_pose(file, f"{label} has a sensor that", file.take(_POSE, label))
+        raise file.fault(
+            f"{label} refers to camera {sensor_id}, which {file.beside('cameras')} does not have"
+        )
+    if not is_reference and file.take(HAS_POSE, label)[0]:
+        _refuse_pose(file, f"{label} has a sensor that", file.take(POSE, label))
     return sensor_type, sensor_id
 
 
@@ -365,18 +456,18 @@ def _check_frames(file: _BinaryFile, rigs: dict[int, set[tuple[int, int]]]) -> d
     """Walk frames.bin and return the camera of each image that a frame refers to."""
     camera_of_image: dict[int, int] = {}
     frame_ids: set[int] = set()
-    for _ in range(file.take_count(_FRAME.size, "frames")):
-        frame_id, rig_id, *pose, num_data = file.take(_FRAME, "a frame")
+    for _ in range(file.take_count(FRAME.size, "frames")):
+        frame_id, rig_id, *pose, num_data = file.take(FRAME, "a frame")
         label = f"frame {frame_id}"
         if frame_id in frame_ids:
             raise file.fault(f"{label} stands twice")
         frame_ids.add(int(frame_id))
         if rig_id not in rigs:
-            raise file.fault(f"{label} refers to rig {rig_id}, which rigs.bin does not have")
+            raise file.fault(f"{label} refers to rig {rig_id}, which {file.beside('rigs')} does not have")
         _refuse_pose(file, label, pose)
-        file.require_room(int(num_data), _FRAME_DATA.size, f"images of {label}")
+        file.require_room(int(num_data), FRAME_DATA.size, f"images of {label}")
         for _ in range(int(num_data)):
-            sensor_type, sensor_id, data_id = map(int, file.take(_FRAME_DATA, label))
+            sensor_type, sensor_id, data_id = map(int, file.take(FRAME_DATA, label))
             if (sensor_type, sensor_id) not in rigs[int(rig_id)]:
                 raise file.fault(f"{label} refers to sensor {sensor_id}, which rig {rig_id} does not have")
             if sensor_type != _CAMERA_SENSOR:
@@ -393,105 +484,13 @@ def _check_frames_match_images(file: _BinaryFile, camera_of_image: dict[int, int
     camera_of = dict(zip(images.ids.tolist(), images.camera_ids.tolist(), strict=True))
     for image_id in sorted(camera_of_image.keys() | camera_of.keys()):
         if image_id not in camera_of:
-            raise file.fault(f"a frame refers to image {image_id}, which images.bin does not have")
+            raise file.fault(
+                f"a frame refers to image {image_id}, which {file.beside('images')} does not have"
+            )
         if image_id not in camera_of_image:
-            raise file.fault(f"image {image_id} of images.bin is in no frame")
+            raise file.fault(f"image {image_id} of {file.beside('images')} is in no frame")
         if camera_of[image_id] != camera_of_image[image_id]:
             raise file.fault(
                 f"image {image_id} belongs to camera {camera_of_image[image_id]} here, "
-                f"but to camera {camera_of[image_id]} in images.bin"
+                f"but to camera {camera_of[image_id]} in {file.beside('images')}"
             )
-
-
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """One line of a text file, with its place for messages."""
-
-    path: Path
-    number: int
-    text: str
-
-    def fault(self, reason: str) -> InputError:
-        """Return the error that names this line."""
-        return InputError(f"{self.path}:{self.number}: {reason}")
-
-    def finite(self, tokens: Sequence[str], what: str, *, or_unknown: bool = False) -> list[float]:
-        """Return the tokens as numbers, which may be NaN if `or_unknown`."""
-        try:
-            values = list(map(float, tokens))
-        except ValueError:
-            raise self.fault(f"{what} holds something that is not a number") from None
-        if not all(math.isfinite(value) or (or_unknown and math.isnan(value)) for value in values):
-            raise self.fault(f"{what} holds a number that is not finite")
-        return values
-
-    @property
-    def is_record(self) -> bool:
-        """Whether this is neither blank nor a comment."""
-        return not self.text.strip().startswith("#") and not self.text.isspace()
-
-
-def _lines(path: Path, *, records_only: bool = True) -> Iterator[_Line]:
-    """Yield the lines of a text file that are records, or all."""
-    try:
-        with path.open(encoding="utf-8", errors="surrogateescape") as stream:
-            for number, text in enumerate(stream, start=1):
-                line = _Line(path, number, text)
-                if line.is_record or not records_only:
-                    yield line
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from None
-
-
-def check_camera_lines(path: Path) -> dict[int, FoundCamera]:
-    """Return the cameras of lines CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[], by their ids."""
-    num_params, found = dict(num_params_of_model().values()), dict[int, FoundCamera]()
-    for line in _lines(path):
-        camera_id, model, *words = *line.text.split(), "", ""
-        words = words[:-2]
-        if len(words) < 2 or not camera_id.isdigit():
-            raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
-        width, height, *params = line.finite(words, "the camera")
-        read = read_camera(model, (width, height), params)
-        if read is None and model not in num_params:
-            raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
-        if read is None:
-            raise line.fault(f"{model} has {num_params[model]} parameters, but {len(params)} are given")
-        found[int(camera_id)] = FoundCamera((int(width), int(height)), read)
-    return found
-
-
-def _check_image_lines(path: Path) -> None:
-    """Two lines per image: IMAGE_ID, QW .. TZ, CAMERA_ID, NAME and then (X, Y, POINT3D_ID)[]."""
-    names: dict[str, int] = {}
-    lines = _lines(path, records_only=False)
-    for line in lines:
-        if not line.is_record:
-            continue
-        tokens = line.text.split()
-        if len(tokens) != 10:
-            raise line.fault(
-                "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME "
-                "(a name with spaces needs the .bin format)"
-            )
-        pose = line.finite(tokens[1:5], "the pose"), line.finite(tokens[5:8], "the pose", or_unknown=True)
-        _refuse_pose(line, f"image {tokens[0]}", [*pose[0], *pose[1]])
-        if tokens[9] in names:
-            raise line.fault(f"the name {tokens[9]} stands in line {names[tokens[9]]} already")
-        names[tokens[9]] = line.number
-        points = next(lines, None)
-        if points is None:
-            raise line.fault("the line of its points is missing; add one, empty if the image has none")
-        tokens = points.text.split()
-        if len(tokens) % 3:
-            raise points.fault("expected triples X, Y, POINT3D_ID")
-        points.finite(tokens, "a point")
-
-
-def _check_point_lines(path: Path) -> None:
-    """Each line: POINT3D_ID, X, Y, Z, R, G, B, ERROR, (IMAGE_ID, POINT2D_IDX)[]."""
-    for line in _lines(path):
-        tokens = line.text.split()
-        if len(tokens) < 8 or len(tokens) % 2:
-            raise line.fault("expected POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as pairs")
-        line.finite(tokens[1:4], "the 3D point")

@@ -18,7 +18,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_pairs import PairRows, check_schema, match_names, read_pairs
 from sfm_shapefit.files.colmap.lenses import rays_of
 from sfm_shapefit.files.colmap.sorted_matches import MOST_MATCHES, SortedMatches
-from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_blob
+from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, database_beside, is_blob
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens
 from sfm_shapefit.scene.matches import Matches, Reading, View
@@ -31,13 +31,9 @@ _HALF = np.uint64(32)  # bits of a keypoint's number; a match is one number of t
 
 
 def find_database(model_folder: Path) -> Path | None:
-    """Return database.db in the model's folder, its parent or its grandparent, whichever comes first."""
+    """Return the database in the model's folder, its parent or its grandparent, whichever comes first."""
     folder = Path(os.path.abspath(model_folder))
-    for candidate in (folder, *folder.parents[:2]):
-        path = candidate / "database.db"
-        if os.path.isfile(path):  # False, not an error, where the folder may not be read
-            return path
-    return None
+    return next(filter(None, map(database_beside, (folder, *folder.parents[:2]))), None)
 
 
 def open_database(path: Path | str, names: Sequence[str], rows: PairRows | None = None) -> "DatabaseMatches":

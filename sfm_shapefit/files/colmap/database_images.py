@@ -16,7 +16,7 @@ from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.database_cameras import read_cameras
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES, NO_ID
 from sfm_shapefit.files.colmap.database_rigs import DatabaseRigs, read_rigs
-from sfm_shapefit.files.colmap.images import images_of, sensors_of
+from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, sensors_of
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
 from sfm_shapefit.files.colmap.template import FrameHead, Template
 from sfm_shapefit.scene.images import Frames, Images
@@ -86,11 +86,9 @@ def read_images(file: DatabaseFile) -> UnposedImages:
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
-        if any("\ud800" <= letter <= "\udfff" for letter in name):  # what is no UTF-8 is read as these
-            raise InputError(f"{path}: the name {name!r} of an image is no UTF-8; rename that image")
         if model.exists_image(image_id):
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
-        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+        image = pycolmap.Image(name=bytes_of_name(name), camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     notes = list(cameras.notes(lost))
     if model.num_images() < 2:

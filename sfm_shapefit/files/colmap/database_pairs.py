@@ -15,6 +15,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile, is_between
+from sfm_shapefit.scene.same_images import same_images
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
@@ -59,15 +60,15 @@ def check_schema(file: DatabaseFile) -> None:
 
 def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
     """Return for each image id of the database the place of the image's name in `names`, or -1."""
-    path, index_of_name = file.path, {name: index for index, name in enumerate(names)}
-    index_of_id: dict[int, int] = {}
+    path, index_of_id = file.path, dict[int, int]()
     example, matched = None, set()
-    for image_id, name in file.query("SELECT image_id, name FROM images ORDER BY image_id"):
+    rows = file.query("SELECT image_id, name FROM images ORDER BY image_id")
+    places, ambiguity = same_images([str(name) for _, name in rows], names)
+    for index, (image_id, name) in zip(places.tolist(), rows, strict=True):
         if not (is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
             )
-        index = index_of_name.get(name, -1)
         if index in matched or image_id in index_of_id:
             raise InputError(f"{path}: the image {name} stands twice; remove one of them")
         index_of_id[image_id] = index
@@ -82,8 +83,10 @@ def match_names(file: DatabaseFile, names: Sequence[str]) -> dict[int, int]:
         there = f", and the database's {example} is not in the model" if example is not None else ""
         raise InputError(
             f"{path} has {len(matched)} of the model's {len(names)} images: the model's {unmatched} is "
-            f"not in the database{there}; give the database this model was made from"
+            f"not in the database{there}; {ambiguity or 'give the database this model was made from'}"
         )
+    if ambiguity:
+        file.notes.append(f"{path}: {ambiguity}")
     return index_of_id
 
 

@@ -15,6 +15,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.files.lines import named_rows
 from sfm_shapefit.scene.given import Gravity
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import same_images
 
 _SIGMA_DEG = 1.0  # degrees; that of a phone, where the table states none
 _LEAST_SIGMA_DEG = 1e-3
@@ -41,10 +42,11 @@ def table_gravity(path: Path, images: Images) -> Gravity:
                 f"{_LEAST_SIGMA_DEG:g} and 90 deg"
             )
         rows[name] = [*values[:3], sigma]
-    index_of_name = {name: index for index, name in enumerate(images.names)}
-    found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
+    same = same_images(list(rows), images.names)
+    found = {k: row for k, row in zip(same.places.tolist(), rows.values(), strict=True) if k >= 0}
     if not found:
-        raise InputError(f"{path} has no gravity of the model's images, such as {images.names[0]}")
+        why = same.ambiguity or f"such as {images.names[0]}"
+        raise InputError(f"{path} has no gravity of the model's images, {why}")
     return _gravity(found)
 
 
@@ -55,11 +57,12 @@ def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
         InputError: if the database has none of these images, or a damaged one.
     """
     query = f"SELECT images.name, gravity FROM pose_priors JOIN images ON {PRIORS_OF_IMAGES}"
-    index_of_name = {name: index for index, name in enumerate(images.names)}
     found: dict[int, list[float]] = {}
     columns = ("corr_data_id", "corr_sensor_type", "gravity")
-    for name, blob in file.rows("pose_priors", {columns: query}):
-        if name not in index_of_name or blob is None:
+    rows = file.rows("pose_priors", {columns: query})
+    places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
+    for place, (name, blob) in zip(places, rows, strict=True):
+        if place < 0 or blob is None:
             continue
         if not isinstance(blob, bytes) or len(blob) != 24:
             raise InputError(
@@ -67,7 +70,7 @@ def database_gravity(file: DatabaseFile, images: Images) -> Gravity:
             )
         values = np.frombuffer(blob, dtype="<f8")
         if 1.0 / _LARGEST <= float(np.linalg.norm(values)) <= _LARGEST:
-            found[index_of_name[name]] = [*values.tolist(), _SIGMA_DEG]
+            found[place] = [*values.tolist(), _SIGMA_DEG]
     if not found:
         raise InputError(f"{file.path} has no gravity of its images; give a table (gravity=FILE)")
     return _gravity(found)

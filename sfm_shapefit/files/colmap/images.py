@@ -16,14 +16,29 @@ from sfm_shapefit.files.colmap.lenses import lens_of
 from sfm_shapefit.scene.images import Frames, Images, Sensors
 
 
+def name_of(image: pycolmap.Image) -> str:
+    """Return the name of an image; its bytes that are no UTF-8 become lone surrogates, as Python's own do."""
+    try:
+        return str(image.name)
+    except UnicodeDecodeError as error:
+        return error.object.decode("utf-8", "surrogateescape")
+
+
+def bytes_of_name(name: str) -> bytes:
+    """Return the name that a new image of pycolmap is to have."""
+    return name.encode("utf-8", "surrogateescape")
+
+
 def images_of(reconstruction: pycolmap.Reconstruction) -> Images:
     """Return all images of a reconstruction, in the order of their names, those of one name by their ids."""
-    images = sorted(reconstruction.images.values(), key=lambda image: (image.name, image.image_id))
+    every = ((name_of(image), image) for image in reconstruction.images.values())
+    named = sorted(every, key=lambda one: (one[0], one[1].image_id))
+    images = [image for _, image in named]
     frame_ids, frame_of = np.unique([image.frame_id for image in images], return_inverse=True)
     camera_ids, camera_of = np.unique([image.camera_id for image in images], return_inverse=True)
     rotations, centers = _poses(reconstruction, frame_ids.tolist())
     return Images(
-        names=tuple(image.name for image in images),
+        names=tuple(name for name, _ in named),
         ids=np.array([image.image_id for image in images], dtype=np.int64),
         frame_of=frame_of.ravel(),
         lens_of=camera_of.ravel(),

@@ -31,6 +31,7 @@ from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import Lens, Origin
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
+from sfm_shapefit.scene.same_images import same_images
 
 # COLMAP's TwoViewGeometryConfiguration: essential or fundamental matrix, not a homography.
 _WITH_DEPTH = (2, 3)
@@ -68,10 +69,12 @@ def find_uncalibrated(
     """
     columns = ("name", "camera_id")
     rows = database.rows("images", {columns: "SELECT name, camera_id FROM images"})
-    camera_ids, cameras = dict(rows), read_cameras(database).usable
+    places = same_images([str(name) for name, _ in rows], images.names).places.tolist()
+    camera_ids = {place: camera_id for place, (_, camera_id) in zip(places, rows, strict=True)}
+    cameras = read_cameras(database).usable
     found: dict[int, Uncalibrated] = {}
-    for number, name in zip(images.lens_of.tolist(), images.names, strict=True):
-        lens, camera = images.lenses[number], cameras.get(camera_ids.get(name, -1))
+    for image, number in enumerate(images.lens_of.tolist()):
+        lens, camera = images.lenses[number], cameras.get(camera_ids.get(image, -1))
         if number in found or camera is None or camera.model_name != lens.model:
             continue
         focal = camera.focal_length_idxs()[:1]  # none of a panorama

@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.base.arrays import IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
+from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
 from sfm_shapefit.files.colmap.points import points2d_xy
 from sfm_shapefit.files.colmap.seed import transform_model
 
@@ -24,9 +26,9 @@ def merge_models(
     """Return a new reconstruction of the posed images and points of both, and new ids of their points.
 
     Images without a pose are left out. Images of the same name are one, which stays where the first has it;
-    the observations of the second join its own where the keypoints are the same. Cameras of the same
-    id and parameters are one, rigs if also their sensors stand alike; others of `second` get new ids. Frames
-    of rigs stay together.
+    keypoints of the second that are none of the first's follow these, so that no observation is lost. Cameras
+    of the same id and parameters are one, rigs if also their sensors stand alike; others of `second` get new
+    ids. Frames of rigs stay together.
 
     Args:
         first, second: neither is changed.
@@ -46,7 +48,8 @@ def merge_models(
     used = sorted({moved.frame(frame_id).rig_id for frame_id in moved.reg_frame_ids()})
     rig_ids = {rig_id: _add_rig(joined, moved, moved.rig(rig_id), cameras) for rig_id in used}
     image_ids = _add_frames(joined, moved, cameras, rig_ids)
-    new, same = _add_points(joined, moved, image_ids)
+    places = {i: _add_keypoints(joined.image(now), moved.image(i)) for i, now in image_ids.items()}
+    new, same = _add_points(joined, moved, image_ids, places)
     renamed: dict[int, int] = {}
     for one, other in [*((one, new[other]) for one, other in same_points if other in new), *same]:
         if one not in renamed and other not in renamed.values():
@@ -63,14 +66,15 @@ def _add_frames(
     rig_ids: dict[int, int],
 ) -> dict[int, int]:
     """Add the posed frames that only the second model has, and return the new ids of all its posed images."""
-    there = {joined.image(i).name: i for i in joined.reg_image_ids()}
-    ids = {i: there[second.image(i).name] for i in second.reg_image_ids() if second.image(i).name in there}
+    there = {name_of(joined.image(i)): i for i in joined.reg_image_ids()}
+    named = {i: name_of(second.image(i)) for i in second.reg_image_ids()}
+    ids = {i: there[name] for i, name in named.items() if name in there}
     fresh = max([*joined.images, *second.images, *joined.frames, *second.frames], default=0) + 1
     for frame_id in sorted(second.reg_frame_ids()):
         own = [data.id for data in second.frame(frame_id).image_ids]
         if shared := [i for i in own if i in ids]:
             if len(shared) < len(own):
-                name = second.image(shared[0]).name
+                name = named[shared[0]]
                 raise InputError(f"a rig took {name} with images that only one of two models has")
             continue
         for i in own:
@@ -106,7 +110,7 @@ def _add_frame(
     """Add a posed frame of a second model with its images."""
     copies = [
         pycolmap.Image(
-            name=image.name,
+            name=bytes_of_name(name_of(image)),
             keypoints=points2d_xy(image),
             camera_id=renamed.cameras[image.camera_id],
             image_id=renamed.images[image.image_id],
@@ -124,27 +128,55 @@ def _add_frame(
     joined.register_frame(frame_id)
 
 
+def _add_keypoints(image: pycolmap.Image, other: pycolmap.Image) -> IntArray:
+    """Return which keypoint of an image each one (k,) of the same image in another model is.
+
+    Those that lie at none of its own are added behind these.
+    """
+    own, others = points2d_xy(image), points2d_xy(other)
+    if own.shape == others.shape and (np.abs(own - others) <= _SAME_PIXEL).all():
+        return np.arange(len(own))
+    places = np.full(len(others), -1)
+    if len(own) and len(others):
+        from scipy.spatial import KDTree  # here, since it takes long to import
+
+        apart, nearest = map(np.asarray, KDTree(own).query(others))
+        is_mutual = np.asarray(KDTree(others).query(own)[1])[nearest] == np.arange(len(others))
+        is_same = is_mutual & (apart <= _SAME_PIXEL)
+        places[is_same] = nearest[is_same]
+    fresh = np.flatnonzero(places < 0)
+    places[fresh] = len(own) + np.arange(len(fresh))
+    points2d = [*image.points2D, *pycolmap.Image(keypoints=others[fresh]).points2D]
+    image.points2D.clear()  # the setter insists on it
+    image.points2D = pycolmap.Point2DList(points2d)
+    return places
+
+
 def _add_points(
-    joined: pycolmap.Reconstruction, second: pycolmap.Reconstruction, image_ids: dict[int, int]
+    joined: pycolmap.Reconstruction,
+    second: pycolmap.Reconstruction,
+    image_ids: dict[int, int],
+    places: dict[int, IntArray],
 ) -> tuple[dict[int, int], list[tuple[int, int]]]:
     """Add the points of a second model; return their new ids, and those of points that are one.
 
-    Observations go with images whose keypoints are others in the first model, and points without two.
+    Images and their keypoints have the new ids and `places`. Points that the first model sees with all of
+    their keypoints are left out.
     """
-    is_same = {i: _have_same_keypoints(joined.image(now), second.image(i)) for i, now in image_ids.items()}
     new, same = {}, []
     last = max(joined.point3D_ids(), default=0)
     for point_id in sorted(second.point3D_ids()):
         point = second.point3D(point_id)
         track, meets = pycolmap.Track(), set()
         for element in point.track.elements:
-            if not is_same.get(element.image_id, False):
+            if element.image_id not in places:
                 continue
-            seen = joined.image(image_ids[element.image_id]).points2D[element.point2D_idx]
+            image_id, place = image_ids[element.image_id], int(places[element.image_id][element.point2D_idx])
+            seen = joined.image(image_id).points2D[place]
             if seen.has_point3D():
                 meets.add(int(seen.point3D_id))
             else:
-                track.add_element(image_ids[element.image_id], element.point2D_idx)
+                track.add_element(image_id, place)
         if track.length() + len(meets) < _LEAST_TRACK or not track.length():
             continue
         last += 1
@@ -154,11 +186,6 @@ def _add_points(
         joined.add_point3D_with_id(last, copy)
         same += [(one, last) for one in sorted(meets)[:1]]
     return new, same
-
-
-def _have_same_keypoints(one: pycolmap.Image, other: pycolmap.Image) -> bool:
-    first, second = points2d_xy(one), points2d_xy(other)
-    return first.shape == second.shape and bool((np.abs(first - second) <= _SAME_PIXEL).all())
 
 
 def _add_rig(

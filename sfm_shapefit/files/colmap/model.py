@@ -11,7 +11,7 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,16 +22,22 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
-from sfm_shapefit.base.wording import counted, first_of
-from sfm_shapefit.files.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files
-from sfm_shapefit.files.colmap.foreign_cameras import with_own_cameras
-from sfm_shapefit.files.colmap.images import images_of
+from sfm_shapefit.base.wording import counted, counted_are, first_of
+from sfm_shapefit.files.colmap.check import (
+    UNIT_QUATERNION_TOLERANCE,
+    ContradictionError,
+    binary_files,
+    name_contradiction,
+    walk_files,
+)
+from sfm_shapefit.files.colmap.images import bytes_of_name, images_of, name_of
 from sfm_shapefit.files.colmap.lenses import focal_lengths
+from sfm_shapefit.files.colmap.model_copies import with_own_cameras, without_points
 from sfm_shapefit.files.colmap.points import Observed, points2d_xy
 from sfm_shapefit.files.colmap.quiet import quiet_log
-from sfm_shapefit.files.model_folder import model_suffix
 from sfm_shapefit.files.norms import are_off, say_normalized
 from sfm_shapefit.scene.images import Images
+from sfm_shapefit.scene.same_images import names_among
 
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
@@ -77,7 +83,21 @@ class ColmapModel:
     @property
     def image_names(self) -> tuple[str, ...]:
         """Names of all images, posed or not."""
-        return tuple(image.name for image in self.reconstruction.images.values())
+        return tuple(name_of(image) for image in self.reconstruction.images.values())
+
+
+def renamed_as(model: ColmapModel, names: Sequence[str]) -> ColmapModel:
+    """Return a model whose images have the names that the same images have among others."""
+    called, _ = names_among(model.image_names, names)
+    changed = {old: new for old, new in called.items() if new != old}
+    if not changed:
+        return model
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for image in copy.images.values():
+        image.name = bytes_of_name(changed.get(name_of(image), name_of(image)))
+    old, new = next(iter(changed.items()))
+    note = f"{counted_are(len(changed), 'image')} called otherwise in an earlier model, such as {old} {new}"
+    return replace(read_model(copy), notes=(*model.notes, note))
 
 
 def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> ColmapModel:
@@ -104,7 +124,7 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
         label, reconstruction = "the reconstruction", source
     else:
         label, (reconstruction, observed, notes) = str(Path(source)), _load(Path(source))
-        is_checked = model_suffix(Path(source)) == ".bin"
+        is_checked = True
     try:
         with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
@@ -118,10 +138,19 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
 
 def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed, tuple[str, ...]]:
     """Check the files of a model and only then let pycolmap read them; with it come `ColmapModel.notes`."""
-    observed = check_model_files(folder)
     try:
-        with quiet_log(), with_own_cameras(folder, model_suffix(folder)) as (own, notes):
-            return pycolmap.Reconstruction(own), observed, notes
+        with quiet_log(), binary_files(folder) as files, with_own_cameras(files) as own:
+            try:
+                observed = walk_files(own)
+                return pycolmap.Reconstruction(own.folder), observed, own.notes
+            except ContradictionError as error:
+                reason = str(error)
+            except PYCOLMAP_ERRORS:
+                reason = name_contradiction(own)
+                if not reason:
+                    raise
+            with without_points(own, reason) as bare:
+                return pycolmap.Reconstruction(bare.folder), walk_files(bare), bare.notes
     except PYCOLMAP_ERRORS as error:
         raise InputError(
             f"{folder} cannot be read as a COLMAP model ({_first_line(error)}); write it again with COLMAP"

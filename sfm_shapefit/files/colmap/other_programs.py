@@ -4,6 +4,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.files.colmap.images import bytes_of_name
 from sfm_shapefit.files.colmap.lenses import camera_of
 from sfm_shapefit.files.colmap.points import add_points
 from sfm_shapefit.files.onedsfm import EpipolarGeometries
@@ -21,7 +22,10 @@ def reconstruction_of(read: OpenSfmModel) -> pycolmap.Reconstruction:
         rotation, camera_id = images.frames.rotations[k], images.lenses[images.lens_of[k]].id
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ images.frames.centers[k])
         image = pycolmap.Image(
-            name=images.names[k], keypoints=xy, camera_id=camera_id, image_id=int(images.ids[k])
+            name=bytes_of_name(images.names[k]),
+            keypoints=xy,
+            camera_id=camera_id,
+            image_id=int(images.ids[k]),
         )
         model.add_image_with_trivial_frame(image, pose)
     add_points(model, images.ids, read.points, read.colors)

@@ -1,6 +1,5 @@
 """Seeded models: cameras, rigs and image names of the input, our poses and points."""
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +13,8 @@ import pycolmap
 from sfm_shapefit.base.arrays import FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import Similarity
-from sfm_shapefit.files.colmap.check import IMAGE, NO_POINT, POINT2D, POINT3D, check_model_files
+from sfm_shapefit.files.colmap.binary_records import COUNT, IMAGE, NO_POINT, POINT2D, POINT3D
+from sfm_shapefit.files.colmap.check import check_model_files
 from sfm_shapefit.files.colmap.images import put_images
 from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.point_colors import color_points
@@ -23,7 +23,6 @@ from sfm_shapefit.files.colmap.template import Template
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.points import Points
 
-_COUNT = struct.Struct("<Q")
 _POINTS_AT_ONCE = 2**16  # points whose bytes are put together at once; all of 10,000 images take 70 MB
 
 
@@ -122,7 +121,7 @@ class SeededModel:
         with (folder / "images.bin").open("wb") as stream:
             stream.writelines(self._images_with_points(bare))
         with (folder / "points3D.bin").open("wb") as stream:
-            stream.write(_COUNT.pack(self.points.num_points))
+            stream.write(COUNT.pack(self.points.num_points))
             for first in range(0, self.points.num_points, _POINTS_AT_ONCE):
                 stream.write(self._bytes_of_points(first, first + _POINTS_AT_ONCE))
 
@@ -136,20 +135,20 @@ class SeededModel:
         """Yield the parts of images.bin, given what it is without points."""
         row_of = {image_id: row for row, image_id in enumerate(self.images.ids.tolist())}
         rows_of, ids = self.points.rows_of_images(self.images.num_images), self.points.ids
-        seen, at = self.points.points_seen(), _COUNT.size
+        seen, at = self.points.points_seen(), COUNT.size
         yield bare[:at]
         while at < len(bare):
             row = row_of[int.from_bytes(bare[at : at + 4], "little")]
             end = bare.index(b"\0", at + IMAGE.size) + 1
-            (count,) = _COUNT.unpack_from(bare, end)
-            points2d = np.frombuffer(bare, POINT2D, count, end + _COUNT.size).copy()
+            (count,) = COUNT.unpack_from(bare, end)
+            points2d = np.frombuffer(bare, POINT2D, count, end + COUNT.size).copy()
             if len(self.keypoints[row]):
                 points2d = np.empty(len(self.keypoints[row]), POINT2D)
                 points2d["xy"] = self.keypoints[row]
             points2d["point3d_id"] = NO_POINT
             points2d["point3d_id"][self.points.keypoints[rows_of[row]]] = ids[seen[rows_of[row]]]
-            yield from (bare[at:end], _COUNT.pack(len(points2d)), points2d.tobytes())
-            at = end + _COUNT.size + count * POINT2D.itemsize
+            yield from (bare[at:end], COUNT.pack(len(points2d)), points2d.tobytes())
+            at = end + COUNT.size + count * POINT2D.itemsize
 
     def _bytes_of_points(self, first: int, last: int) -> bytes:
         """Return the records of some points in points3D.bin."""

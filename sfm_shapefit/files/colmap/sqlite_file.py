@@ -24,6 +24,9 @@ from sfm_shapefit.base.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_irregular_file
 
+DATABASE_NAMES = ("database.db", "colmap.db")
+"""What COLMAP's own tools, and instant-ngp's, call their databases."""
+
 _SIDECARS = ("-wal", "-journal")
 _WAL_VERSION = 2  # bytes 18 and 19 of the header; they are 2 where the file has a write-ahead log
 _LOCK_TIMEOUT_S = 2.0  # seconds; another program that writes is waited for so long
@@ -52,16 +55,23 @@ def is_between(value: object, least: int, bound: int) -> bool:
 
 
 def database_in(path: Path) -> Path:
-    """Return the database of a folder, which is its database.db; any other path is that of a database.
+    """Return the database of a folder, see `database_beside`; any other path is that of a database.
 
     Raises:
         InputError: if the folder has none.
     """
     if not path.is_dir():
         return path
-    if not (path / "database.db").is_file():
-        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
-    return path / "database.db"
+    found = database_beside(path)
+    if found is None:
+        raise InputError(f"{path} is a folder without a {DATABASE_NAMES[0]}; give the database file itself")
+    return found
+
+
+def database_beside(folder: Path) -> Path | None:
+    """Return the database that a folder has by a usual name; None if it has none."""
+    paths = (folder / name for name in DATABASE_NAMES)
+    return next((path for path in paths if os.path.isfile(path)), None)  # False where none may be read
 
 
 class DatabaseFile:

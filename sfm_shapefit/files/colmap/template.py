@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.base.arrays import BoolArray
+from sfm_shapefit.files.colmap.images import bytes_of_name, name_of
 from sfm_shapefit.files.colmap.model import ColmapModel
 from sfm_shapefit.files.colmap.point_colors import PointColors, read_colors
 from sfm_shapefit.files.colmap.points import points2d_xy
@@ -38,7 +39,7 @@ class Template:
     @property
     def image_names(self) -> tuple[str, ...]:
         """Names of all images, posed or not."""
-        return tuple(image.name for image in self.images)
+        return tuple(name_of(image) for image in self.images)
 
     def build(self) -> pycolmap.Reconstruction:
         """Return a new model without points, its frames where they were."""
@@ -94,7 +95,10 @@ def bare_image(image: pycolmap.Image, *, keeps_keypoints: bool) -> pycolmap.Imag
     """Return an image by itself, in no frame, whose keypoints observe nothing."""
     keypoints = points2d_xy(image) if keeps_keypoints else np.zeros((0, 2))
     return pycolmap.Image(
-        name=image.name, camera_id=image.camera_id, image_id=image.image_id, keypoints=keypoints
+        name=bytes_of_name(name_of(image)),
+        camera_id=image.camera_id,
+        image_id=image.image_id,
+        keypoints=keypoints,
     )
 
 

@@ -33,6 +33,7 @@ class TrackMatches(Matches):
     def __init__(self, model: ColmapModel) -> None:
         """Collect what the images observe, and count the matches of each pair."""
         super().__init__()
+        self.lacking = "" if model.reconstruction.num_points3D() else "; ".join(model.notes)
         self.names = model.images.names
         images = [model.reconstruction.image(i) for i in model.images.ids.tolist()]
         self._model, self._images = model.reconstruction, dict(zip(self.names, images, strict=True))

@@ -1,0 +1,48 @@
+"""Observations in another resolution than their cameras, recognized by the points that they see.
+
+Programs that shrink pictures write the pixels of one size and the cameras of another. Pixels count from the
+corner, so that each observation is then the projection of its point times a factor that all images share; a
+wrong focal length scales from the middle instead.
+"""
+
+import numpy as np
+
+from sfm_shapefit.judgement.conventions import Recognized
+from sfm_shapefit.scene.images import Images, Pictures
+from sfm_shapefit.scene.points import Points
+
+_GROSS_PX = 2.0  # median reprojection error in pixels; smaller ones are no matter of the resolution
+_VANISHES = 0.25  # largest share of this error that is left at the right scale
+_LEAST_CHANGE = 0.01  # of the scale
+_FAR = 0.25  # share of the picture from its corner on where projections tell the scale
+_MOST_IMAGES = 200  # images that are asked, evenly
+
+
+def recognize_resolution(points: Points, images: Images, pictures: Pictures) -> Recognized | None:
+    """Return by what factors observations are scaled; None if by none that explains their errors."""
+    seen, rows_of, found = points.points_seen(), points.rows_of_images(images.num_images), []
+    for k in range(0, images.num_images, -(-images.num_images // _MOST_IMAGES)):
+        rows, size = rows_of[k], images.sizes_px[k]
+        in_camera = (points.xyz[seen[rows]] - images.centers[k]) @ images.rotations[k].T
+        both = np.stack([pictures.pixels(k, points.keypoints[rows]), pictures.project(k, in_camera)], axis=1)
+        found.append(np.append(both, np.broadcast_to(size, (len(rows), 1, 2)), axis=1))
+    pixels, projected, sizes = np.concatenate(found).transpose(1, 0, 2)
+    far = (projected > _FAR * sizes) & (projected < sizes)  # false for NaN
+    if not far.any(axis=0).all():
+        return None
+    scales = np.array([np.median(pixels[far[:, a], a] / projected[far[:, a], a]) for a in (0, 1)])
+    before, after = (
+        np.nanmedian(np.linalg.norm(pixels / s - projected, axis=1)) for s in (np.ones(2), scales)
+    )
+    if not (
+        before > _GROSS_PX and after <= _VANISHES * before and np.abs(scales - 1.0).max() > _LEAST_CHANGE
+    ):
+        return None
+    width, height = np.round(sizes[0]).astype(int).tolist()
+    by = f"{scales.mean():.3g}" if np.ptp(scales) <= _LEAST_CHANGE else f"{scales[0]:.3g} and {scales[1]:.3g}"
+    own = " x ".join(map(str, np.round(scales * sizes[0]).astype(int).tolist()))
+    return Recognized(
+        f"points2D look scaled by {by}, as those of pictures {own} where the camera has {width} x {height}: "
+        f"their median reprojection error is {before:.3g} px, and {after:.2g} px at its scale",
+        "bring both to one resolution",
+    )

@@ -1,0 +1,72 @@
+"""Ask whether an input is in another program's convention, or resolution, where its matches contradict it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.base.errors import UnsolvableError
+from sfm_shapefit.facts.result import LocateResult
+from sfm_shapefit.files.colmap.points import ModelPictures
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
+from sfm_shapefit.judgement.conventions import Recognized, Written, recognize_convention
+from sfm_shapefit.judgement.grade import IS_ITS_DATABASE, Grade
+from sfm_shapefit.judgement.resolutions import recognize_resolution
+from sfm_shapefit.pipeline.doubts import ask_rotations, rank_within
+from sfm_shapefit.pipeline.inputs import MatchSource
+
+_FIRST_PAIRS = 3  # pairs of each image that are asked, those with most matches
+_MOST_PAIRS = 200  # pairs that are asked at all; a second
+
+
+def ask_convention(source: MatchSource, threads: int) -> Recognized | None:
+    """Return the convention that the poses of a source look like; None if it is the one they are read by.
+
+    In rigs of several cameras, whose poses are of frames, none is recognized.
+    """
+    view, folder = source.view, source.inputs.folder
+    if source.images.has_rigs or not view.num_pairs:
+        return None
+    written: Written = "colmap"
+    if folder is not None and not folder.is_dir():
+        written = "nerf" if folder.suffix.lower() == ".json" else "tum"
+    counts = np.repeat(-view.matches.num_matches[view.rows].astype(np.int64), 2)
+    rank = rank_within(view.pairs.ravel(), counts).reshape(-1, 2).min(axis=1)
+    chosen = np.lexsort((counts[::2], rank))[:_MOST_PAIRS]
+    asked = view.pairs[np.sort(chosen[rank[chosen] < _FIRST_PAIRS])]
+    return recognize_convention(source.images.rotations, ask_rotations(source, asked, threads), written)
+
+
+def _ask_input(source: MatchSource, threads: int) -> Recognized | None:
+    """Return what an input seems to be instead; without a database its points tell, too."""
+    view, recognized = source.view, None
+    if isinstance(source.matches, TrackMatches):
+        pictures = ModelPictures(view.images, view.keypoints, view.num_keypoints)
+        recognized = recognize_resolution(source.matches.points_of(view.images), view.images, pictures)
+    return recognized or ask_convention(source, threads)
+
+
+@contextmanager
+def naming_convention(source: MatchSource, threads: int) -> Iterator[None]:
+    """Say in what convention the input seems to be, where its cameras cannot be placed.
+
+    Raises:
+        UnsolvableError: that says so, or as before.
+    """
+    try:
+        yield
+    except UnsolvableError as error:
+        if recognized := _ask_input(source, threads):
+            raise UnsolvableError(recognized.sentence) from error
+        raise
+
+
+def tell_convention(found: LocateResult, source: MatchSource, threads: int) -> LocateResult:
+    """Return a result that is not good with the convention that its input is in, if that can be told."""
+    recognized = None if found.verdict.grade is Grade.GOOD else _ask_input(source, threads)
+    if recognized is None:
+        return found
+    others = tuple(reason for reason in found.suspicions if not reason.endswith(IS_ITS_DATABASE))
+    warnings = (recognized.sentence, *found.warnings)
+    return replace(found, recognized=recognized.clause, suspicions=others, warnings=warnings)

@@ -1,0 +1,125 @@
+"""The world in which a model is written: its own, that of a system of coordinates on Earth, or shifted.
+
+Systems on Earth are curved, so that places and poses go there one by one: each camera by the turn and scale
+that the system has where it stands. A model goes as one by what they are at its middle, and so keeps its
+reprojection errors; `World.bend` says how far its cameras then stand from their own coordinates.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.base.arrays import FloatArray
+from sfm_shapefit.base.errors import InputError
+from sfm_shapefit.base.geometry import Similarity, nearest_rotations
+from sfm_shapefit.files.colmap.earth import epsg_code, to_epsg
+from sfm_shapefit.files.lines import is_number
+from sfm_shapefit.pipeline.evaluate import datum_of
+from sfm_shapefit.scene.given import Datum
+from sfm_shapefit.scene.images import Images
+
+_STEP = 100.0  # meters, half the distance over which turn and scale are measured; the error is below 1e-9
+_LARGEST = 1e9  # units; larger offsets would swallow the digits of coordinates
+_ROUND = 100.0  # units; offsets that are found are multiples of it, as surveyors choose them
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class World:
+    """Where what is written stands."""
+
+    datum: Datum | None = None
+    """Where the model's own axes are on Earth; None where no other system is asked for."""
+    code: int = 0
+    """EPSG code of the system; 0 without one."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What is subtracted from all coordinates."""
+
+    @property
+    def is_own(self) -> bool:
+        """Whether it is the model's own, in which places and poses stay what they are, to the bit."""
+        return self.datum is None and not any(self.offset)
+
+    @property
+    def offset_line(self) -> bytes:
+        """The offset as Pix4D's offset.xyz has it; nothing if it is 0."""
+        return "{!r} {!r} {!r}\n".format(*self.offset).encode() if any(self.offset) else b""
+
+    @property
+    def statement(self) -> str:
+        """System and offset in words; empty for the model's own."""
+        offset = "offset {!r} {!r} {!r}".format(*self.offset) if any(self.offset) else ""
+        return ", ".join(filter(None, [f"EPSG:{self.code}" if self.code else "", offset]))
+
+    def places(self, own: FloatArray) -> FloatArray:
+        """Return places (k, 3) of the model where they stand."""
+        there = own if self.datum is None else to_epsg(own, self.datum, self.code)
+        return np.asarray(there - self.offset)
+
+    def slopes(self, own: FloatArray) -> FloatArray:
+        """Return the derivatives (k, 3, 3) of where places (k, 3) stand."""
+        if self.datum is None:
+            return np.tile(np.eye(3), (len(own), 1, 1))
+        steps = _STEP * np.eye(3)
+        ends = [self.places((own[:, None] + sign * steps).reshape(-1, 3)) for sign in (1.0, -1.0)]
+        return np.asarray((ends[0] - ends[1]).reshape(-1, 3, 3).swapaxes(1, 2) / (2.0 * _STEP))
+
+    def poses(self, images: Images) -> Images:
+        """Return images where they stand, each for itself."""
+        if self.is_own:
+            return images
+        turns = nearest_rotations(self.slopes(images.centers)).swapaxes(1, 2)
+        order = np.argsort(images.ids)  # as the frames are when images are apart
+        return images.apart().posed((images.rotations @ turns)[order], self.places(images.centers)[order])
+
+    def similarity(self, centers: FloatArray) -> Similarity:
+        """Return how a model with cameras at centers (k, 3) goes there as one."""
+        middle = np.median(centers, axis=0)[None]
+        if self.datum is None:
+            return Similarity(scale=1.0, rotation=np.eye(3), translation=-np.array(self.offset))
+        slope = self.slopes(middle)
+        scale, rotation = float(np.cbrt(np.linalg.det(slope[0]))), nearest_rotations(slope)[0]
+        shift = (self.places(middle) - scale * middle @ rotation.T)[0]
+        return Similarity(scale=scale, rotation=rotation, translation=shift)
+
+    def bend_statement(self, centers: FloatArray) -> str:
+        """Say how far cameras stand from their own coordinates where their model goes as one, if they do."""
+        off = self.similarity(centers).apply(centers) - self.places(centers)
+        most = float(np.linalg.norm(off, axis=1).max(initial=0.0))
+        return (
+            f"; as one model, up to {most:.2g} m from the coordinates of each camera" if most > 1e-3 else ""
+        )
+
+
+def world_of(source: Any, centers: FloatArray, crs: str, offset: str) -> World:
+    """Return the world in which a model is to be written.
+
+    Args:
+        source: the model, a folder or a result, that may have a datum.
+        centers: (k, 3) of its cameras.
+        crs: a system as of `epsg_code`; empty for the model's own axes.
+        offset: three numbers with commas between them, or auto: the cameras' middle in round numbers.
+
+    Raises:
+        InputError: if nothing says where on Earth the model stands, or `crs` or `offset` is none.
+    """
+    world = World()
+    if crs:
+        datum = datum_of(source)
+        if datum is None:
+            label = source if isinstance(source, Path | str) else "the model"
+            raise InputError(
+                f"{label} has no datum, so that nothing says where on Earth it stands; convert the output of "
+                "locate or map with --priors or --control-points of known latitude and longitude"
+            )
+        world = World(datum=datum, code=epsg_code(crs, datum))
+    if offset == "auto":
+        middle = np.median(world.places(centers), axis=0)
+        x, y, z = (_ROUND * np.round(middle / _ROUND)).tolist()
+    elif offset:
+        words = offset.replace(",", " ").split()
+        if len(words) != 3 or not all(is_number(word) and abs(float(word)) < _LARGEST for word in words):
+            raise InputError(f"the offset must be auto, or three numbers as 481300,5782900,0; got {offset!r}")
+        x, y, z = map(float, words)
+    return replace(world, offset=(x, y, z)) if offset else world
