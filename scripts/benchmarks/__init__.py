@@ -16,6 +16,7 @@ INDEX = {
     "join": "Models cut into pieces and joined by a few of the pairs between: right, refused, wrong.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
     "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
+    "panoramas": "Native panoramas against a cubemap rig of one rendered yard, beside global mapping.",
     "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
     "real": "Real scenes against their ground truth, as delivered and by the placement alone.",
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",

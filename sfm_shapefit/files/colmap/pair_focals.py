@@ -25,7 +25,9 @@ from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 _HEAD = struct.Struct("<IiQQBQ")
 _WIDTH = 0.03  # scatter of logs of focal lengths; that of right pairs of castle-P30 and lego100
 _NEAR = 3.0  # such widths; pairs within agree
-_FEWEST, _LEAST_SHARE = 3, 0.5  # pairs that agree, and their share of the matches; fewer prove nothing
+# Pairs that agree, their share of the matches and of the pairs; with fewer, those of liberty, most of which
+# are of wrong matches, agree on focal lengths that are off by a factor of two.
+_FEWEST, _LEAST_SHARE, _LEAST_OF_PAIRS = 3, 0.5, 0.4
 _MOST_PAIRS = 50_000  # pairs of most matches; 65 bytes each
 _MOST_OF_CAMERA = 500  # pairs of a camera that take part; the time grows with their square
 
@@ -84,7 +86,8 @@ def _agreed(pairs: FloatArray) -> PairFocal | None:
     kernel = np.exp(-0.5 * ((logs[:, None] - logs) / _WIDTH) ** 2)
     peak = logs[np.argmax(kernel @ matches)]
     near = np.abs(logs - peak) <= _NEAR * _WIDTH
-    if near.sum() < _FEWEST or matches[near].sum() <= _LEAST_SHARE * matches.sum():
+    is_most = matches[near].sum() > _LEAST_SHARE * matches.sum() and near.mean() >= _LEAST_OF_PAIRS
+    if near.sum() < _FEWEST or not is_most:
         return None
     order = np.argsort(logs[near], kind="stable")
     weights = np.cumsum(matches[near][order])
