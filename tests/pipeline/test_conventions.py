@@ -9,11 +9,13 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.base.errors import UnsolvableError
 from sfm_shapefit.base.geometry import FLIP_YZ, fit_similarity
+from sfm_shapefit.judgement.conventions import recognize_convention
 from sfm_shapefit.judgement.grade import Grade
+from sfm_shapefit.pairs.relative_rotations import RelativeRotations
 from sfm_shapefit.pipeline.check import check
 from sfm_shapefit.pipeline.convert import convert
 from tests.models import centers_of, posed
-from tests.scenes import COURTYARD, RING
+from tests.scenes import COURTYARD, RING, copied, edit_database
 
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
 OPENGL = "OpenGL's camera axes"
@@ -144,3 +146,34 @@ def test_what_needs_positions_takes_images_without_one_for_unposed_and_says_so(t
     assert told.facts.warnings[0] == errors.warnings[0]
     with pytest.raises(sfm_shapefit.InputError, match=r"of 8 of 8 images the position is not known.*locate"):
         check(nowhere(truth, 8))
+
+
+def test_an_image_that_is_not_placed_has_no_pose_whatever_its_position_was(tmp_path):
+    last = 8  # pair_id is 2147483647 times the smaller id, plus the larger
+    scene = copied(RING, tmp_path)
+    edit_database(
+        scene / "database.db", f"DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = {last}"
+    )
+    found = sfm_shapefit.locate(nowhere(scene / "sparse" / "0", 8), scene / "database.db").reconstruction
+    assert sorted(found.reg_image_ids()) == [i for i in sorted(found.images) if i != last]
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_on_a_turntable_right_poses_are_no_convention_and_others_may_be_two(turns):
+    angles = np.radians(20.0 * np.arange(8))
+    cosines, sines, zeros = np.cos(angles), np.sin(angles), np.zeros(8)
+    rows = [[cosines, zeros, sines], [zeros, zeros + 1.0, zeros], [-sines, zeros, cosines]]
+    rotations = np.array(rows).transpose(2, 0, 1)
+    i, j = np.triu_indices(8, 1)
+    relative = RelativeRotations(
+        pairs=np.column_stack([i, j]),
+        rotations=rotations[j] @ rotations[i].transpose(0, 2, 1),
+        information=np.tile(np.eye(3), (len(i), 1, 1)),
+        num_matches=np.full(len(i), 100),
+        weight_shares=np.ones(len(i)),
+    )
+    found = recognize_convention(rotations.transpose(0, 2, 1) if turns else rotations, relative, "model")
+    assert (found is not None) == turns
+    if found is not None:
+        assert "camera-to-world" in found.clause
+        assert OPENGL in found.clause
