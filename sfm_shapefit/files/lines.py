@@ -12,6 +12,7 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.paths import refuse_irregular_file
+from sfm_shapefit.scene.same_images import same_images
 
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words, for Python does not convert them
 _DATABASE = b"SQLite format 3\0"
@@ -230,12 +231,12 @@ def rotations_by_name(
     """
     ids = [row[column] for row in table.rows]
     table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
-    row_of = {name: row for row, name in enumerate(ids)}
-    has_one = np.array([name in row_of for name in names], dtype=np.bool_)
+    row_of = same_images(names, ids).places
+    has_one = row_of >= 0
     if not has_one.any():
         raise InputError(f"{table.file} has a rotation of none of the {len(names)} cameras; check its ids")
     chosen = np.tile(np.eye(3), (len(names), 1, 1))
-    chosen[has_one] = rotations[[row_of[name] for name in names if name in row_of]]
+    chosen[has_one] = rotations[row_of[has_one]]
     return chosen, has_one
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.colmap.model import ColmapModel, read_model
+from sfm_shapefit.files.colmap.track_matches import TrackMatches
 from tests.scenes import ROOT, fingerprint
 
 Change = Callable[[str], str]
@@ -144,6 +145,12 @@ def test_poses_typed_one_line_each_are_read_and_some_second_lines_alone_are_refu
         InputError, match=r"images\.txt:6: the line of its points is missing; each image has two"
     ):
         read_model(written(tmp_path, images=PLAIN["images"].removesuffix("\n\n")))
+
+
+def test_a_keypoint_that_only_a_track_gives_to_a_point_observes_it_as_for_pycolmap(tmp_path: Path) -> None:
+    model = read_model(written(tmp_path, images=PLAIN["images"].replace("1.5 2.25 7", "1.5 2.25 -1")))
+    assert content(model.reconstruction) == content(pycolmap.Reconstruction(tmp_path))
+    assert TrackMatches(model).num_matches.tolist() == [1]
 
 
 CONTRADICTIONS = {

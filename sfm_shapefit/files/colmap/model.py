@@ -113,7 +113,7 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
             refuses them, if the pose of a sensor in its rig is not known, or if fewer than two images have a
             pose.
     """
-    is_checked, source = False, model_of(source)
+    source = model_of(source)
     observed: Observed = {}
     notes: tuple[str, ...] = ()
     if not isinstance(source, pycolmap.Reconstruction | Path | str):
@@ -124,10 +124,9 @@ def read_model(source: ModelSource, *, rotations_suffice: bool = False) -> Colma
         label, reconstruction = "the reconstruction", source
     else:
         label, (reconstruction, observed, notes) = str(Path(source)), _load(Path(source))
-        is_checked = True
     try:
         with quiet_log():
-            _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
+            _refuse_inconsistent(label, reconstruction, is_checked=reconstruction is not source)
             reconstruction, note = _with_unit_quaternions(reconstruction, source)
             model = _posed_model(label, reconstruction, observed)
             model = replace(model, notes=(*notes, *filter(None, [note])))
@@ -141,8 +140,10 @@ def _load(folder: Path) -> tuple[pycolmap.Reconstruction, Observed, tuple[str, .
     try:
         with quiet_log(), binary_files(folder) as files, with_own_cameras(files) as own:
             try:
-                observed = walk_files(own)
-                return pycolmap.Reconstruction(own.folder), observed, own.notes
+                observed, model = walk_files(own), pycolmap.Reconstruction(own.folder)
+                # pycolmap lets a keypoint of no point observe the one whose track has it.
+                same = {i: s for i, s in observed.items() if len(s[0]) == model.image(i).num_points3D}
+                return model, same, own.notes
             except ContradictionError as error:
                 reason = str(error)
             except PYCOLMAP_ERRORS:
