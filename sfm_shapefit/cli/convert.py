@@ -22,7 +22,10 @@ _DESCRIBED = "; ".join(f"{name}: {one.help}" for name, one in FORMATS.items())
 def convert_command(
     model: Annotated[
         Path | None,
-        typer.Argument(metavar="MODEL", help="COLMAP model folder, OpenSfM's reconstruction.json, transforms.json or trajectory."),
+        typer.Argument(
+            metavar="MODEL",
+            help="COLMAP model folder, OpenSfM's reconstruction.json, transforms.json or trajectory.",
+        ),
     ] = None,
     out: Annotated[Path | None, typer.Argument(metavar="OUT", help="File or folder to be made.")] = None,
     *,
