@@ -68,7 +68,7 @@ def check_command(
         from sfm_shapefit.files.model_folder import refuse_no_model
 
         refuse_no_model(source)
-        from sfm_shapefit.files.colmap.model import read_model
+        from sfm_shapefit.files.colmap.listed_poses import read_source
         from sfm_shapefit.files.colmap.quiet import hear_pycolmap
         from sfm_shapefit.pipeline.check import check
         from sfm_shapefit.pipeline.write import refuse_file
@@ -77,7 +77,7 @@ def check_command(
             raise InputError("pictures of the images go into a page; name it with --report")
         if report is not None:  # now, not when all is computed
             if report.exists() and not overwrite:
-                read_model(source)  # what is wrong with that is said first
+                read_source(source, database)  # what is wrong with that is said first
             refuse_file(report, overwrite=overwrite)
         with show_progress(not (quiet or as_json)) as progress, hear_pycolmap(False):
             found = check(source, database, second_opinion=second_opinion, progress=progress)

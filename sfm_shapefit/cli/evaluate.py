@@ -33,7 +33,7 @@ def evaluate_command(
         Path | None,
         typer.Argument(
             metavar="REF",
-            help="COLMAP model with the true poses, or a table (.csv, .txt) of known positions such as GPS.",
+            help="Model with the true poses, also transforms.json, or a table (.csv, .txt) of positions.",
         ),
     ] = None,
     *,

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.files.lines import text_of
+
+_LARGEST = (
+    1e100  # absolute value of a number; squares of larger ones overflow, so that these count as infinite
+)
 
 
 def read_json(file: Path) -> Any:
@@ -67,7 +69,7 @@ class JsonNode:
         """Return a finite number."""
         if isinstance(self.value, bool) or not isinstance(self.value, int | float):
             raise self.error("is no number")
-        if not np.isfinite(self.value):
+        if not abs(self.value) <= _LARGEST:  # false for NaN
             raise self.error("is not finite")
         return float(self.value)
 

@@ -29,6 +29,9 @@ from sfm_shapefit.scene.listed_poses import ListedPoses
 
 _LEAST_ANGLE_RAD = 1e-3  # radians, angle of view; no lens has so small a one, and none has 0
 
+_LEAST_SCALE = 1e-100  # factor of a world; what is smaller is none, and divides to infinity
+_LARGEST_SIDE = 2**31  # pixels; no picture has such a side
+
 _MODELS = {
     "SIMPLE_PINHOLE": ("OPENCV", 1, ()),
     "PINHOLE": ("OPENCV", 2, ()),
@@ -68,7 +71,10 @@ def read_nerf(file: Path) -> ListedPoses:
     frames = content.get("frames").elements()
     turns, centers = _poses([frame.get("transform_matrix") for frame in frames])
     if content.has("applied_scale"):
-        centers = centers / content.get("applied_scale").number()
+        scale = content.get("applied_scale").number()
+        if scale < _LEAST_SCALE:
+            raise content.get("applied_scale").error("is not positive")
+        centers = centers / scale
     if content.has("applied_transform"):
         (turn,), (shift,) = _poses([content.get("applied_transform")])
         turns, centers = turn.T @ turns, (centers - shift) @ turn
@@ -126,7 +132,7 @@ class _Intrinsics(NamedTuple):
 
     def read(self) -> Lens | None:
         """Return the lens; None where size or focal length is missing, or COLMAP has no such model."""
-        if not (self.number("w") >= 1.0 and self.number("h") >= 1.0):
+        if not all(1.0 <= self.number(side) <= _LARGEST_SIDE for side in "wh"):
             return None
         width, height = int(self.number("w")), int(self.number("h"))
         kind = "OPENCV" if (node := self.node("camera_model")) is None else node.text()

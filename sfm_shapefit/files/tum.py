@@ -32,6 +32,7 @@ _COLUMNS = tuple(range(1, 8))  # columns of tx ty tz qx qy qz qw; a header may n
 _KEYS = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _UNIT = re.compile(r"\[.*?\]")
 _TURN = re.compile(r"(^|[^a-z])q|quat|orient|rot")  # in the name of a column of the quaternion
+_MOST_DIGITS = 400  # digits of a timestamp before or after its point; numbers in double precision have fewer
 _KITTI = 12  # numbers of a line of KITTI's poses; these name no image
 
 
@@ -54,7 +55,8 @@ def read_tum(file: Path) -> ListedPoses:
         cells = [words[k] if k < len(words) else "" for k in (0, *columns)]
         values = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
         norm = np.linalg.norm(values[None, 4:], axis=1)
-        if len(words) == _KITTI or not (np.isfinite(values).all() and may_be_rotations(norm).all()):
+        is_pose = bool(np.isfinite(values).all()) and bool(may_be_rotations(norm).all())
+        if len(words) == _KITTI or not is_pose or abs(Decimal(words[0]).adjusted()) > _MOST_DIGITS:
             raise InputError(f"{file}, line {number}: expected timestamp tx ty tz qx qy qz qw")
         names.append(f"{Decimal(words[0]):f}")
         poses.append(values[1:])

@@ -14,6 +14,7 @@ from sfm_shapefit.files.nerf import read_nerf
 from sfm_shapefit.files.tum import read_tum
 from sfm_shapefit.pipeline.convert import convert
 from sfm_shapefit.pipeline.evaluate import evaluate
+from sfm_shapefit.pipeline.locate import locate
 from tests.models import poses_of
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, edit_database
@@ -360,3 +361,20 @@ def test_transforms_json_names_the_points_that_stand_beside_it(tmp_path):
     assert f"element vertex {pycolmap.Reconstruction(RING / 'sparse' / '0').num_points3D()}" in head
     with pytest.raises(InputError, match="scene"):
         convert(RING / "sparse" / "0", tmp_path / "scene.json")
+
+
+def test_known_poses_without_points_are_enough_beside_a_database(tmp_path):
+    truth = pycolmap.Reconstruction(RING / "sparse" / "0")
+    blank = pycolmap.Reconstruction(truth)
+    for point_id in list(blank.point3D_ids()):
+        blank.delete_point3D(point_id)
+    (tmp_path / "text").mkdir()
+    blank.write_text(tmp_path / "text")
+    convert(truth, tmp_path / "half.tum")
+    lines = (tmp_path / "half.tum").read_text().splitlines()[1:6]
+    (tmp_path / "half.tum").write_text("\n".join(line.replace(" ", ", ") for line in lines))
+    for given, count in ((tmp_path / "text", 8), (tmp_path / "half.tum", 5)):
+        found = locate(given, RING / "database.db")
+        assert len(found.reconstruction.reg_image_ids()) == count
+        assert found.reconstruction.num_points3D() > 100
+        assert evaluate(found, truth).position.max < 1e-5

@@ -187,7 +187,7 @@ def _scaled(lens: Lens | None, camera: pycolmap.Camera) -> Lens | None:
 
 def _is_calibrated(lens: Lens) -> bool:
     """Return whether a lens is more than a focal length."""
-    if "FISHEYE" in lens.model or lens.model == "EQUIRECTANGULAR":
+    if "FISHEYE" in lens.model or lens.is_panorama:
         return True
     camera = camera_of(lens)
     off_px = np.abs(camera.params[camera.principal_point_idxs()] - [0.5 * lens.width, 0.5 * lens.height])
