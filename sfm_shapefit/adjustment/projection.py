@@ -1,14 +1,18 @@
 """How an observation looks at its point: the pixel that a camera sees it at, and derivatives of that.
 
 The parts of which kernels of an adjustment are made. Each camera is a row of numbers, `views`, see
-`residuals.kernel_inputs`; u and v are coordinates of a ray (u, v, 1) in axes of the camera.
+`residuals.kernel_inputs`. A ray (u, v, w) is a point in axes of the camera over its `depth_of`, so that w is
+1 for cases of OPENCV, which are written out here; other lenses are those of `scene.wide_lenses`.
 """
 
 from typing import Any
 
+import numpy as np
+
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.base.jit import inner_kernel
 from sfm_shapefit.scene.lens import NUM_VALUES
+from sfm_shapefit.scene.wide_lenses import KIND, PLANE, differentiate_by_values, is_seen, see
 
 _LEAST_DEPTH = 1e-8  # depth over the distance from the camera; a point of less is behind it
 
@@ -31,14 +35,27 @@ def look(views: Any, camera: int, points: Any, p: int) -> tuple[float, float, fl
 
 
 @inner_kernel
-def is_ahead(x: float, y: float, z: float) -> bool:
-    """Return whether a point, in axes of the camera, is in front of it."""
+def is_ahead(views: Any, camera: int, x: float, y: float, z: float) -> bool:
+    """Return whether a point, in axes of the camera, is in front of it, or where its lens sees all round."""
+    if views[camera, LENS + KIND] != PLANE:
+        return bool(is_seen(views[camera, LENS:], x, y, z))
     return bool(z > 0.0 and z * z > _LEAST_DEPTH * _LEAST_DEPTH * (x * x + y * y + z * z))
 
 
 @inner_kernel
-def miss(views: Any, camera: int, u: float, v: float, observed: Any, k: int) -> tuple[float, float]:
-    """Return the pixel of the ray (u, v, 1), less the k-th that was observed."""
+def depth_of(views: Any, camera: int, x: float, y: float, z: float) -> float:
+    """Return the depth of a point, or its distance where a lens sees all round."""
+    return float(z if views[camera, LENS + KIND] == PLANE else np.sqrt(x * x + y * y + z * z))
+
+
+@inner_kernel
+def miss(
+    views: Any, camera: int, u: float, v: float, w: float, observed: Any, k: int
+) -> tuple[float, float]:
+    """Return the pixel of the ray (u, v, w), less the k-th that was observed."""
+    if views[camera, LENS + KIND] != PLANE:
+        x, y, _, _, _, _, _, _ = see(views[camera, LENS:], u, v, w)
+        return x - observed[k, 0], y - observed[k, 1]
     f, g = views[camera, LENS], views[camera, LENS + 1]
     k1, k2 = views[camera, LENS + 4], views[camera, LENS + 5]
     p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
@@ -51,12 +68,15 @@ def miss(views: Any, camera: int, u: float, v: float, observed: Any, k: int) -> 
 
 @inner_kernel
 def differentiate_by_point(
-    views: Any, camera: int, u: float, v: float, inverse: float
+    views: Any, camera: int, u: float, v: float, w: float, inverse: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return the derivatives of the pixel by the point in axes of the camera: x by it, then y.
 
     `inverse` is that of the point's depth.
     """
+    if views[camera, LENS + KIND] != PLANE:
+        _, _, a0, a1, a2, b0, b1, b2 = see(views[camera, LENS:], u, v, w)
+        return a0 * inverse, a1 * inverse, a2 * inverse, b0 * inverse, b1 * inverse, b2 * inverse
     f, g = views[camera, LENS], views[camera, LENS + 1]
     k1, k2 = views[camera, LENS + 4], views[camera, LENS + 5]
     p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
@@ -79,12 +99,27 @@ def differentiate_by_point(
 
 @inner_kernel
 def differentiate_by_lens(
-    views: Any, camera: int, u: float, v: float, slots: Any, lens: int, by_values: Any, by_lens: Any
+    views: Any, camera: int, u: float, v: float, w: float, slots: Any, lens: int, by_values: Any, by_lens: Any
 ) -> None:
     """Write the derivatives of the pixel by the unknowns of a lens (2, 6).
 
-    Each of these is the sum over the OPENCV parameters that it stands for, see `by_values` (2, 8).
+    Each of these is the sum over the values that it stands for, see `by_values` (2, 8).
     """
+    if views[camera, LENS + KIND] != PLANE:
+        differentiate_by_values(views[camera, LENS:], u, v, w, by_values)
+    else:
+        _differentiate_by_values(views, camera, u, v, by_values)
+    for q in range(SLOTS):
+        by_lens[0, q] = by_lens[1, q] = 0.0
+    for q in range(NUM_VALUES):
+        if slots[lens, q] >= 0:
+            by_lens[0, slots[lens, q]] += by_values[0, q]
+            by_lens[1, slots[lens, q]] += by_values[1, q]
+
+
+@inner_kernel
+def _differentiate_by_values(views: Any, camera: int, u: float, v: float, by_values: Any) -> None:
+    """Write the derivatives of the pixel by the values of a lens that is a case of OPENCV (2, 8)."""
     f, g = views[camera, LENS], views[camera, LENS + 1]
     p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
     s = u * u + v * v
@@ -95,12 +130,6 @@ def differentiate_by_lens(
     by_values[0, 5], by_values[1, 5] = f * u * s * s, g * v * s * s
     by_values[0, 6], by_values[1, 6] = f * 2.0 * u * v, g * (s + 2.0 * v * v)
     by_values[0, 7], by_values[1, 7] = f * (s + 2.0 * u * u), g * 2.0 * u * v
-    for q in range(SLOTS):
-        by_lens[0, q] = by_lens[1, q] = 0.0
-    for q in range(NUM_VALUES):
-        if slots[lens, q] >= 0:
-            by_lens[0, slots[lens, q]] += by_values[0, q]
-            by_lens[1, slots[lens, q]] += by_values[1, q]
 
 
 @inner_kernel
