@@ -65,7 +65,7 @@ _MODELS = {
     "EUCM": _Model(EUCM, 2, 2),
 }
 """All of pycolmap 4.2 but for EQUIRECTANGULAR, which has nothing to free."""
-_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how the names of models with a single focal length begin
+_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how names of models that are not known begin, if they have one
 
 # Newton steps that undo a distortion at most, and their length over the focal length at which they end;
 # double precision is reached.
@@ -151,10 +151,21 @@ class Lens:
     @property
     def focal_px(self) -> float:
         """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
-        if self.model == "EQUIRECTANGULAR":
-            return self.parameters[0] / (2.0 * np.pi)  # its width covers a full turn
-        has_one = self.model.startswith(_ONE_FOCAL_LENGTH)
-        return self.parameters[0] if has_one else (self.parameters[0] + self.parameters[1]) / 2.0
+        count = self._num_focal
+        return sum(self.parameters[:count]) / count if count else self.parameters[0] / (2.0 * np.pi)
+
+    @property
+    def _num_focal(self) -> int:
+        """Number of focal lengths, which are the first parameters."""
+        if self.is_adjustable:
+            return _MODELS[self.model].num_focal
+        return 0 if self.model == "EQUIRECTANGULAR" else 2 - self.model.startswith(_ONE_FOCAL_LENGTH)
+
+    def longer(self, factor: float) -> "Lens":
+        """Return the lens with focal lengths that are some factor larger."""
+        count = self._num_focal
+        scaled = (factor * length for length in self.parameters[:count])
+        return replace(self, parameters=(*scaled, *self.parameters[count:]))
 
     def refuse_impossible(self) -> None:
         """Raise InputError if the lens cannot be adjusted, or has impossible parameters."""
