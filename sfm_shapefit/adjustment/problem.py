@@ -8,9 +8,8 @@ through a lens, which it may share. A point X of the world has, in a camera of f
 Where a sensor is free, its center -R_s^T t_s and its rotation in the rig are unknowns that all its images
 share.
 
-Lens models and the order of their parameters are COLMAP's; which there are stands in `scene.lens`, and their
-projections there and in `scene.wide_lenses`. Focal lengths may be free, and the first four coefficients of the
-distortion.
+Lens models and the order of their parameters are COLMAP's; which there are stands in `scene.lens`, their
+projections there and in `scene.wide_lenses`. Focal lengths may be free, and the first four coefficients.
 
 An observation through any other lens is given undistorted: undo the distortion once, and pass focal length
 times ray as the pixel of a PINHOLE lens with that focal length and principal point 0. Its residuals are then

@@ -49,9 +49,7 @@ def depth_of(views: Any, camera: int, x: float, y: float, z: float) -> float:
 
 
 @inner_kernel
-def miss(
-    views: Any, camera: int, u: float, v: float, w: float, observed: Any, k: int
-) -> tuple[float, float]:
+def miss(views: Any, camera: int, u: float, v: float, w: float, observed: Any, k: int) -> tuple[float, float]:
     """Return the pixel of the ray (u, v, w), less the k-th that was observed."""
     if views[camera, LENS + KIND] != PLANE:
         x, y, _, _, _, _, _, _ = see(views[camera, LENS:], u, v, w)

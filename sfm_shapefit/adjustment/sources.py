@@ -110,7 +110,7 @@ def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:
     """Return the same observations with the rays that lenses (l,) which have changed give them now."""
     views = views_of(images)
     lens_of, on_plane = images.lens_of[views.images][links.cameras], links.on_plane.copy()
-    first = np.searchsorted(views.images, views.images)  # of the views of each one's image
+    first = np.searchsorted(views.images, views.images)  # camera of the same image
     for k in np.flatnonzero(changed).tolist():
         rows, lens = np.flatnonzero(lens_of == k), images.lenses[k]
         pixels = links.pixels[rows].astype(np.float64)

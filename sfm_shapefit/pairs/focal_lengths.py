@@ -21,9 +21,8 @@ _STEP = 1.12  # factor between focal lengths that are tried; poses at the right 
 # COLMAP's guess, 1.2 times the larger side, is four times too long for a picture of a half sphere.
 _FACTORS = _STEP ** np.arange(-17.0, 11.0)
 _NARROWER = (0.5, 0.25, 0.125)  # steps from the best of these, in theirs; an adjustment does the rest
-# Steps from the best, from which on focal lengths are to explain less of the matches, and by how much. Through
-# a fisheye it is a fifth of all, through a lens that hardly bends .03; a flat scene and a straight drive tell
-# nothing, and chance makes less than .01.
+# Steps from the best, from which on focal lengths are to explain less of the matches, and by which share of
+# all: through a fisheye .2 less, through a lens that hardly bends .03; chance makes less than .01.
 _APART, _LEAST_GAIN = 4, 0.02
 _MOST_KINDS = 8  # kinds of lenses, those of most images; each takes a second
 # Pairs of a kind, evenly of all by their matches; pairs of the most matches alone are of neighbors, which say
@@ -43,7 +42,7 @@ class _PixelMatches(NamedTuple):
 
 
 def find_focal_factors(view: View, asked: BoolArray, doubted: BoolArray) -> dict[int, float]:
-    """Return by which factors matches want focal lengths longer, by the rows of those lenses that they tell.
+    """Return by which factors matches want focal lengths longer, by lens; nothing of those left open.
 
     Args:
         view: of images in axes of their cameras.

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
 from sfm_shapefit.files.colmap.database import DatabaseMatches
 from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated

@@ -33,7 +33,7 @@ from sfm_shapefit.scene.wide_lenses import (
     write_rays,
 )
 
-NUM_VALUES = 8  # numbers of a lens that may change
+NUM_VALUES = 8  # numbers of a lens that may change; two focal lengths and four coefficients fill a node
 
 
 class _Model(NamedTuple):
@@ -45,7 +45,7 @@ class _Model(NamedTuple):
     num_coefficients: int
 
 
-_MODELS = {
+_LENS_MODELS = {
     "SIMPLE_PINHOLE": _Model(PLANE, 1, 0),
     "PINHOLE": _Model(PLANE, 2, 0),
     "SIMPLE_RADIAL": _Model(PLANE, 1, 1),
@@ -141,12 +141,12 @@ class Lens:
     @property
     def is_adjustable(self) -> bool:
         """Whether an adjustment knows the model; images through others are undistorted to be adjusted."""
-        return self.model in _MODELS
+        return self.model in _LENS_MODELS
 
     @property
     def is_plane(self) -> bool:
         """Whether the model is a case of OPENCV: its rays point ahead, by x/z and y/z."""
-        return self.is_adjustable and _MODELS[self.model].kind == PLANE
+        return self.is_adjustable and _LENS_MODELS[self.model].kind == PLANE
 
     @property
     def focal_px(self) -> float:
@@ -158,7 +158,7 @@ class Lens:
     def _num_focal(self) -> int:
         """Number of focal lengths, which are the first parameters."""
         if self.is_adjustable:
-            return _MODELS[self.model].num_focal
+            return _LENS_MODELS[self.model].num_focal
         return 0 if self.model == "EQUIRECTANGULAR" else 2 - self.model.startswith(_ONE_FOCAL_LENGTH)
 
     def longer(self, factor: float) -> "Lens":
@@ -170,19 +170,19 @@ class Lens:
     def refuse_impossible(self) -> None:
         """Raise InputError if the lens cannot be adjusted, or has impossible parameters."""
         if not self.is_adjustable:
-            known = ", ".join(_MODELS)
+            known = ", ".join(_LENS_MODELS)
             raise InputError(
                 f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
             )
-        wanted = 2 + sum(_MODELS[self.model][1:])
+        wanted = 2 + sum(_LENS_MODELS[self.model][1:])
         if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
             raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
         if min(self.values()[:2]) <= 0.0:
             raise InputError("a lens has a focal length that is not positive; correct its parameters")
 
     def row(self) -> FloatArray:
-        """Return the numbers that a projection takes, (17,), see `scene.wide_lenses`; values are the first."""
-        kind, num_focal, _ = _MODELS[self.model]
+        """Return the numbers that a projection takes, (17,), see `scene.wide_lenses`; values come first."""
+        kind, num_focal, _ = _LENS_MODELS[self.model]
         row, others = np.zeros(ROW), self.parameters[num_focal:]
         row[0], row[1], row[KIND] = self.parameters[0], self.parameters[num_focal - 1], kind
         row[2 : 2 + len(others)] = others
@@ -201,7 +201,7 @@ class Lens:
         """Return which of the values the model states by itself, (8,): fy is none where it is fx."""
         own = np.zeros(NUM_VALUES, np.bool_)
         if self.is_adjustable:
-            _, num_focal, num_coefficients = _MODELS[self.model]
+            _, num_focal, num_coefficients = _LENS_MODELS[self.model]
             own[: 4 + num_coefficients] = True
             own[1] = num_focal == 2
         return own

@@ -26,13 +26,14 @@ from sfm_shapefit.base.jit import inner_kernel, kernel
 
 PLANE, RATIONAL, ANGLE, THIN_PRISM, RAD_TAN, FOV, DIVISION, EUCM = range(8)
 """Kinds of projections; PLANE is that of OPENCV."""
-KIND, ROW = 16, 17  # place of the kind in a lens' row, and length of that
+KIND, ROW = 16, 17  # place of the kind in a lens' row, and its length; no model has more parameters
 
 _LEAST = 1e-8  # share of a ray's length; what is nearer to where a projection ends is not seen
-_NEAR_AXIS = 1e-8  # rho over z^2, below which an angle is the first terms of its series
-_LEAST_FOV = 1e-6  # radians; a FOV lens of less is a plane
-_MOST_STEPS, _LONGEST_RAD, _STILL_RAD = 50, 0.3, 1e-13  # Newton steps to a ray, and their lengths in radians
-_FIRST_RAD = 1.4  # angle of the first try at most
+_NEAR_AXIS = 1e-8  # rho over z^2; below, an angle is the first terms of its series, whose next is rounding
+_LEAST_FOV = 1e-6  # radians; a FOV lens of less is a plane to rounding
+# Newton steps to a ray, and their lengths in radians; 0.3 leaps over no fold of a lens in use.
+_MOST_STEPS, _LONGEST_RAD, _STILL_RAD = 50, 0.3, 1e-13
+_FIRST_RAD = 1.4  # radians; a first try farther from the axis would find models that end at 1.57 undefined
 
 
 @kernel
@@ -40,7 +41,7 @@ def is_seen(lens: Any, x: float, y: float, z: float) -> bool:
     """Return whether a lens has a pixel for a ray."""
     kind, rho = lens[KIND], x * x + y * y
     square = rho + z * z
-    if kind == RATIONAL or kind == FOV:
+    if kind in (RATIONAL, FOV):
         return bool(z > 0.0 and z * z > _LEAST * _LEAST * square)
     if kind == DIVISION:
         inside = z * z - 4.0 * lens[4] * rho
@@ -85,7 +86,7 @@ def differentiate_by_values(lens: Any, x: float, y: float, z: float, out: Any) -
     u, v = g * x, g * y
     a, b, _, _, _, _ = _distort(lens, u, v)
     out[0, 0], out[1, 1], out[0, 2], out[1, 3] = a, b, 1.0, 1.0
-    if kind == FOV or kind == DIVISION or kind == EUCM:
+    if kind in (FOV, DIVISION, EUCM):
         out[0, 4], out[1, 4], out[0, 5], out[1, 5] = f * x * by_first, h * y * by_first, 0.0, 0.0
         if kind == EUCM:
             out[0, 5], out[1, 5] = f * x * by_second, h * y * by_second
@@ -102,7 +103,7 @@ def differentiate_by_values(lens: Any, x: float, y: float, z: float, out: Any) -
     for q in range(4, 8):
         out[0, q], out[1, q] = f * power * (uu * u + uv * v), h * power * (vu * u + vv * v)
         power *= s
-    if kind == RATIONAL or kind == THIN_PRISM:
+    if kind in (RATIONAL, THIN_PRISM):
         out[0, 6], out[1, 6] = f * 2.0 * u * v, h * (s + 2.0 * v * v)
         out[0, 7], out[1, 7] = f * (s + 2.0 * u * u), h * 2.0 * u * v
 
@@ -231,7 +232,7 @@ def _slopes_of_shift(lens: Any, u: float, v: float) -> tuple[float, float, float
 def _distort(lens: Any, u: float, v: float) -> tuple[float, float, float, float, float, float]:
     """Return the distorted place of (u, v), then the derivatives: of its x, then of its y."""
     kind = lens[KIND]
-    if kind == FOV or kind == DIVISION or kind == EUCM:
+    if kind in (FOV, DIVISION, EUCM):
         return u, v, 1.0, 0.0, 0.0, 1.0
     radial, slope = _stretch(lens, u * u + v * v)
     uu, uv, vv = radial + 2.0 * slope * u * u, 2.0 * slope * u * v, radial + 2.0 * slope * v * v
