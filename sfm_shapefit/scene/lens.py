@@ -65,6 +65,8 @@ _LENS_MODELS = {
     "EUCM": _Model(EUCM, 2, 2),
 }
 """All of pycolmap 4.2 but for EQUIRECTANGULAR, which has nothing to free."""
+ADJUSTED_ELSEWHERE = "intrinsics of this model are not adjusted here, but by COLMAP's bundle_adjuster"
+"""What is said of a model that a later pycolmap may bring."""
 _ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how names of models that are not known begin, if they have one
 
 # Newton steps that undo a distortion at most, and their length over the focal length at which they end;
