@@ -1,13 +1,11 @@
 """How an observation looks at its point: the pixel that a camera sees it at, and derivatives of that.
 
 The parts of which kernels of an adjustment are made. Each camera is a row of numbers, `views`, see
-`residuals.kernel_inputs`. A ray (u, v, w) is a point in axes of the camera over its `depth_of`, so that w is
-1 for cases of OPENCV, which are written out here; other lenses are those of `scene.wide_lenses`.
+`residuals.kernel_inputs`. Cases of OPENCV are written out here; u and v are coordinates of a ray (u, v, 1) in
+axes of the camera. Other lenses are those of `scene.wide_lenses`, behind one branch.
 """
 
 from typing import Any
-
-import numpy as np
 
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.base.jit import inner_kernel
@@ -35,25 +33,31 @@ def look(views: Any, camera: int, points: Any, p: int) -> tuple[float, float, fl
 
 
 @inner_kernel
-def is_ahead(views: Any, camera: int, x: float, y: float, z: float) -> bool:
-    """Return whether a point, in axes of the camera, is in front of it, or where its lens sees all round."""
+def observe(
+    views: Any, camera: int, point: Any, ray: Any, observed: Any, k: int
+) -> tuple[bool, float, float, float, float, float, float, float, float]:
+    """Return how a camera sees a point.
+
+    Args:
+        views, camera: see the module.
+        point: (x, y, z) in axes of the camera.
+        ray: (x/z, y/z, 1/z), of which a lens that sees all round makes no use.
+        observed, k: pixels, and which it was seen at.
+
+    Returns:
+        Whether it is ahead, or where its lens sees all round; its pixel less the one observed; and
+        derivatives of the pixel by the point: x by it, then y.
+    """
+    x, y, z = point
     if views[camera, LENS + KIND] != PLANE:
-        return bool(is_seen(views[camera, LENS:], x, y, z))
-    return bool(z > 0.0 and z * z > _LEAST_DEPTH * _LEAST_DEPTH * (x * x + y * y + z * z))
-
-
-@inner_kernel
-def depth_of(views: Any, camera: int, x: float, y: float, z: float) -> float:
-    """Return the depth of a point, or its distance where a lens sees all round."""
-    return float(z if views[camera, LENS + KIND] == PLANE else np.sqrt(x * x + y * y + z * z))
-
-
-@inner_kernel
-def miss(views: Any, camera: int, u: float, v: float, w: float, observed: Any, k: int) -> tuple[float, float]:
-    """Return the pixel of the ray (u, v, w), less the k-th that was observed."""
-    if views[camera, LENS + KIND] != PLANE:
-        x, y, _, _, _, _, _, _ = see(views[camera, LENS:], u, v, w)
-        return x - observed[k, 0], y - observed[k, 1]
+        lens = views[camera, LENS:]
+        if not is_seen(lens, x, y, z):
+            return False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        a, b, a0, a1, a2, b0, b1, b2 = see(lens, x, y, z)
+        return True, a - observed[k, 0], b - observed[k, 1], a0, a1, a2, b0, b1, b2
+    if not (z > 0.0 and z * z > _LEAST_DEPTH * _LEAST_DEPTH * (x * x + y * y + z * z)):
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    u, v, inverse = ray
     f, g = views[camera, LENS], views[camera, LENS + 1]
     k1, k2 = views[camera, LENS + 4], views[camera, LENS + 5]
     p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
@@ -61,31 +65,15 @@ def miss(views: Any, camera: int, u: float, v: float, w: float, observed: Any, k
     radial = 1.0 + s * (k1 + s * k2)
     x = f * (u * radial + p1 * product + p2 * (s + 2.0 * u * u)) + views[camera, LENS + 2]
     y = g * (v * radial + p2 * product + p1 * (s + 2.0 * v * v)) + views[camera, LENS + 3]
-    return x - observed[k, 0], y - observed[k, 1]
-
-
-@inner_kernel
-def differentiate_by_point(
-    views: Any, camera: int, u: float, v: float, w: float, inverse: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return the derivatives of the pixel by the point in axes of the camera: x by it, then y.
-
-    `inverse` is that of the point's depth.
-    """
-    if views[camera, LENS + KIND] != PLANE:
-        _, _, a0, a1, a2, b0, b1, b2 = see(views[camera, LENS:], u, v, w)
-        return a0 * inverse, a1 * inverse, a2 * inverse, b0 * inverse, b1 * inverse, b2 * inverse
-    f, g = views[camera, LENS], views[camera, LENS + 1]
-    k1, k2 = views[camera, LENS + 4], views[camera, LENS + 5]
-    p1, p2 = views[camera, LENS + 6], views[camera, LENS + 7]
-    s = u * u + v * v
-    radial = 1.0 + s * (k1 + s * k2)
     # Twice the slope of the radial factor by s.
     slope = 2.0 * (k1 + 2.0 * s * k2)
     mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
     x_by_u, x_by_v = f * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u), f * mixed
     y_by_u, y_by_v = g * mixed, g * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v)
     return (
+        True,
+        x - observed[k, 0],
+        y - observed[k, 1],
         x_by_u * inverse,
         x_by_v * inverse,
         -(x_by_u * u + x_by_v * v) * inverse,
@@ -97,16 +85,16 @@ def differentiate_by_point(
 
 @inner_kernel
 def differentiate_by_lens(
-    views: Any, camera: int, u: float, v: float, w: float, slots: Any, lens: int, by_values: Any, by_lens: Any
+    views: Any, camera: int, point: Any, ray: Any, slots: Any, lens: int, by_values: Any, by_lens: Any
 ) -> None:
-    """Write the derivatives of the pixel by the unknowns of a lens (2, 6).
+    """Write the derivatives of the pixel of a point that is seen by the unknowns of a lens (2, 6).
 
     Each of these is the sum over the values that it stands for, see `by_values` (2, 8).
     """
     if views[camera, LENS + KIND] != PLANE:
-        differentiate_by_values(views[camera, LENS:], u, v, w, by_values)
+        differentiate_by_values(views[camera, LENS:], point[0], point[1], point[2], by_values)
     else:
-        _differentiate_by_values(views, camera, u, v, by_values)
+        _differentiate_by_values(views, camera, ray[0], ray[1], by_values)
     for q in range(SLOTS):
         by_lens[0, q] = by_lens[1, q] = 0.0
     for q in range(NUM_VALUES):

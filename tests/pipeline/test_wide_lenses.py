@@ -13,7 +13,7 @@ from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.pairs.focal_lengths import find_focal_factors
 from sfm_shapefit.scene import lens as lens_module
 from tests.adjustment.made import look_at
-from tests.scenes import edit_database, read_from, view_of
+from tests.scenes import read_from, view_of
 
 FOCAL_PX, WIDTH, HEIGHT, NUM_IMAGES = 400.0, 1000, 800, 10
 GUESS_PX = 1.2 * WIDTH  # COLMAP's, three times too long
@@ -88,7 +88,7 @@ def factors_of(path):
 def test_factors_are_those_of_the_matches_and_a_flat_scene_tells_none(tmp_path):
     path, _ = make_database(tmp_path, "OPENCV_FISHEYE")
     factors = factors_of(path)
-    # The guess has no distortion, which makes up for some of the focal length: k1 angle^2 is .03 at 57 degrees.
+    # The guess has no distortion, which would be .03 of the radius at an angle of 57 degrees.
     assert factors[0] * GUESS_PX == pytest.approx(FOCAL_PX, rel=0.06)
     assert factors_of(path) == factors  # to the bit
     # Through a lens that does not bend, a plane has a relative pose at any focal length.
