@@ -85,7 +85,7 @@ _MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
 # The same for lenses that are no case of OPENCV, whose coefficients are of any size: factor by which these
 # may change the angle of a ray, and share of the largest circle in the picture up to which that is asked,
 # since pictures of fisheyes end before its corners.
-_MOST_BENT, _ASKED_SHARE = 3.0, 0.8
+_MOST_BENT, _ASKED_SHARE = 3.0, 0.7
 
 
 class Origin(Enum):
@@ -296,7 +296,7 @@ class Lens:
             return bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
         row = self.row()
         row[4:KIND] = 0.0
-        most = 0.5 * _ASKED_SHARE * min(self.width, self.height)
+        most = 0.5 * _ASKED_SHARE * (min(self.width, self.height) or self.focal_px)
         turns = np.arange(8)[:, None, None] * (np.pi / 4.0)
         along = np.concatenate([np.cos(turns), np.sin(turns)], axis=2)
         pixels = (row[2:4] + most * np.linspace(0.25, 1.0, 4)[:, None] * along).reshape(-1, 2)
