@@ -28,7 +28,9 @@ class Change(NamedTuple):
 
 
 CHANGES = {
-    "a camera model that adjustments may change": Change(2, r"\b_PLACES\b", {"scene/lens.py"}),
+    "a camera model that adjustments may change": Change(
+        2, r"\b_LENS_MODELS\b|\bRAD_TAN\b", {"scene/lens.py", "scene/wide_lenses.py"}
+    ),
     "an output format": Change(2, r"\btum_text\b|\"tum\"", {"files/tum.py", "pipeline/convert.py"}),
     "a robust loss": Change(2, r"\bsettle_points\b", {"adjustment/lone_points.py", "adjustment/solve.py"}),
     "a flag": Change(

@@ -53,7 +53,7 @@ class FrameCovariances:
     deciding: BoolArray
     """(n,) frames relative to whose similarity these covariances are."""
     lens_sigmas: FloatArray
-    """(l, 8) standard deviations of the OPENCV parameters of each lens; 0 for what is held."""
+    """(l, 8) standard deviations of the values of each lens; 0 for what is held."""
     sensor_sigmas: FloatArray
     """(s, 6) standard deviations of the center of each free sensor, units of the world, and of its rotation,
     in rad, along axes of its rig; those of a baseline that keeps its length are along and across it."""

@@ -45,7 +45,9 @@ class Layout:
     active: BoolArray
     """(N, 6) which slots of each node are unknowns."""
     lens_slots: IntArray
-    """(l, 8) the slot of each parameter of the OPENCV model in its lens' node; -1 if held."""
+    """(l, 8) the slot of each value of a lens in its node; -1 if held."""
+    held_of_lens: FloatArray
+    """(l, 9) the other numbers of each lens, which never change."""
 
     observation: IntArray
     """(m,) the order by points: row of the problem's observations that stands k-th here."""
@@ -139,6 +141,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         scale_sensor=scale_sensor,
         active=active,
         lens_slots=lens_slots,
+        held_of_lens=np.array([lens.row()[NUM_VALUES:] for lens in problem.lenses]).reshape(-1, 9),
         observation=order,
         first_observation=np.searchsorted(point, np.arange(problem.num_points + 1)),
         camera=camera,

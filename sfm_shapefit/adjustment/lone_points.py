@@ -14,10 +14,8 @@ from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.projection import (
     LENS,
     SHIFT,
-    differentiate_by_point,
-    is_ahead,
     look,
-    miss,
+    observe,
     turn_to_world,
 )
 from sfm_shapefit.adjustment.residuals import CHUNKS, Values, chunks_of, kernel_inputs
@@ -111,13 +109,12 @@ def _equations_of(p: int, given: Any, points: Any, out: Any) -> float:
         x, y, z = look(views, camera, points, p)
         x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
         square, w = views[camera, LENS] * views[camera, LENS], 0.0
-        if is_ahead(x, y, z):
-            inverse = 1.0 / z
-            u, v = x * inverse, y * inverse
-            rx, ry = miss(views, camera, u, v, pixels, k)
+        inverse = 1.0 / z
+        ray = (x * inverse, y * inverse, inverse)
+        ahead, rx, ry, a0, a1, a2, b0, b1, b2 = observe(views, camera, (x, y, z), ray, pixels, k)
+        if ahead:
             square = rx * rx + ry * ry
             w = 1.0 / (1.0 + square * inverse_scale)
-            a0, a1, a2, b0, b1, b2 = differentiate_by_point(views, camera, u, v, inverse)
             p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
             q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
             v00 += w * (p0 * p0 + q0 * q0)

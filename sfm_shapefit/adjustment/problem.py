@@ -8,15 +8,12 @@ through a lens, which it may share. A point X of the world has, in a camera of f
 Where a sensor is free, its center -R_s^T t_s and its rotation in the rig are unknowns that all its images
 share.
 
-Lens models and the order of their parameters are COLMAP's. All five are cases of OPENCV,
+Lens models and the order of their parameters are COLMAP's; which there are stands in `scene.lens`, their
+projections there and in `scene.wide_lenses`. Focal lengths may be free, and the first four coefficients.
 
-    u = x/z, v = y/z, s = u^2 + v^2,
-    pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
-             fy (v (1 + k1 s + k2 s^2) + 2 p2 u v + p1 (s + 2 v^2)) + cy).
-
-An observation through any other lens (fisheyes among them, in front of the camera) is given undistorted: undo
-the distortion once, and pass focal length times ray as the pixel of a PINHOLE lens with that focal length and
-principal point 0. Its residuals are then those of an ideal camera, not exactly pixels of the image.
+An observation through any other lens is given undistorted: undo the distortion once, and pass focal length
+times ray as the pixel of a PINHOLE lens with that focal length and principal point 0. Its residuals are then
+those of an ideal camera, not exactly pixels of the image.
 """
 
 from collections.abc import Iterator, Sequence
@@ -87,7 +84,7 @@ class RotationPrior:
 class LensPrior:
     """Intrinsics known otherwise: cost 1/2 noise_px^2 sum_p Omega_p d_p^2 with d = p - p_prior.
 
-    Parameters are those of the OPENCV model; where fx and fy are one, it counts once.
+    Parameters are the values of a lens, see `scene.lens`; where fx and fy are one, it counts once.
     """
 
     values: FloatArray

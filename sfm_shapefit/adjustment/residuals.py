@@ -29,10 +29,8 @@ from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.projection import (
     SHIFT,
     differentiate_by_lens,
-    differentiate_by_point,
-    is_ahead,
     look,
-    miss,
+    observe,
     turn_to_frame,
     turn_to_world,
 )
@@ -55,7 +53,7 @@ class Values:
     points: FloatArray
     """(k, 3)"""
     lenses: FloatArray
-    """(l, 8) as OPENCV models."""
+    """(l, 8) what may change of them, see `scene.lens`."""
     sensor_rotations: FloatArray
     """Rotations (c, 3, 3) of sensor_from_rig."""
     sensor_translations: FloatArray
@@ -148,6 +146,7 @@ def kernel_inputs(layout: Layout, values: Values, loss_scale_px: float | None) -
             values.sensor_translations,
             values.sensor_rotations.reshape(-1, 9),
             values.lenses[layout.lens_of_camera],
+            layout.held_of_lens[layout.lens_of_camera],
         ],
         axis=1,
     )
@@ -171,9 +170,9 @@ def _write_residuals(given: Any, out: Any) -> None:
             camera = cameras[k]
             x, y, z = look(views, camera, points, p)
             x, y, z = x + views[camera, SHIFT], y + views[camera, SHIFT + 1], z + views[camera, SHIFT + 2]
-            out[k, 0] = out[k, 1] = np.nan
-            if is_ahead(x, y, z):
-                out[k, 0], out[k, 1] = miss(views, camera, x / z, y / z, pixels, k)
+            ray = (x / z, y / z, 1.0 / z)
+            ahead, rx, ry, _, _, _, _, _, _ = observe(views, camera, (x, y, z), ray, pixels, k)
+            out[k, 0], out[k, 1] = (rx, ry) if ahead else (np.nan, np.nan)
 
 
 @kernel
@@ -195,14 +194,13 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             bx, by, bz = look(views, camera, points, p)
             x, y = bx + views[camera, SHIFT], by + views[camera, SHIFT + 1]
             z = bz + views[camera, SHIFT + 2]
-            if not is_ahead(x, y, z):
-                continue
             inverse = 1.0 / z
-            u, v = x * inverse, y * inverse
-            rx, ry = miss(views, camera, u, v, pixels, k)
+            point, ray = (x, y, z), (x * inverse, y * inverse, inverse)
+            # Derivatives are by the point in axes of the camera, then in those of the world.
+            ahead, rx, ry, a0, a1, a2, b0, b1, b2 = observe(views, camera, point, ray, pixels, k)
+            if not ahead:
+                continue
             w, m00, m01, m11 = _weigh(rx, ry, scale, least_curvature)
-            # By the point in axes of the camera, then in those of the world.
-            a0, a1, a2, b0, b1, b2 = differentiate_by_point(views, camera, u, v, inverse)
             p0, p1, p2 = turn_to_world(views, camera, a0, a1, a2)
             q0, q1, q2 = turn_to_world(views, camera, b0, b1, b2)
             wx, wy = w * rx, w * ry
@@ -280,7 +278,7 @@ def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             by_point[1, 0], by_point[1, 1], by_point[1, 2] = q0, q1, q2
             if lens_entry[k] >= 0:
                 lens = lens_of_camera[camera]
-                differentiate_by_lens(views, camera, u, v, lens_slots, lens, by_values, by_lens)
+                differentiate_by_lens(views, camera, point, ray, lens_slots, lens, by_values, by_lens)
                 _multiply(m00, m01, m11, by_lens, weighted)
                 _add_node(
                     by_point, by_lens, weighted, wx, wy, node_of_lens[lens], lens_entry[k],

@@ -42,10 +42,8 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.projection import (
     SHIFT,
-    differentiate_by_point,
-    is_ahead,
     look,
-    miss,
+    observe,
     turn_to_frame,
     turn_to_world,
 )
@@ -343,11 +341,13 @@ def _pull(
             x = bx + views[camera, SHIFT]
             y = by + views[camera, SHIFT + 1]
             z = bz + views[camera, SHIFT + 2]
-            if not is_ahead(x, y, z):
+            ray = (x / z, y / z, 1.0 / z)
+            ahead, rx, ry, a0, a1, a2, b0, b1, b2 = observe(views, camera, (x, y, z), ray, pixels, k)
+            if not ahead:
                 continue
-            u, v = x / z, y / z
-            residual[0], residual[1] = miss(views, camera, u, v, pixels, k)
-            _differentiate_by_frame(views, camera, (bx, by, bz), u, v, z, by_points[at], by_frames[at])
+            residual[0], residual[1] = rx, ry
+            slopes = (a0, a1, a2, b0, b1, b2)
+            _differentiate_by_frame(views, camera, (bx, by, bz), slopes, by_points[at], by_frames[at])
             square = residual[0] * residual[0] + residual[1] * residual[1]
             weights[at] = 1.0 / (1.0 + square / scale)
             x = (pixels[k, 0] - windows[camera, 0]) / windows[camera, 2]
@@ -401,16 +401,15 @@ def _pull(
 
 @inner_kernel
 def _differentiate_by_frame(
-    views: Any, camera: int, point: Any, u: float, v: float, z: float, by_point: Any, by_frame: Any
+    views: Any, camera: int, point: Any, slopes: Any, by_point: Any, by_frame: Any
 ) -> None:
     """Write the derivatives of a pixel by its point (2, 3) and by center and rotation of its frame (2, 6).
 
     Args:
         views, camera: of the observation.
-        point: less the frame's center, in axes of the camera. u, v: of its ray. z: its depth.
+        point: less the frame's center, in axes of the camera. slopes: derivatives by it, see `observe`.
         by_point, by_frame: are written.
     """
-    slopes = differentiate_by_point(views, camera, u, v, 1.0 / z)
     b0, b1, b2 = turn_to_frame(views, camera, point[0], point[1], point[2])
     for axis in range(2):
         j0, j1, j2 = slopes[3 * axis], slopes[3 * axis + 1], slopes[3 * axis + 2]

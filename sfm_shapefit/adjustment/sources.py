@@ -108,11 +108,25 @@ def links_touching(images: Images, links: Links, chosen: BoolArray) -> Links:
 
 def with_rays_of(images: Images, links: Links, changed: BoolArray) -> Links:
     """Return the same observations with the rays that lenses (l,) which have changed give them now."""
-    lens, on_plane = images.lens_of[views_of(images).images][links.cameras], links.on_plane.copy()
+    views = views_of(images)
+    lens_of, on_plane = images.lens_of[views.images][links.cameras], links.on_plane.copy()
+    first = np.searchsorted(views.images, views.images)  # camera of the same image
     for k in np.flatnonzero(changed).tolist():
-        rows = np.flatnonzero(lens == k)
-        on_plane[rows] = images.lenses[k].undistort(links.pixels[rows].astype(np.float64))
+        rows, lens = np.flatnonzero(lens_of == k), images.lenses[k]
+        pixels = links.pixels[rows].astype(np.float64)
+        if lens.is_plane:
+            on_plane[rows] = lens.undistort(pixels)
+            continue
+        rays, view = lens.rays(pixels), links.cameras[rows] - first[links.cameras[rows]]
+        for v, turn in enumerate(CUBE):
+            on_plane[rows[view == v]] = _on_plane(rays[view == v] @ turn.T)
     return replace(links, on_plane=on_plane)
+
+
+def _on_plane(rays: FloatArray) -> FloatArray:
+    """Return x/z and y/z (m, 2) of rays (m, 3); NaN for those that do not point ahead."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(rays[:, 2:] > 0.0, rays[:, :2] / rays[:, 2:], np.nan))
 
 
 def _look_up(
@@ -127,13 +141,14 @@ def _look_up(
         own, lens = slice(begin, end), images.lenses[images.lens_of[k]]
         pixels = pictures.pixels(k, keypoints[own])
         rays = pictures.rays(k, pixels)
-        if lens.is_adjustable:
+        if lens.is_plane:
             on_plane[own] = rays[:, :2] / rays[:, 2:]
         else:
             view = np.argmax(rays @ CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
             local = np.einsum("mab,mb->ma", CUBE[view], rays)
             on_plane[own] = local[:, :2] / local[:, 2:]
-            pixels = lens.focal_px * on_plane[own]
+            if not lens.is_adjustable:
+                pixels = lens.focal_px * on_plane[own]
             cameras[own] += view
         if not np.array_equal(pixels.astype(seen.dtype), pixels, equal_nan=True):
             seen = seen.astype(np.float64)

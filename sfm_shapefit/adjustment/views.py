@@ -1,10 +1,13 @@
-"""The cameras of an adjustment: images as they are, or ideal views of images through other lenses.
+"""The cameras of an adjustment: images as they are, or views of images through other lenses.
 
-An image whose lens is a case of OPENCV is one camera of the problem. An image through any other lens becomes
-several ideal cameras of one center: its rays are undistorted once and shared out to 14 views, the faces and
-corners of a cube round the camera, of which those that see something take part. No ray is more than 28
-degrees off the axis of its view, so that an error is at most 1.3 times that of the image, even for rays at
-right angles to the camera or behind it.
+An image whose lens is a case of OPENCV is one camera. An image through any other lens becomes several cameras
+of one center: its rays are shared out to 14 views, the faces and corners of a cube round the camera, of which
+those that see something take part. Points are triangulated from these, as no ray is more than 28 degrees off
+the axis of its view, even at right angles to the camera or behind it.
+
+The adjustment itself takes the pixels of the image, in all views alike, where it knows the projection of the
+lens. A lens that it does not know is ideal in its views: rays are undistorted once, and an error is at most
+1.3 times that of the image.
 """
 
 from dataclasses import dataclass, replace
@@ -55,7 +58,7 @@ class Views:
         Lenses among `sensors` (l,) move in their rigs. Rotations that were given have no part yet.
         """
         used = np.flatnonzero(found.points_seen >= 0)
-        rotations, translations = self._sensors(images)
+        rotations, translations = self._as_adjusted(images)._sensors(images)
         frames, lenses = images.frame_of[self.images], images.lens_of[self.images]
         rig = Rig(
             frame_of_camera=frames,
@@ -87,7 +90,8 @@ class Views:
         cameras = np.flatnonzero(solved.rig.free_sensor_of_camera >= 0)
         if not len(cameras):
             return moved
-        own, back = solved.lens_of_camera[cameras], self.rotations[cameras].transpose(0, 2, 1)
+        views = self._as_adjusted(images)
+        own, back = solved.lens_of_camera[cameras], views.rotations[cameras].transpose(0, 2, 1)
         rotations, translations = images.sensors.rotations.copy(), images.sensors.translations.copy()
         rotations[own] = back @ solved.rig.rotations[cameras]
         translations[own] = np.einsum("cab,cb->ca", back, solved.rig.translations[cameras])
@@ -106,6 +110,12 @@ class Views:
             ids=1 + np.arange(len(lengths)) if tracks.may_split else tracks.ids[found.tracks],
         )
 
+    def _as_adjusted(self, images: Images) -> "Views":
+        """Return the views as the problem has them: those of a lens that it knows are all the whole image."""
+        known = np.array([lens.is_adjustable for lens in images.lenses], dtype=np.bool_)
+        is_whole = known[images.lens_of][self.images]
+        return replace(self, rotations=np.where(is_whole[:, None, None], np.eye(3), self.rotations))
+
     def _sensors(self, images: Images) -> tuple[FloatArray, FloatArray]:
         """Return rotations (c, 3, 3) and translations (c, 3) of camera_from_rig."""
         lenses = images.lens_of[self.images]
@@ -118,7 +128,7 @@ class Views:
 
 def views_of(images: Images) -> Views:
     """Return the cameras of posed images."""
-    whole = np.array([lens.is_adjustable for lens in images.lenses], dtype=np.bool_)[images.lens_of]
+    whole = np.array([lens.is_plane for lens in images.lenses], dtype=np.bool_)[images.lens_of]
     parts = [np.eye(3)[None] if is_whole else CUBE for is_whole in whole.tolist()]
     return Views(
         images=np.repeat(np.arange(images.num_images), [len(part) for part in parts]),
@@ -127,7 +137,7 @@ def views_of(images: Images) -> Views:
 
 
 def _lens_of_views(lens: Lens) -> Lens:
-    """Return the lens of the views of an image."""
+    """Return the lens of the views of an image, as the problem has them."""
     if lens.is_adjustable:
         return lens
     return Lens("SIMPLE_PINHOLE", (lens.focal_px, 0.0, 0.0), fixed=True, id=lens.id)

@@ -12,7 +12,7 @@ from sfm_shapefit.judgement.seams import Seam
 from sfm_shapefit.judgement.ties import Untied
 from sfm_shapefit.judgement.wrong_lenses import WrongLens
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens
 
 _UNLIKE = 2.0  # scatters of what images ask for; a mean that is nearer names no other focal length
 _LEAST_TOLD = 1e-5  # share of the spread; a smaller difference is not told as a number
@@ -28,6 +28,7 @@ class ContradictedLens(Record):
     asked_sigma_px: Annotated[
         float, "Standard deviation of it: by the noise for one image or two, by the scatter over more."
     ]
+    remedy: Annotated[str, "What to do about it, or what has been done."]
 
     @property
     def statement(self) -> str:
@@ -42,8 +43,7 @@ class ContradictedLens(Record):
         who = "its image asks" if self.num_images == 1 else f"its {self.num_images} images ask"
         return (
             f"the focal length of camera {self.camera} is wrong: {who} for {asked}, not {self.focal_px:,.0f} "
-            "px, by the points that the others make; its images stand wrong by that: intrinsics=focal lets "
-            "it change, or calibrate that camera"
+            f"px, by the points that the others make; its images stand wrong by that: {self.remedy}"
         )
 
 
@@ -231,11 +231,19 @@ def _cameras(names: tuple[str, ...]) -> str:
 
 
 def _tell_lens(wrong: WrongLens, lens: Lens) -> ContradictedLens:
-    asked_px = wrong.factor * lens.focal_px
+    asked_px, remedy = (
+        wrong.factor * lens.focal_px,
+        "intrinsics=focal lets it change, or calibrate that camera",
+    )
+    if not lens.is_adjustable:
+        remedy = f"{ADJUSTED_ELSEWHERE}; or calibrate that camera"
+    elif lens.origin is not None and lens.parameters != lens.given:
+        remedy = "it was adjusted already, so calibrate that camera"
     return ContradictedLens(
         camera=lens.id,
         num_images=wrong.num_images,
         focal_px=lens.focal_px,
         asked_focal_px=asked_px,
         asked_sigma_px=wrong.sigma * asked_px,
+        remedy=remedy,
     )

@@ -11,7 +11,7 @@ from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.record import Record
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Origin
+from sfm_shapefit.scene.lens import ADJUSTED_ELSEWHERE, Lens, Origin
 
 _NAMED = 3  # cameras; more in doubt are told together, as a list of them is not read
 _LOOSE = 0.01  # relative sigma of a focal length; more of its distance is more than most cameras are off
@@ -33,7 +33,7 @@ class CameraIntrinsics(Record):
         How,
         "What decided about its focal length: the adjustments; the fundamental matrices alone; nothing, as "
         "the matches leave it undetermined, so that it stays as given and only the distortion may change; "
-        "or the user, who wants it held.",
+        "or the options, which hold it, or its model, whose intrinsics are not adjusted here.",
     ]
     given_focal_px: Annotated[float, "Mean focal length as given."]
     focal_px: Annotated[float, "Mean focal length of the output."]
@@ -160,6 +160,12 @@ def describe_intrinsics(rows: Sequence[CameraIntrinsics]) -> list[str]:
     return ["; ".join(parts) + "; each stands in locate.json"]
 
 
+def _why(row: CameraIntrinsics) -> str:
+    """Return what decided about a camera, told apart where it is held because of its model."""
+    is_other = row.decided_by == "held" and not Lens(row.model, ()).is_adjustable
+    return "other model" if is_other else row.decided_by
+
+
 def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
     """Yield which cameras keep a focal length that was never measured, or have one that is hardly known."""
     guessed = [row for row in rows if row.origin != Origin.CALIBRATION.value]
@@ -168,9 +174,10 @@ def intrinsics_warnings(rows: Sequence[CameraIntrinsics]) -> Iterator[str]:
             "undetermined",
             "which the matches do not determine: the scene is flat, or the camera hardly turns and shifts",
         ),
-        ("held", "as it was held or nothing was adjusted: `sfm-shapefit map` finds it from the matches"),
+        ("held", "as intrinsics=held or adjust=none says, or as cameras are too many to be adjusted"),
+        ("other model", f"as {ADJUSTED_ELSEWHERE}"),
     ):
-        cameras = [str(row.camera) for row in guessed if row.decided_by == how]
+        cameras = [str(row.camera) for row in guessed if _why(row) == how]
         if cameras:
             noun = "cameras" if len(cameras) > 1 else "camera"
             yield (

@@ -1,7 +1,6 @@
 """How well the images of a model are held by its 3D points: their number, errors, tracks, and coverage.
 
-Errors are those of COLMAP's own projection, through any of its camera models. `adjustment` measures its
-errors in ideal views of a fisheye, where they are up to a tenth larger or smaller.
+Errors are those of COLMAP's own projection, through any of its camera models.
 """
 
 from dataclasses import dataclass

@@ -13,7 +13,6 @@ import numpy as np
 
 from sfm_shapefit.facts.options import PlacingOptions
 from sfm_shapefit.facts.result import LocateResult
-from sfm_shapefit.files.colmap.intrinsics import with_focal_length
 from sfm_shapefit.judgement.limits import OUTNUMBERED
 from sfm_shapefit.pipeline.given import Given
 from sfm_shapefit.pipeline.inputs import MatchSource
@@ -122,7 +121,7 @@ def find_remedy(
         known = lenses[row]
         if known.origin in (None, Origin.CALIBRATION):  # what is contradicted pulls no harder than a guess
             known = replace(known.in_doubt(Origin.GUESS), origin=Origin.CALIBRATION)
-        lenses[row] = with_focal_length(known, factor)
+        lenses[row] = known.longer(factor)
         parts[row, FOCAL] = True
     pairs = np.concatenate([np.zeros((0, 2), dtype=np.int64), *(place.pairs_here for place in moved)])
     names = ((images.names[i], images.names[j]) for i, j in pairs.tolist())

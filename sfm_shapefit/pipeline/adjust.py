@@ -65,7 +65,7 @@ def bundle_adjust(
         adjusted = bundle_adjust(model, rotation_sigma_deg=0.03)         # or pulled to, so far
 
     Unlike `locate(..., adjust="full")`, nothing is triangulated or filtered here. Rigs hold their
-    sensors. Lenses that are no case of OPENCV, such as fisheyes, are undistorted and stay what they are.
+    sensors. Lenses of all models but EQUIRECTANGULAR may be free.
 
     Args:
         reconstruction: the start, or a result that has it; it is not changed.

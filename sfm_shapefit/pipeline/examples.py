@@ -239,6 +239,7 @@ def adjust_bundle(folder: Path) -> None:
     images, _, tracks = read_bundle(model.reconstruction)
     adjust_thinly(images, lambda: tracks, StructureOptions(), Freedom())
     adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
+    Lens("SIMPLE_FISHEYE", (500.0, 320.0, 240.0)).rays(np.zeros((1, 2)))
     estimate_covariances(adjusted.problem)
     estimate_center_errors(adjusted.problem, AdjustmentOptions())
 

@@ -6,14 +6,11 @@ import numpy as np
 
 from sfm_shapefit.base.wording import first_of
 from sfm_shapefit.facts.intrinsics import RefinedIntrinsics, intrinsics_in_doubt
-from sfm_shapefit.files.colmap.intrinsics import (
-    Uncalibrated,
-    calibrate_view_graph,
-    find_uncalibrated,
-    with_focal_length,
-)
+from sfm_shapefit.files.colmap.database import DatabaseMatches
+from sfm_shapefit.files.colmap.intrinsics import Uncalibrated, calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.pair_focals import PairFocal, read_pair_focals
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
+from sfm_shapefit.pairs.focal_lengths import find_focal_factors
 from sfm_shapefit.scene.freedom import PARTS_FREED, IntrinsicsFreedom
 from sfm_shapefit.scene.images import Images
 from sfm_shapefit.scene.lens import PARTS, Lens, Origin
@@ -46,17 +43,24 @@ def settle_intrinsics(
     asked = [found.database_id for found in guessed.values()]
     by_pairs = read_pair_focals(file, asked, left_out) if file is not None and asked else {}
     if file is not None and guessed and wanted != "held":
-        by_database = calibrate_view_graph(file, asked, left_out)
+        doubted = np.isin(np.arange(len(lenses)), list(guessed))
+        by_rays = doubted & [lens.is_adjustable and not lens.is_plane for lens in lenses]
+        others = [found.database_id for k, found in guessed.items() if not by_rays[k]]
+        by_database = calibrate_view_graph(file, others, left_out) if others else {}
         by_database |= {
             i: one.factor for i, one in by_pairs.items() if one.is_one_sided or i not in by_database
         }
         for k, found in guessed.items():
             factors[k] = by_database.get(found.database_id, 1.0 / found.ratio) * found.ratio
         factors[(factors < 1.0 / _MOST_OFF) | (factors > _MOST_OFF)] = 1.0
+        if by_rays.any():
+            view = DatabaseMatches(file, images.names).at(images.apart(), left_out)
+            for k, factor in find_focal_factors(view, by_rays, doubted).items():
+                factors[k] = factor
     may_move = [[lens.origin is not None and lens.is_adjustable] for lens in lenses]
     by_view_graph = factors != 1.0
     for k in np.flatnonzero(by_view_graph).tolist():
-        lenses[k] = with_focal_length(lenses[k], factors[k])
+        lenses[k] = lenses[k].longer(factors[k])
     if file is not None:
         file.notes += _contradicted_guesses(images.lenses, lenses, guessed, by_pairs)
     parts = np.array(may_move, dtype=np.bool_) & np.isin(list(PARTS), PARTS_FREED[wanted])

@@ -1,10 +1,13 @@
 """Lenses of any of COLMAP's models, those that an adjustment may change, and how far given ones may be off.
 
-What is adjusted are the five cases of OPENCV:
+Five models are cases of OPENCV:
 
 u = x/z, v = y/z, s = u^2 + v^2,
 pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
          fy (v (1 + k1 s + k2 s^2) + 2 p2 u v + p1 (s + 2 v^2)) + cy).
+
+Projections of the others stand in `scene.wide_lenses`. Numbers of a lens that an adjustment may change are
+its first eight, its values: fx, fy, cx, cy, and its first four coefficients, of OPENCV k1, k2, p1, p2.
 """
 
 from dataclasses import dataclass, replace
@@ -16,21 +19,55 @@ import numpy as np
 from sfm_shapefit.base.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.base.errors import InputError
 from sfm_shapefit.base.geometry import normalized
+from sfm_shapefit.scene.wide_lenses import (
+    ANGLE,
+    DIVISION,
+    EUCM,
+    FOV,
+    KIND,
+    PLANE,
+    RAD_TAN,
+    RATIONAL,
+    ROW,
+    THIN_PRISM,
+    write_rays,
+)
 
-_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
+NUM_VALUES = 8  # numbers of a lens that may change; two focal lengths and four coefficients fill a node
 
 
-NUM_VALUES = 8  # parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2
+class _Model(NamedTuple):
+    """What the parameters of a model are, in COLMAP's order: focal lengths, cx, cy, coefficients."""
 
-# For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
-_PLACES = {
-    "SIMPLE_PINHOLE": (-1, _CX, _CY),
-    "PINHOLE": (_FX, _FY, _CX, _CY),
-    "SIMPLE_RADIAL": (-1, _CX, _CY, _K1),
-    "RADIAL": (-1, _CX, _CY, _K1, _K2),
-    "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
+    kind: int
+    """Its projection, see `scene.wide_lenses`."""
+    num_focal: int
+    num_coefficients: int
+
+
+_LENS_MODELS = {
+    "SIMPLE_PINHOLE": _Model(PLANE, 1, 0),
+    "PINHOLE": _Model(PLANE, 2, 0),
+    "SIMPLE_RADIAL": _Model(PLANE, 1, 1),
+    "RADIAL": _Model(PLANE, 1, 2),
+    "OPENCV": _Model(PLANE, 2, 4),
+    "FULL_OPENCV": _Model(RATIONAL, 2, 8),
+    "SIMPLE_FISHEYE": _Model(ANGLE, 1, 0),
+    "FISHEYE": _Model(ANGLE, 2, 0),
+    "SIMPLE_RADIAL_FISHEYE": _Model(ANGLE, 1, 1),
+    "RADIAL_FISHEYE": _Model(ANGLE, 1, 2),
+    "OPENCV_FISHEYE": _Model(ANGLE, 2, 4),
+    "THIN_PRISM_FISHEYE": _Model(THIN_PRISM, 2, 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": _Model(RAD_TAN, 2, 12),
+    "FOV": _Model(FOV, 2, 1),
+    "SIMPLE_DIVISION": _Model(DIVISION, 1, 1),
+    "DIVISION": _Model(DIVISION, 2, 1),
+    "EUCM": _Model(EUCM, 2, 2),
 }
-_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how the names of models with a single focal length begin
+"""All of pycolmap 4.2 but for EQUIRECTANGULAR, which has nothing to free."""
+ADJUSTED_ELSEWHERE = "intrinsics of this model are not adjusted here, but by COLMAP's bundle_adjuster"
+"""What is said of a model that a later pycolmap may bring."""
+_ONE_FOCAL_LENGTH = ("SIMPLE_", "RADIAL")  # how names of models that are not known begin, if they have one
 
 # Newton steps that undo a distortion at most, and their length over the focal length at which they end;
 # double precision is reached.
@@ -45,6 +82,10 @@ _SHARED_NOISE = 7.0
 _CONTRADICTION = 10.0  # sigmas, of the noise and of what was given; as many are no chance
 # Factor of the focal length, and largest coefficient of the distortion; a lens beyond has run away.
 _MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
+# The same for lenses that are no case of OPENCV, whose coefficients are of any size: factor by which these
+# may change the angle of a ray, and share of the largest circle in the picture up to which that is asked,
+# since pictures of fisheyes end before its corners.
+_MOST_BENT, _ASKED_SHARE = 3.0, 0.7
 
 
 class Origin(Enum):
@@ -59,7 +100,7 @@ class LensPart(NamedTuple):
     """Parameters of a lens that are free, or held, together."""
 
     places: slice
-    """Where they are among those of the OPENCV model."""
+    """Where they are among the values of a lens."""
     sigmas: dict[Origin, float]
     """Standard deviation of each as it was given."""
     is_relative: bool = False
@@ -82,7 +123,7 @@ class Lens:
     """The intrinsics that one or several cameras look through."""
 
     model: str
-    """COLMAP's name of it. What is said of OPENCV below holds for its cases only."""
+    """COLMAP's name of it. What is said of values holds for those that an adjustment may change."""
     parameters: tuple[float, ...]
     """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
     fixed: bool | tuple[bool, ...] = False
@@ -101,8 +142,13 @@ class Lens:
 
     @property
     def is_adjustable(self) -> bool:
-        """Whether the model is a case of OPENCV; images through others are undistorted to be adjusted."""
-        return self.model in _PLACES
+        """Whether an adjustment knows the model; images through others are undistorted to be adjusted."""
+        return self.model in _LENS_MODELS
+
+    @property
+    def is_plane(self) -> bool:
+        """Whether the model is a case of OPENCV: its rays point ahead, by x/z and y/z."""
+        return self.is_adjustable and _LENS_MODELS[self.model].kind == PLANE
 
     @property
     def is_panorama(self) -> bool:
@@ -112,10 +158,22 @@ class Lens:
     @property
     def focal_px(self) -> float:
         """Mean focal length; of an equirectangular picture, which has none, its pixels per radian."""
-        if self.is_panorama:
-            return self.parameters[0] / (2.0 * np.pi)  # its width covers a full turn
-        has_one = self.model.startswith(_ONE_FOCAL_LENGTH)
-        return self.parameters[0] if has_one else (self.parameters[0] + self.parameters[1]) / 2.0
+        count = self._num_focal
+        # The width of a panorama covers a full turn.
+        return sum(self.parameters[:count]) / count if count else self.parameters[0] / (2.0 * np.pi)
+
+    @property
+    def _num_focal(self) -> int:
+        """Number of focal lengths, which are the first parameters."""
+        if self.is_adjustable:
+            return _LENS_MODELS[self.model].num_focal
+        return 0 if self.is_panorama else 2 - self.model.startswith(_ONE_FOCAL_LENGTH)
+
+    def longer(self, factor: float) -> "Lens":
+        """Return the lens with focal lengths that are some factor larger."""
+        count = self._num_focal
+        scaled = (factor * length for length in self.parameters[:count])
+        return replace(self, parameters=(*scaled, *self.parameters[count:]))
 
     def offsets_px(self, found: FloatArray, seen: FloatArray) -> FloatArray:
         """Return how far pixels `found` are from those `seen`, (k, 2).
@@ -133,36 +191,47 @@ class Lens:
     def refuse_impossible(self) -> None:
         """Raise InputError if the lens cannot be adjusted, or has impossible parameters."""
         if not self.is_adjustable:
-            known = ", ".join(_PLACES)
+            known = ", ".join(_LENS_MODELS)
             raise InputError(
                 f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
             )
-        wanted = len(_PLACES[self.model])
+        wanted = 2 + sum(_LENS_MODELS[self.model][1:])
         if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
             raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
         if min(self.values()[:2]) <= 0.0:
             raise InputError("a lens has a focal length that is not positive; correct its parameters")
 
+    def row(self) -> FloatArray:
+        """Return the numbers that a projection takes, (17,), see `scene.wide_lenses`; values come first."""
+        kind, num_focal, _ = _LENS_MODELS[self.model]
+        row, others = np.zeros(ROW), self.parameters[num_focal:]
+        row[0], row[1], row[KIND] = self.parameters[0], self.parameters[num_focal - 1], kind
+        row[2 : 2 + len(others)] = others
+        return row
+
     def values(self) -> FloatArray:
-        """Return the parameters of the same lens as OPENCV model, (8,)."""
-        values = np.zeros(NUM_VALUES)
-        for place, parameter in zip(_PLACES[self.model], self.parameters, strict=True):
-            values[[_FX, _FY] if place < 0 else place] = parameter
-        return values
+        """Return the numbers that an adjustment may change, (8,)."""
+        return self.row()[:NUM_VALUES]
 
     def with_values(self, values: FloatArray) -> "Lens":
-        """Return the lens of this model whose OPENCV parameters are `values`, (8,)."""
-        kept = [float(values[max(place, 0)]) for place in _PLACES[self.model]]
-        return replace(self, parameters=tuple(kept))
+        """Return the lens of this model that has other values, (8,)."""
+        own = values[self.own_values()].tolist()
+        return replace(self, parameters=(*own, *self.parameters[len(own) :]))
 
     def own_values(self) -> BoolArray:
-        """Return which of OPENCV's parameters the model states by itself, (8,): fy is none where it is fx."""
+        """Return which of the values the model states by itself, (8,): fy is none where it is fx."""
         own = np.zeros(NUM_VALUES, np.bool_)
-        own[[max(place, 0) for place in _PLACES[self.model]]] = True
+        if self.is_adjustable:
+            _, num_focal, num_coefficients = _LENS_MODELS[self.model]
+            own[: 4 + num_coefficients] = True
+            own[1] = num_focal == 2
         return own
 
     def undistort(self, pixels: FloatArray) -> FloatArray:
-        """Return x/z and y/z (m, 2) of the rays of pixels (m, 2), by Newton's method; NaN where it fails."""
+        """Return x/z and y/z (m, 2) of the rays of pixels (m, 2), by Newton's method; NaN where it fails.
+
+        The model is a case of OPENCV.
+        """
         fx, fy, cx, cy, *distortion = self.values().tolist()
         distorted: FloatArray = (pixels - [cx, cy]) / [fx, fy]
         if not any(distortion):
@@ -173,6 +242,14 @@ class Lens:
             found[part] = _undistort(distorted[part].T, *distortion).T
         return found
 
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """Return the unit rays (m, 3) of pixels (m, 2); NaN for those that have none."""
+        if self.is_plane:
+            return normalized(np.insert(self.undistort(pixels), 2, 1.0, axis=1))
+        rays = np.empty((len(pixels), 3))
+        write_rays(self.row(), np.ascontiguousarray(pixels, dtype=np.float64), rays)
+        return rays
+
     def differs_in_rays(self, other: "Lens") -> bool:
         """Return whether the unit rays of a corner or of edges differ by a hundredth from those of another.
 
@@ -182,18 +259,20 @@ class Lens:
             return self.parameters != other.parameters
         w, h = self.width, self.height
         pixels = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
-        rays, those = (
-            normalized(np.insert(lens.undistort(pixels), 2, 1.0, axis=1)) for lens in (self, other)
-        )
+        rays, those = (lens.rays(pixels) for lens in (self, other))
+        if not self.is_plane:  # beyond the circle of a fisheye's picture there may be no ray
+            rays, those = np.nan_to_num(rays), np.nan_to_num(those)
         return not bool(np.abs(rays - those).max() <= _SAME_RAYS)  # NaN differs too
 
     def slots(self, free: BoolArray) -> IntArray:
-        """Return which unknown each OPENCV parameter is, (8,), by the `PARTS` free; -1 for those held."""
+        """Return which unknown each value is, (8,), by the `PARTS` free; -1 for those held."""
         slots, moves = np.full(NUM_VALUES, -1), np.zeros(NUM_VALUES, np.bool_)
         for part, is_free in zip(PARTS.values(), free & ~np.array(self.fixed), strict=True):
             moves[part.places] = is_free
-        for unknown, place in enumerate(p for p in _PLACES[self.model] if moves[max(p, 0)]):
-            slots[[_FX, _FY] if place < 0 else place] = unknown
+        own = self.own_values()
+        slots[own & moves] = np.arange(np.sum(own & moves))
+        if not own[1]:
+            slots[1] = slots[0]
         return slots
 
     def in_doubt(self, origin: Origin) -> "Lens":
@@ -211,7 +290,7 @@ class Lens:
         return [bool(self.own_values()[part.places].any()) for part in PARTS.values()]
 
     def information(self) -> FloatArray:
-        """Return the inverse variances of the OPENCV parameters as given, (8,); 0 for those always held."""
+        """Return the inverse variances of the values as given, (8,); 0 for those always held."""
         information = np.zeros(NUM_VALUES)
         for part, sigma in zip(PARTS.values(), self.sigmas, strict=True):
             size = self.as_given().values()[part.places] if part.is_relative else 1.0
@@ -225,11 +304,26 @@ class Lens:
         beyond what any lens given so is off by, is not believed either.
         """
         ratio = self.values()[0] / self.as_given().values()[0]
-        sound = bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
-        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
+        sound = 1.0 / _MOST_OFF <= ratio <= _MOST_OFF and self._is_sound()
         better = _SHARED_NOISE * sigma <= self.sigmas[FOCAL]
         contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.sigmas[FOCAL])
         return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
+
+    def _is_sound(self) -> bool:
+        """Return whether the distortion is one that lenses have."""
+        if self.is_plane:
+            return bool(np.abs(self.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
+        row = self.row()
+        row[4:KIND] = 0.0
+        most = 0.5 * _ASKED_SHARE * (min(self.width, self.height) or self.focal_px)
+        turns = np.arange(8)[:, None, None] * (np.pi / 4.0)
+        along = np.concatenate([np.cos(turns), np.sin(turns)], axis=2)
+        pixels = (row[2:4] + most * np.linspace(0.25, 1.0, 4)[:, None] * along).reshape(-1, 2)
+        rays, ideal = self.rays(pixels), np.empty((len(pixels), 3))
+        write_rays(row, pixels, ideal)
+        angles, those = (np.arctan2(np.hypot(r[:, 0], r[:, 1]), r[:, 2]).reshape(8, 4) for r in (rays, ideal))
+        grows = bool((np.diff(angles, axis=1) > 0.0).all())  # NaN does not
+        return grows and bool((np.abs(np.log(angles / those)) <= np.log(_MOST_BENT)).all())
 
 
 def _undistort(distorted: FloatArray, k1: float, k2: float, p1: float, p2: float) -> FloatArray:

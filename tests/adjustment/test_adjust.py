@@ -463,7 +463,7 @@ def test_wrong_priors_lenses_and_options_are_refused():
     with pytest.raises(InputError, match="lens prior must have 1 x 8"):
         replace(start, lens_prior=LensPrior(values=np.ones((1, 8)), information=np.full((1, 8), -1.0)))
     with pytest.raises(InputError, match="undistort it"):
-        replace(start, lenses=[Lens("THIN_PRISM_FISHEYE", (1.0,))])
+        replace(start, lenses=[Lens("EQUIRECTANGULAR", (1200.0, 600.0))])
     with pytest.raises(InputError, match="4 finite"):
         replace(start, lenses=[Lens("PINHOLE", (1.0, 2.0, np.nan, 0.0))])
     with pytest.raises(InputError, match="not positive"):

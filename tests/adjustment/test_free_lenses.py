@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment.covariance import estimate_covariances, focal_shares
 from sfm_shapefit.adjustment.freedom import Freedom
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.solve import adjust
+from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
 from sfm_shapefit.scene.lens import Lens
+from sfm_shapefit.scene.wide_lenses import see
 from tests.adjustment.made import disturb, look_at, ring_problem
 from tests.structures import in_doubt
 
@@ -155,3 +157,31 @@ def test_a_straight_drive_tells_the_distortion_but_not_the_focal_length():
     sigma_k1 = known.lens_sigmas[0, 4]
     assert 0.0 < sigma_k1 < 0.1 * abs(true_k1)
     assert k1 == pytest.approx(true_k1 * (given_px / TRUE_PX) ** 2, abs=4.0 * sigma_k1)
+
+
+def test_a_fisheye_is_adjusted_by_what_it_sees_behind_itself():
+    rng = np.random.default_rng(3)
+    lens = Lens("OPENCV_FISHEYE", (300.0, 310.0, 500.0, 500.0, 0.02, -0.01, 0.002, 0.0))
+    directions = rng.standard_normal((300, 3))
+    points = 5.0 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    centers = 1.5 * rng.standard_normal((8, 3))
+    rotations = Rotation.random(8, random_state=3).as_matrix()
+    inside = (points[None] - centers[:, None]) @ rotations.transpose(0, 2, 1)
+    is_seen = inside[:, :, 2] > np.cos(np.radians(115.0)) * np.linalg.norm(inside, axis=2)
+    cameras, seen = np.nonzero(is_seen)
+    assert (inside[cameras, seen, 2] < 0.0).mean() > 0.2
+    pixels = np.array([see(lens.row(), *ray)[:2] for ray in inside[cameras, seen]])
+    truth = AdjustmentProblem(
+        rotations=rotations,
+        centers=centers,
+        points=points,
+        cameras_seeing=cameras,
+        points_seen=seen,
+        pixels=pixels,
+        lenses=(lens,),
+        lens_of_camera=np.zeros(8, np.int64),
+    )
+    start = replace(disturb(truth, rng), lenses=(lens.longer(1.1),))
+    done = adjust(start, free_focal_lengths=True, free_distortion=True, gradient_tolerance=1e-9)
+    assert np.max(reprojection_errors_px(done.problem)) < 1e-4  # NaN, behind a camera, is no error of less
+    np.testing.assert_allclose(done.problem.lenses[0].parameters, lens.parameters, rtol=1e-6, atol=1e-6)

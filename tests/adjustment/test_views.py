@@ -44,8 +44,10 @@ DISTORTIONS = {
     "RADIAL_FISHEYE": [-0.02, 0.005],
     "OPENCV_FISHEYE": [-0.02, 0.005, 1e-3, 0.0],
     "THIN_PRISM_FISHEYE": [-0.02, 0.005, 1e-4, 1e-4, 0.0, 0.0, 1e-4, 1e-4],
+    "SIMPLE_FISHEYE": [],
+    "SIMPLE_DIVISION": [-0.1],
+    "EUCM": [0.6, 1.1],
 }
-EXACT = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
 def camera_of(model):
@@ -92,7 +94,7 @@ def disturbed(model, size=0.02, seed=1):
     return copy
 
 
-WITH_RIGS = [*((model, False) for model in DISTORTIONS), ("OPENCV", True)]
+WITH_RIGS = [*((model, False) for model in DISTORTIONS), ("OPENCV", True), ("OPENCV_FISHEYE", True)]
 
 
 @pytest.mark.parametrize(("model", "rigs"), WITH_RIGS)
@@ -111,11 +113,7 @@ def test_the_errors_are_those_of_pycolmap_through_every_lens(model, rigs):
     sums = np.bincount(problem.points_seen, errors)
     ours = sums / np.bincount(problem.points_seen)
     theirs = np.array([given.point3D(i).error for i in points.ids.tolist()])
-    if model in EXACT:
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
-    else:  # an ideal camera's error is up to 1 / cos(28 deg)^2 times the fisheye's; distortion does its part
-        assert (ours / theirs).min() > 0.7
-        assert (ours / theirs).max() < 1.6
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("model", "rigs"), WITH_RIGS)
@@ -134,6 +132,18 @@ def test_a_disturbed_model_of_any_lens_is_adjusted_back(model, rigs):
     assert found.reconstruction.compute_mean_reprojection_error() < 1e-5
     for i, camera in truth.cameras.items():
         assert bytes(found.reconstruction.camera(i).params) == bytes(camera.params)
+
+
+@pytest.mark.parametrize(("model", "rigs"), [("OPENCV_FISHEYE", True), ("EUCM", False)])
+def test_lenses_of_any_model_are_found_where_they_are_free(model, rigs):
+    truth = scene(model, rigs=rigs, noise_px=0.0)
+    start = disturbed(truth)
+    for camera in start.cameras.values():
+        camera.params = camera.params * np.repeat([1.03, 1.0], [2, len(camera.params) - 2])
+    free = {"free_focal_lengths": True, "free_distortion": True}
+    found = sfm_shapefit.bundle_adjust(start, cost_tolerance=0.0, **free).reconstruction
+    for i, camera in truth.cameras.items():
+        np.testing.assert_allclose(found.camera(i).params, camera.params, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("rigs", [False, True])

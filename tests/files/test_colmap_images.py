@@ -138,4 +138,4 @@ def test_rays_of_pictures_lead_back_to_their_pixels(name):
     np.testing.assert_array_equal(pixels, known)
     np.testing.assert_allclose(camera.img_from_cam(rays), pixels, atol=1e-6)
     np.testing.assert_allclose(pictures.project(2, 3.0 * rays), pixels, atol=1e-6)
-    assert (rays[:, 2] == 1.0).all() == images.lenses[0].is_adjustable
+    assert (rays[:, 2] == 1.0).all() == images.lenses[0].is_plane

@@ -5,11 +5,7 @@ import pytest
 
 from sfm_shapefit.files.colmap.database_images import read_images
 from sfm_shapefit.files.colmap.database_pairs import MAX_NUM_IMAGES
-from sfm_shapefit.files.colmap.intrinsics import (
-    calibrate_view_graph,
-    find_uncalibrated,
-    with_focal_length,
-)
+from sfm_shapefit.files.colmap.intrinsics import calibrate_view_graph, find_uncalibrated
 from sfm_shapefit.files.colmap.model import read_model
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.pipeline.intrinsics import settle_intrinsics
@@ -46,7 +42,7 @@ def test_what_was_never_measured_is_told_from_what_was(tmp_path, model, params, 
     assert read_from(path, find_uncalibrated, read_model(RING / "sparse" / "0").images) == {}
     marked, may_change = read_from(path, lambda file: settle_intrinsics(images, file, "auto"))
     assert [lens.origin for lens in marked.lenses] == [origin]
-    assert may_change.parts[:, FOCAL].tolist() == [origin is not None and model != "OPENCV_FISHEYE"]
+    assert may_change.parts[:, FOCAL].tolist() == [origin is not None]
     kept, stays = read_from(path, lambda file: settle_intrinsics(images, file, "held"))
     assert [lens.origin for lens in kept.lenses] == [origin]
     assert kept.lenses[0].parameters == images.lenses[0].parameters
@@ -78,7 +74,7 @@ def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
     assert all(read_from(path, calibrate_view_graph, [1]) == factors for _ in range(5))  # to the bit
     assert fingerprint(tmp_path) == before
     images = read_from(path, read_images).images
-    found = with_focal_length(images.lenses[0], factors[1]).parameters
+    found = images.lenses[0].longer(factors[1]).parameters
     np.testing.assert_allclose(found, [1000.0, 1000.0, 600.0, 450.0], rtol=1e-4)
     assert images.lenses[0].parameters[0] == 1150.0
 
@@ -87,7 +83,7 @@ def test_the_view_graph_knows_the_focal_length_and_the_database_stays(tmp_path):
 def test_what_a_list_guesses_gives_way_to_what_the_view_graph_knows(tmp_path, listed):
     path = database_with(tmp_path, "PINHOLE", [1150.0, 1150.0, 600.0, 450.0], 0)
     images = read_from(path, read_images).images
-    guess = with_focal_length(images.lenses[0], listed / 1150.0)
+    guess = images.lenses[0].longer(listed / 1150.0)
     images = images.with_lenses([guess])
     ids = frozenset({guess.id})
     found, _ = read_from(path, lambda file: settle_intrinsics(images, file, "auto", listed=ids))

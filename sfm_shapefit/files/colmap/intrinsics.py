@@ -15,7 +15,6 @@ import sqlite3
 import tempfile
 from collections.abc import Collection, Mapping
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from sfm_shapefit.files.colmap.model import PYCOLMAP_ERRORS
 from sfm_shapefit.files.colmap.quiet import quiet_stderr
 from sfm_shapefit.files.colmap.sqlite_file import DatabaseFile
 from sfm_shapefit.scene.images import Images
-from sfm_shapefit.scene.lens import Lens, Origin
+from sfm_shapefit.scene.lens import Origin
 from sfm_shapefit.scene.matches import PairNames, indices_of_pairs
 from sfm_shapefit.scene.same_images import same_images
 
@@ -97,13 +96,6 @@ def _origin(camera: pycolmap.Camera) -> Origin:
     extra = camera.params[camera.extra_params_idxs()]
     is_centered = bool((principal == [0.5 * camera.width, 0.5 * camera.height]).all())
     return Origin.EXIF if is_centered and len(extra) and not extra.any() else Origin.CALIBRATION
-
-
-def with_focal_length(lens: Lens, factor: float) -> Lens:
-    """Return a lens whose focal length is some factor larger."""
-    params = np.array(lens.parameters)
-    params[camera_of(lens).focal_length_idxs()] *= factor
-    return replace(lens, parameters=tuple(params.tolist()))
 
 
 def calibrate_view_graph(

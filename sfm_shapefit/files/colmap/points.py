@@ -60,7 +60,7 @@ class ModelPictures:
     def rays(self, image: int, pixels: FloatArray) -> FloatArray:
         """Return rays (k, 3) of pixels; through a case of OPENCV, of depth 1."""
         lens, camera = self._lenses[self._lens_of[image]], self._cameras[self._lens_of[image]]
-        if not lens.is_adjustable:
+        if not lens.is_plane:
             return rays_of(lens, pixels)
         on_plane = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
         return np.concatenate([on_plane, np.ones((len(pixels), 1))], axis=1)
