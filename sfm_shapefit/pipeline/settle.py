@@ -153,8 +153,8 @@ def finish_piece(
             kept, stand = _choose(stand, judged, options.trust.min_trust)
     if (sure & ~seeded.images.is_posed).any():
         seeded = seed_points(stand, kept, options, clock, sure)
-    moves = judged.unit is None and not given.rigid.fixed.any()
-    seeded, control, told = bring_to_known(seeded, given.known, options.structure, moves=moves)
+    may = {"moves": not given.rigid.fixed.any(), "resize": judged.unit is None}
+    seeded, control, told = bring_to_known(seeded, given.known, options.structure, **may)
     intrinsics = stand.intrinsics
     if seeded.adjusted is not None:
         judged = with_uncertainty(judged, before, seeded.adjusted, stand.gauge.similarity.scale)
@@ -303,7 +303,7 @@ def _place_all(stand: Stand, images: Images) -> Images:
 def _compare_with_priors(stand: Stand, judged: Judged, images: Images, gauge: Gauge) -> PriorFit | None:
     """Return how well position priors fit the delivered images where they set the scale; else None."""
     priors, pairs = stand.given.known.priors, stand.directions
-    if priors is None or gauge.scale != "prior":
+    if priors is None or not gauge.has_priors:
         return None
     directions = pairs.directions if gauge.axes is None else pairs.directions @ gauge.axes.T
     sigmas, own = np.full(images.num_images, np.nan), standard_deviations(judged.covariances)

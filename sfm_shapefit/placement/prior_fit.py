@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.base.arrays import FloatArray, IntArray
-from sfm_shapefit.base.geometry import MEDIAN_NORMAL_LENGTH, angle_between_deg, median_spread, normalized
+from sfm_shapefit.base.geometry import angle_between_deg, median_spread, normalized
+from sfm_shapefit.placement.gauge import ALL_FREE, FEWEST_CHECKED, residual_level
 from sfm_shapefit.scene.given import PositionPriors
 
 _FAR = 5.0  # standard deviations; of 100,000 cameras with normal errors two are farther off by chance
@@ -43,7 +44,8 @@ def compare_with_priors(
     positions[rows] = priors.known.positions
     off[rows] = np.linalg.norm(priors.known.off(centers), axis=1)
     there = np.isfinite(off)
-    level = float(np.median(off[there])) / MEDIAN_NORMAL_LENGTH if there.any() else 0.0
+    robust = int(there.sum()) >= FEWEST_CHECKED
+    level = residual_level(off[there], ALL_FREE.unknowns, robust=robust) if there.any() else 0.0
     least = max(level, _ROUNDING * median_spread(priors.known.positions))
     errors[rows] = np.fmax(priors.known.sigmas(), least)
     wrong = np.flatnonzero(off > _FAR * np.hypot(errors, np.nan_to_num(sigmas, posinf=np.inf)))
