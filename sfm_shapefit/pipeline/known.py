@@ -97,7 +97,7 @@ def _bring_to_control_points(
 ) -> tuple[Seeded, list[ControlPoint], list[str]]:
     """Return a model in the world of control points, a row for each point, and what to warn of."""
     found = triangulate_control_points(known, look_at_marks(seeded.images, known), options)
-    fit = fit_control_points(known, found.positions, resize=resize and moves)
+    fit = fit_control_points(known, found.positions, resize=resize or not moves)
     warnings = list(control_warnings(known, found, fit, seeded.images.names))
     rows = control_rows(known, found, fit)
     if isinstance(fit, str):
